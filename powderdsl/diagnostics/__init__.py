@@ -1,0 +1,18 @@
+"""Diagnostics: what is wrong, where, and what to write instead. Used by every stage; depends on nothing."""
+
+from powderdsl.diagnostics.codes import CODES, Code, Severity
+from powderdsl.diagnostics.report import CompileError, Diagnostic, Label, Reporter, suggest
+from powderdsl.diagnostics.span import Source, Span
+
+__all__ = [
+    "CODES",
+    "Code",
+    "CompileError",
+    "Diagnostic",
+    "Label",
+    "Reporter",
+    "Severity",
+    "Source",
+    "Span",
+    "suggest",
+]

@@ -1,0 +1,90 @@
+"""The table of diagnostic codes. A code is permanent: never reused, its page stays when it is retired."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Severity(Enum):
+    """An error stops; a warning is probably a mistake; a note is worth knowing."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    NOTE = "note"
+
+
+@dataclass(frozen=True)
+class Code:
+    """A row: the code, its slug (names the fault, not the cure), how severe it is."""
+
+    code: str
+    slug: str
+    severity: Severity
+
+
+_ERROR, _WARNING, _NOTE = Severity.ERROR, Severity.WARNING, Severity.NOTE
+
+_ROWS = (
+    # PD1xx: files, YAML, shape
+    ("PD101", "file-not-readable", _ERROR),
+    ("PD102", "file-too-large", _ERROR),
+    ("PD103", "invalid-yaml", _ERROR),
+    ("PD104", "duplicate-key", _ERROR),
+    ("PD105", "forbidden-yaml", _ERROR),
+    ("PD106", "document-too-deep", _ERROR),
+    ("PD107", "wrong-shape", _ERROR),
+    ("PD108", "unknown-key", _ERROR),
+    ("PD109", "missing-key", _ERROR),
+    ("PD110", "invalid-literal", _ERROR),
+    ("PD111", "invalid-name", _ERROR),
+    # PD2xx: the syntax of one line
+    ("PD201", "syntax-error", _ERROR),
+    ("PD202", "expression-too-large", _ERROR),
+    ("PD203", "quoted-expression", _ERROR),
+    ("PD204", "mixed-list", _ERROR),
+    # PD3xx: names
+    ("PD301", "unknown-name", _ERROR),
+    ("PD302", "redefinition", _ERROR),
+    ("PD303", "duplicate-id", _ERROR),
+    ("PD304", "unknown-pack", _ERROR),
+    ("PD305", "missing-pack", _ERROR),
+    ("PD306", "conflicting-packs", _ERROR),
+    ("PD307", "pass-cycle", _ERROR),
+    ("PD308", "shadowed-name", _ERROR),
+    ("PD309", "unknown-parameter", _ERROR),
+    ("PD310", "unknown-ruleset-entry", _ERROR),
+    ("PD311", "reserved-word", _ERROR),
+    # PD4xx: kinds and ranges
+    ("PD401", "wrong-kind", _ERROR),
+    ("PD402", "value-out-of-range", _ERROR),
+    ("PD403", "chance-out-of-range", _ERROR),
+    ("PD404", "chance-not-representable", _WARNING),
+    ("PD405", "not-constant", _ERROR),
+    ("PD406", "wrong-arguments", _ERROR),
+    ("PD407", "not-assignable", _ERROR),
+    ("PD408", "range-overflow", _WARNING),
+    ("PD409", "offset-too-far", _ERROR),
+    # PD5xx: the logic of rules
+    ("PD501", "movement-conflict", _ERROR),
+    ("PD502", "write-conflict", _ERROR),
+    ("PD503", "rule-never-fires", _WARNING),
+    ("PD504", "element-never-appears", _NOTE),
+    ("PD505", "empty-set", _WARNING),
+    ("PD506", "rule-asleep", _NOTE),
+    ("PD507", "unused-definition", _WARNING),
+    ("PD508", "expansion-too-large", _ERROR),
+    ("PD509", "rule-does-nothing", _WARNING),
+    ("PD510", "pass-order-undecided", _WARNING),
+    # PD6xx: worlds, scenes, files
+    ("PD601", "unknown-world", _ERROR),
+    ("PD602", "invalid-world-file", _ERROR),
+    ("PD603", "palette-mismatch", _ERROR),
+    # PD7xx: limits of a backend
+    ("PD701", "backend-not-available", _ERROR),
+    ("PD702", "backend-limit", _ERROR),
+    # PD9xx: our own mistakes
+    ("PD901", "internal-error", _ERROR),
+)
+
+CODES: dict[str, Code] = {row[0]: Code(*row) for row in _ROWS}

@@ -1,0 +1,123 @@
+"""Three renderings of one diagnostic: full text with carets, one line, JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from typing import Any
+from unicodedata import combining, east_asian_width
+
+from powderdsl.diagnostics.codes import Severity
+from powderdsl.diagnostics.report import Diagnostic, Label
+from powderdsl.diagnostics.span import Span
+
+TAB_WIDTH = 4
+MAX_SHOWN = 160
+COLOURS = {Severity.ERROR: "31;1", Severity.WARNING: "33;1", Severity.NOTE: "36;1"}
+
+
+def _cells(text: str) -> int:
+    """Terminal cells that `text` takes, tabs already expanded."""
+    return sum(0 if combining(char) else 2 if east_asian_width(char) in "WF" else 1 for char in text)
+
+
+def _printable(text: str) -> str:
+    return "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text)
+
+
+def _snippet(label: Label, caret: str) -> tuple[str, str]:
+    """The source line and the line of carets below it, long lines cut to a window around the place."""
+    span = label.span
+    assert span is not None
+    line_number, column = span.source.position(span.start)
+    raw = span.source.line(line_number)
+    start = min(column - 1, len(raw))
+    end = max(min(start + span.end - span.start, len(raw)), start)
+    left = max(0, start - MAX_SHOWN // 2) if len(raw) > MAX_SHOWN else 0
+    right = min(len(raw), left + MAX_SHOWN)
+
+    def shown(piece: str) -> str:
+        return _printable(piece.expandtabs(TAB_WIDTH))
+
+    text = ("…" if left else "") + shown(raw[left:right]) + ("…" if right < len(raw) else "")
+    before = _cells(shown(raw[left:start])) + (1 if left else 0)
+    width = max(1, _cells(shown(raw[left : min(end, right)])) + (1 if left else 0) - before)
+    return text, (" " * before + caret * width + (" " + label.text if label.text else "")).rstrip()
+
+
+def _block(label: Label, caret: str, gutter: int) -> list[str]:
+    text, carets = _snippet(label, caret)
+    assert label.span is not None
+    return [
+        f"{label.span.line:>{gutter}} | {text}".rstrip(),
+        f"{' ' * gutter} | {carets}",
+    ]
+
+
+def render_text(diagnostic: Diagnostic, *, colour: bool = False) -> str:
+    """The full text with source lines and carets. Ends without a line break."""
+
+    def paint(text: str, style: str) -> str:
+        return f"\x1b[{style}m{text}\x1b[0m" if colour else text
+
+    severity = diagnostic.severity
+    head = paint(f"{severity.value}[{diagnostic.code}]", COLOURS[severity]) + f": {diagnostic.message}"
+    lines = [head]
+    labels = [label for label in (diagnostic.primary, *diagnostic.secondary) if label.span]
+    gutter = max((len(str(label.span.line)) for label in labels if label.span), default=1)
+    name = None
+    for label in labels:
+        assert label.span is not None
+        if label.span.source.name != name:
+            arrow = "-->" if name is None else ":::"
+            name = label.span.source.name
+            lines.append(f"{' ' * gutter}{arrow} {label.span.place}")
+            lines.append(f"{' ' * gutter} |")
+        lines.extend(_block(label, "^" if label is diagnostic.primary else "-", gutter))
+    lines.extend(f"{' ' * gutter} = note: {note}" for note in diagnostic.notes)
+    lines.extend(f"{' ' * gutter} = help: {text}" for text in diagnostic.helps)
+    lines.append(f"{' ' * gutter} = more: powderdsl explain {diagnostic.code}")
+    return "\n".join(lines)
+
+
+def render_short(diagnostic: Diagnostic) -> str:
+    """`file:line:column: error[CODE]: message (help)` on one line."""
+    span = diagnostic.primary.span
+    place = f"{span.place}: " if span else ""
+    helps = f" ({'; '.join(diagnostic.helps)})" if diagnostic.helps else ""
+    return _printable(f"{place}{diagnostic.severity.value}[{diagnostic.code}]: {diagnostic.message}{helps}")
+
+
+def _offset_units(text: str, utf16: bool) -> int:
+    return len(text.encode("utf-16-le")) // 2 if utf16 else len(text)
+
+
+def _span_data(span: Span, utf16: bool) -> dict[str, Any]:
+    def point(offset: int) -> dict[str, int]:
+        line, column = span.source.position(offset)
+        before = span.source.line(line)[: column - 1]
+        return {"line": line, "column": _offset_units(before, utf16) + 1}
+
+    return {"file": span.source.name, "start": point(span.start), "end": point(span.end)}
+
+
+def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str, Any]:
+    """A diagnostic as plain data. `utf16` counts columns in UTF-16 units, as browser editors do."""
+
+    def label_data(label: Label) -> dict[str, Any]:
+        return {"span": _span_data(label.span, utf16) if label.span else None, "text": label.text}
+
+    return {
+        "code": diagnostic.code,
+        "severity": diagnostic.severity.value,
+        "message": diagnostic.message,
+        "primary": label_data(diagnostic.primary),
+        "secondary": [label_data(label) for label in diagnostic.secondary],
+        "notes": list(diagnostic.notes),
+        "helps": list(diagnostic.helps),
+    }
+
+
+def render_json(diagnostics: Iterable[Diagnostic], *, utf16: bool = False) -> str:
+    """All diagnostics as one JSON list."""
+    return json.dumps([diagnostic_data(diagnostic, utf16=utf16) for diagnostic in diagnostics], indent=2)

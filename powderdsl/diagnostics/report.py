@@ -1,0 +1,107 @@
+"""Diagnostics as data, collected by a Reporter, raised once per stage as one CompileError."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from powderdsl.diagnostics.codes import CODES, Severity
+from powderdsl.diagnostics.span import Span
+
+MAX_ERRORS = 200
+"""A file with more mistakes than this is reported up to here: nobody reads further."""
+
+
+@dataclass(frozen=True)
+class Label:
+    """A place and the words that finish the sentence under its caret. `span` is None where there is no text."""
+
+    span: Span | None
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """One mistake (or remark): a code of the table, the place, what is wrong, and how to mend it."""
+
+    code: str
+    message: str
+    primary: Label
+    secondary: tuple[Label, ...] = ()
+    notes: tuple[str, ...] = ()
+    helps: tuple[str, ...] = ()
+
+    @property
+    def severity(self) -> Severity:
+        return CODES[self.code].severity
+
+    @property
+    def sort_key(self) -> tuple[str, int, int, str]:
+        span = self.primary.span
+        return (span.source.name, span.start, span.end, self.code) if span else ("", 0, 0, self.code)
+
+
+class CompileError(Exception):
+    """Bad input: rule files, worlds, tasks. `diagnostics` has everything that was found, in source order."""
+
+    def __init__(self, diagnostics: Iterable[Diagnostic]):
+        self.diagnostics = tuple(diagnostics)
+        super().__init__(self.diagnostics)
+
+    def __str__(self) -> str:
+        from powderdsl.diagnostics.render import render_text
+
+        return "\n".join(render_text(diagnostic) for diagnostic in self.diagnostics)
+
+
+class Reporter:
+    """Collects diagnostics. Every stage reports all it can; `raise_if_errors` ends the stage."""
+
+    def __init__(self) -> None:
+        self._found: dict[Diagnostic, None] = {}
+
+    def report(
+        self,
+        code: str,
+        message: str,
+        span: Span | None,
+        label: str = "",
+        *,
+        secondary: Sequence[Label] = (),
+        notes: Sequence[str] = (),
+        helps: Sequence[str] = (),
+    ) -> None:
+        """Add a diagnostic. The code's row in the table decides whether it is an error, a warning or a note."""
+        diagnostic = Diagnostic(code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps))
+        if len(self._found) < MAX_ERRORS or diagnostic.severity is Severity.ERROR:
+            self._found[diagnostic] = None
+
+    error = report
+
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """Everything found so far, in source order, without repetitions."""
+        return tuple(sorted(self._found, key=lambda diagnostic: diagnostic.sort_key))
+
+    @property
+    def has_errors(self) -> bool:
+        return any(diagnostic.severity is Severity.ERROR for diagnostic in self._found)
+
+    def raise_if_errors(self) -> None:
+        """Raise CompileError with the errors found (warnings and notes stay with the reporter)."""
+        if self.has_errors:
+            errors = [d for d in self.diagnostics if d.severity is Severity.ERROR]
+            raise CompileError(errors[:MAX_ERRORS])
+
+
+def suggest(word: str, candidates: Iterable[str], kind: str = "") -> tuple[str, ...]:
+    """Help lines for an unknown word: the close match, or the whole list when it is short."""
+    known = sorted(set(candidates) - {word})
+    close = get_close_matches(word.lower(), known, n=1, cutoff=0.6)
+    if close:
+        return (f"did you mean `{close[0]}`?",)
+    if 0 < len(known) <= 8:
+        names = ", ".join(f"`{name}`" for name in known)
+        return (f"{kind or 'known here'}: {names}",)
+    return ()

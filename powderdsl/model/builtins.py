@@ -1,0 +1,95 @@
+"""The table of words that every rule file knows: directions, kernels, functions, kinds. Docs are made from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from powderdsl.model.types import Kernel, Offset
+
+DIRECTIONS: dict[str, Offset] = {
+    "here": (0, 0),
+    "above": (-1, 0),
+    "below": (1, 0),
+    "left": (0, -1),
+    "right": (0, 1),
+}
+"""Names of neighbours: (rows down, columns right). Paths add up: `above.left`."""
+
+OCTANTS: tuple[Offset, ...] = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
+"""The eight neighbours by octant: 0 right, 2 below, 4 left, 6 above, odd the diagonals between."""
+
+DIRECTION_SETS: dict[str, tuple[Offset, ...]] = {
+    "octants": OCTANTS,
+    "sides": ((-1, 0), (1, 0), (0, -1), (0, 1)),
+    "diagonals": ((-1, -1), (-1, 1), (1, -1), (1, 1)),
+}
+"""Sets of directions to loop over, in this order."""
+
+
+def grid_kernel(name: str, rows: tuple[tuple[int, ...], ...], wrap: bool = False) -> Kernel:
+    """A kernel from a matrix of whole weights with odd sides; zero weights are left out."""
+    cy, cx = len(rows) // 2, len(rows[0]) // 2
+    weights = tuple((y - cy, x - cx, w) for y, row in enumerate(rows) for x, w in enumerate(row) if w)
+    return Kernel(name, weights, wrap)
+
+
+KERNELS: dict[str, Kernel] = {
+    "box": grid_kernel("box", ((1, 1, 1), (1, 1, 1), (1, 1, 1))),
+    "ring": grid_kernel("ring", ((1, 1, 1), (1, 0, 1), (1, 1, 1))),
+    "cross": grid_kernel("cross", ((0, 1, 0), (1, 1, 1), (0, 1, 0))),
+    "plus": grid_kernel("plus", ((0, 1, 0), (1, 0, 1), (0, 1, 0))),
+}
+"""Neighbourhoods for `count` and `sum`. Cells outside the grid count as nothing."""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of the line language: how it is called, and one line for the documentation."""
+
+    name: str
+    signature: str
+    about: str
+    arity: tuple[int, int]
+
+
+FUNCTIONS: dict[str, Function] = {
+    row.name: row
+    for row in (
+        Function("count", "count(SET in KERNEL)", "how many cells of the neighbourhood hold; `box` if none is named", (1, 16)),
+        Function("sum", "sum(VALUE in KERNEL)", "the weighted sum of a value over the neighbourhood", (1, 1)),
+        Function("at", "at(ROWS, COLUMNS)", "the neighbour so many rows down and columns right", (2, 2)),
+        Function("inside", "inside(PLACE)", "whether that neighbour lies inside the grid, without wrapping", (1, 1)),
+        Function("octant", "octant(VEC2)", "the direction a vector points to", (1, 1)),
+        Function("length", "length(VEC2)", "the length of a vector", (1, 1)),
+        Function("vector", "vector(ROWS, COLUMNS)", "a vec2 from two numbers", (2, 2)),
+        Function("min", "min(A, B)", "the smaller of two numbers", (2, 8)),
+        Function("max", "max(A, B)", "the larger of two numbers", (2, 8)),
+        Function("abs", "abs(A)", "a number without its sign", (1, 1)),
+        Function("clamp", "clamp(A, LOW, HIGH)", "a number kept between two bounds", (3, 3)),
+        Function("opposite", "opposite(PLACE)", "the neighbour on the other side", (1, 1)),
+    )
+}
+
+COORDINATES = ("row", "column", "step")
+"""Where and when: whole numbers that are used with `mod`, as in `(row + step) mod 2`."""
+
+KIND_WORDS: dict[str, str] = {
+    "flag": "yes or no",
+    "element": "the name of an element",
+    "direction": "one of the eight neighbours",
+    "chance": "a probability, 0% to 100%",
+    "real": "real(LOW..HIGH): a float32",
+    "vec2": "vec2(LOW..HIGH): two float32, (rows, columns)",
+}
+"""Kinds of properties, fields and parameters, besides whole-number ranges LOW..HIGH."""
+
+MAX_OFFSET = 15
+"""How far a rule may look in one step."""
+
+MAX_MAGNITUDE = 1_000_000
+"""The largest number a rule file may contain."""
+
+RESERVED = (
+    frozenset(DIRECTIONS) | frozenset(DIRECTION_SETS) | frozenset(KERNELS) | frozenset(FUNCTIONS) | frozenset(COORDINATES)
+)
+"""Words that no definition may take."""

@@ -1,0 +1,396 @@
+"""Located YAML -> declarations of one pack or ruleset file. Shapes and literals are checked here, names are not."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.model.schema import KEYS, Reader, first_line
+from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import parse_scalar
+from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_yaml
+
+MAX_PASSES = 200
+
+
+@dataclass(frozen=True)
+class TypedDecl:
+    """A property, field or parameter as written: its kind and default are still syntax."""
+
+    name: Scalar
+    type: Syntax | None
+    default: Syntax | None
+    at: str = "place"
+    of: Syntax | None = None
+    resets: bool = False
+    values: tuple[tuple[Scalar, Syntax], ...] = ()
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class ElementDecl:
+    name: Scalar
+    id: int | None
+    id_scalar: Scalar | None
+    color: str
+    glyph: str
+    about: str
+    tags: tuple[Scalar, ...]
+    values: tuple[tuple[Scalar, Syntax], ...]
+    override: bool
+
+
+@dataclass(frozen=True)
+class AlsoDecl:
+    element: Scalar
+    tags: tuple[Scalar, ...]
+    values: tuple[tuple[Scalar, Syntax], ...]
+
+
+@dataclass(frozen=True)
+class KernelDecl:
+    name: Scalar
+    rows: tuple[tuple[int, ...], ...]
+    wrap: bool
+
+
+@dataclass(frozen=True)
+class StreamDecl:
+    name: Scalar
+    bits: int
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of a pass: lets, then one action (a moment of rules, or further blocks, maybe in a loop), then the rest."""
+
+    lets: tuple[tuple[Scalar, Syntax], ...]
+    header: Syntax | None
+    rules: tuple[Syntax, ...]
+    blocks: tuple[Block, ...]
+    symmetry: str | None
+    policy: str | None
+    then: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class PassDecl:
+    name: Scalar
+    about: str
+    after: tuple[Scalar, ...]
+    before: tuple[Scalar, ...]
+    scratch: tuple[TypedDecl, ...]
+    block: Block
+
+
+@dataclass(frozen=True)
+class TestDecl:
+    name: str
+    scalar: Scalar
+    given: Scalar | None
+    legend: tuple[tuple[Scalar, Scalar], ...]
+    steps: int
+    expect: Scalar | None
+    always: tuple[Syntax, ...]
+    seed: int | None
+
+
+@dataclass(frozen=True)
+class PackDecl:
+    """One pack file."""
+
+    name: Scalar
+    source: Source
+    about: str
+    needs: tuple[Scalar, ...]
+    conflicts: tuple[Scalar, ...]
+    tags: tuple[tuple[Scalar, str], ...]
+    properties: tuple[TypedDecl, ...]
+    fields: tuple[TypedDecl, ...]
+    streams: tuple[StreamDecl, ...]
+    params: tuple[TypedDecl, ...]
+    kernels: tuple[KernelDecl, ...]
+    sets: tuple[tuple[Scalar, Syntax], ...]
+    elements: tuple[ElementDecl, ...]
+    also: tuple[AlsoDecl, ...]
+    passes: tuple[PassDecl, ...]
+    tests: tuple[TestDecl, ...]
+
+
+@dataclass(frozen=True)
+class RulesetDecl:
+    """One ruleset file: a list of packs with a name."""
+
+    name: Scalar
+    source: Source
+    about: str
+    packs: tuple[Scalar, ...]
+    slots: int | None
+    matrix: tuple[Scalar, ...]
+    params: tuple[tuple[Scalar, Syntax], ...] = field(default=())
+
+
+def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | None:
+    """Parse and shape-check a rule file. Reports everything it can; None where nothing can be made of it."""
+    tree = parse_yaml(source, reporter)
+    if tree is None:
+        if not reporter.has_errors:
+            reporter.error("PD107", f"{source.name} is empty", None, helps=["a pack starts with `pack: NAME`"])
+        return None
+    if not isinstance(tree, Mapping):
+        Reader(reporter).shape(tree, "a pack: a mapping that starts with `pack: NAME`")
+        return None
+    reader = _PackReader(reporter, source)
+    if tree.get("ruleset") is not None:
+        return reader.ruleset(tree)
+    return reader.pack(tree)
+
+
+class _PackReader(Reader):
+    def __init__(self, reporter: Reporter, source: Source):
+        super().__init__(reporter)
+        self.source = source
+
+    def line(self, node: Node, start: str = "expression") -> Syntax | None:
+        if not isinstance(node, Scalar):
+            self.shape(node, "one line")
+            return None
+        return parse_scalar(node, start, self.reporter)
+
+    def ruleset(self, tree: Mapping) -> RulesetDecl | None:
+        entries = self.mapping(tree, "ruleset", "a ruleset")
+        name = self.scalar(entries, "ruleset")
+        if name is None or not self.name(name, "a ruleset"):
+            return None
+        params = []
+        node = entries.get("params", (None, None))[1]
+        if isinstance(node, Mapping):
+            params = [(key, line) for key, value in node.entries if (line := self.line(value))]
+        return RulesetDecl(
+            name, self.source, self.text(entries, "about"), self.words(entries.get("packs", (None, None))[1]),
+            self.number(entries, "slots", 1, 256), self.words(entries.get("matrix", (None, None))[1]), tuple(params),
+        )
+
+    def pack(self, tree: Mapping) -> PackDecl | None:
+        entries = self.mapping(tree, "pack", "a pack")
+        name = self.scalar(entries, "pack")
+        if name is None or not self.name(name, "a pack"):
+            return None
+
+        def value(key: str) -> Node | None:
+            return entries.get(key, (None, None))[1]
+
+        return PackDecl(
+            name=name,
+            source=self.source,
+            about=self.text(entries, "about"),
+            needs=self.words(value("needs")),
+            conflicts=self.words(value("conflicts")),
+            tags=tuple((key, node.text if isinstance(node, Scalar) else "") for key, node in self.named(value("tags"), "a tag")),
+            properties=tuple(self.property(key, node) for key, node in self.named(value("properties"), "a property")),
+            fields=tuple(self.field(key, node) for key, node in self.named(value("fields"), "a field")),
+            streams=self.streams(value("streams")),
+            params=tuple(self.param(key, node) for key, node in self.named(value("params"), "a parameter")),
+            kernels=tuple(k for key, node in self.named(value("kernels"), "a kernel") if (k := self.kernel(key, node))),
+            sets=tuple((key, line) for key, node in self.named(value("sets"), "a set") if (line := self.line(node))),
+            elements=tuple(self.element(key, node) for key, node in self.named(value("elements"), "an element")),
+            also=tuple(self.also(key, node) for key, node in self._pairs(value("also"))),
+            passes=tuple(self.pass_(key, node) for key, node in self.named(value("passes"), "a pass")),
+            tests=tuple(t for node in self._items(value("tests")) if (t := self.test(node))),
+        )
+
+    def _pairs(self, node: Node | None) -> tuple[tuple[Scalar, Node], ...]:
+        if node is None:
+            return ()
+        if not isinstance(node, Mapping):
+            self.shape(node, "a mapping from elements to tags")
+            return ()
+        return node.entries
+
+    def _items(self, node: Node | None) -> tuple[Node, ...]:
+        if node is None:
+            return ()
+        if not isinstance(node, Sequence):
+            self.shape(node, "a list")
+            return ()
+        return node.items
+
+    def property(self, key: Scalar, node: Node) -> TypedDecl:
+        if isinstance(node, Scalar):
+            return TypedDecl(key, self.line(node), None)
+        entries = self.mapping(node, "property", f"the property `{key.text}`")
+        values = self.open_values(entries, "property")
+        return TypedDecl(
+            key, self.entry_line(entries, "type"), self.entry_line(entries, "default"), values=values,
+            about=self.text(entries, "about"),
+        )
+
+    def open_values(self, entries: dict[str, tuple[Scalar, Node]], context: str) -> tuple[tuple[Scalar, Syntax], ...]:
+        """Entries beyond the table's keys: property values, or values for elements."""
+        found = []
+        for name, (key, node) in entries.items():
+            if name not in KEYS[context] and (line := self.line(node)):
+                found.append((key, line))
+        return tuple(found)
+
+    def entry_line(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> Syntax | None:
+        node = entries.get(key, (None, None))[1]
+        return self.line(node) if isinstance(node, Scalar) else None
+
+    def field(self, key: Scalar, node: Node) -> TypedDecl:
+        entries = self.mapping(node, "field", f"the field `{key.text}`")
+        at = self.choice(entries, "at", ("element", "place")) or "place"
+        resets = self.choice(entries, "resets", ("step",)) is not None
+        return TypedDecl(
+            key, self.entry_line(entries, "type"), self.entry_line(entries, "default"), at,
+            self.entry_line(entries, "of"), resets, about=self.text(entries, "about"),
+        )
+
+    def param(self, key: Scalar, node: Node) -> TypedDecl:
+        if isinstance(node, Scalar):
+            return TypedDecl(key, None, self.line(node))
+        entries = self.mapping(node, "param", f"the parameter `{key.text}`")
+        return TypedDecl(
+            key, self.entry_line(entries, "type"), self.entry_line(entries, "default"), about=self.text(entries, "about")
+        )
+
+    def streams(self, node: Node | None) -> tuple[StreamDecl, ...]:
+        if isinstance(node, Mapping):
+            found = []
+            for key, value in self.named(node, "a stream"):
+                entries = self.mapping(value, "stream", f"the stream `{key.text}`")
+                bits = self.number(entries, "bits", 16, 32) or 16
+                if bits not in (16, 32):
+                    self.reporter.error("PD110", "`bits` must be 16 or 32", self.scalar(entries, "bits").span)  # type: ignore[union-attr]
+                    bits = 16
+                found.append(StreamDecl(key, bits))
+            return tuple(found)
+        return tuple(StreamDecl(word, 16) for word in self.words(node) if self.name(word, "a stream"))
+
+    def kernel(self, key: Scalar, node: Node) -> KernelDecl | None:
+        if isinstance(node, Sequence):
+            rows_node: Node | None = node
+            wrap = False
+        else:
+            entries = self.mapping(node, "kernel", f"the kernel `{key.text}`")
+            rows_node = entries.get("rows", (None, None))[1]
+            wrap = self.choice(entries, "edges", ("nothing", "wrap")) == "wrap"
+        rows = []
+        for word in self.words(rows_node):
+            parts = word.text.split()
+            if not all(re.fullmatch(r"-?[0-9]{1,3}", part) for part in parts):
+                self.reporter.error("PD110", "a kernel row has whole weights", word.span, "not a row of whole numbers", helps=['write "1 0 1"'])
+                return None
+            rows.append(tuple(int(part) for part in parts))
+        if not rows or len(rows) % 2 == 0 or len({len(row) for row in rows}) != 1 or len(rows[0]) % 2 == 0 or max(len(rows), len(rows[0])) > 31:
+            self.reporter.error(
+                "PD110", f"kernel `{key.text}` has no middle", key.span, "needs an odd number of equally long rows of an odd length, up to 31"
+            )
+            return None
+        return KernelDecl(key, tuple(rows), wrap)
+
+    def element(self, key: Scalar, node: Node) -> ElementDecl:
+        entries = self.mapping(node, "element", f"the element `{key.text}`")
+        color = self.scalar(entries, "color")
+        if color is not None and not re.fullmatch(r"#[0-9A-Fa-f]{6}", color.text):
+            helps = ['YAML takes an unquoted `#` for a comment: write "#RRGGBB" with quotes'] if color.text in ("", "~") else ['write "#RRGGBB"']
+            span = entries["color"][0].span if color.text == "" else color.span
+            self.reporter.error("PD110", f"`{color.text}` is not a colour", span, 'expected "#RRGGBB"', helps=helps)
+            color = None
+        glyph = self.scalar(entries, "glyph")
+        if glyph is not None and not (len(glyph.text) == 1 and "!" <= glyph.text <= "~" and glyph.text != "?"):
+            self.reporter.error("PD110", "a glyph is one ASCII character", glyph.span, "expected one printable character, not `?`")
+            glyph = None
+        return ElementDecl(
+            key, self.number(entries, "id", 0, 255), self.scalar(entries, "id"), color.text.upper() if color else "#000000",
+            glyph.text if glyph else "", self.text(entries, "about"), self.words(entries.get("tags", (None, None))[1]),
+            self.open_values(entries, "element"), self.choice(entries, "override", ("yes", "no", "true", "false")) in ("yes", "true"),
+        )
+
+    def also(self, key: Scalar, node: Node) -> AlsoDecl:
+        if isinstance(node, (Sequence, Scalar)):
+            return AlsoDecl(key, self.words(node), ())
+        entries = self.mapping(node, "also", f"`{key.text}`")
+        return AlsoDecl(key, self.words(entries.get("tags", (None, None))[1]), self.open_values(entries, "also"))
+
+    def pass_(self, key: Scalar, node: Node) -> PassDecl:
+        entries = self.mapping(node, "pass", f"the pass `{key.text}`")
+        scratch = []
+        for name, value in self.named(entries.get("scratch", (None, None))[1], "a scratch field"):
+            scratch.append(TypedDecl(name, self.line(value), None))
+        return PassDecl(
+            key, self.text(entries, "about"), self.words(entries.get("after", (None, None))[1]),
+            self.words(entries.get("before", (None, None))[1]), tuple(scratch), self.block(entries, node),
+        )
+
+    def block(self, entries: dict[str, tuple[Scalar, Node]], node: Node) -> Block:
+        lets = []
+        for name, value in self.named(entries.get("let", (None, None))[1], "a value"):
+            if line := self.line(value):
+                lets.append((name, line))
+        actions = [(key, value) for key, value in entries.values() if key.text == "do" or key.text.startswith(("for ", "repeat "))]
+        if len(actions) > 1:
+            self.reporter.error(
+                "PD107", "a block does one thing", actions[1][0].span, "a second action",
+                helps=["what comes next stands under `then:`"],
+            )
+        header = None
+        rules: tuple[Syntax, ...] = ()
+        blocks: tuple[Block, ...] = ()
+        if actions:
+            key, body = actions[0]
+            if key.text != "do":
+                header = parse_scalar(key, "header", self.reporter)
+            rules, blocks = self.body(body)
+        elif "then" not in entries:
+            self.reporter.error("PD109", "a block does something", first_line(node), "`do:`, `for …:` or `repeat …:` is missing")
+        then: tuple[Block, ...] = ()
+        if "then" in entries:
+            then_rules, then_blocks = self.body(entries["then"][1])
+            then = (Block((), None, then_rules, (), None, None, ()),) if then_rules else then_blocks
+        return Block(
+            tuple(lets), header, rules, blocks, self.choice(entries, "symmetry", ("mirror", "rotations", "all")),
+            self.choice(entries, "conflicts", ("drop_both", "first_wins")), then,
+        )
+
+    def body(self, node: Node) -> tuple[tuple[Syntax, ...], tuple[Block, ...]]:
+        """A rule or a list of rules (one moment), or a block or a list of blocks (one after the other)."""
+        items = node.items if isinstance(node, Sequence) else (node,)
+        kinds = {isinstance(item, Mapping) for item in items}
+        if len(kinds) > 1:
+            first = next(item for item in items if isinstance(item, Mapping) != isinstance(items[0], Mapping))
+            self.reporter.error(
+                "PD204", "a list of rules is one moment, a list of blocks a sequence", first_line(first), "this is of the other kind",
+                helps=["put the rules of one moment into a block of their own: `- do: [...]`"],
+                notes=["a rule with `: ` in it reads as a mapping to YAML"],
+            )
+            return (), ()
+        if True in kinds:
+            return (), tuple(self.block(self.mapping(item, "block", "a block"), item) for item in items)
+        return tuple(rule for item in items if (rule := self.line(item, "rule"))), ()
+
+    def test(self, node: Node) -> TestDecl | None:
+        if not isinstance(node, Mapping) or len(node.entries) != 1:
+            self.shape(node, "a test: `- what it shows:` with its keys indented below")
+            return None
+        name, body = node.entries[0]
+        entries = self.mapping(body, "test", f"the test `{name.text}`")
+        legend = []
+        legend_node = entries.get("legend", (None, None))[1]
+        if isinstance(legend_node, Mapping):
+            legend = [(key, value) for key, value in legend_node.entries if isinstance(value, Scalar)]
+        after = self.scalar(entries, "after")
+        steps = 1
+        if after is not None:
+            match = re.fullmatch(r"([0-9]{1,5}) steps?", after.text.strip())
+            if match:
+                steps = int(match[1])
+            else:
+                self.reporter.error("PD110", "`after` says how many steps", after.span, "expected `50 steps`")
+        always = entries.get("always", (None, None))[1]
+        lines = () if always is None else tuple(line for item in (always.items if isinstance(always, Sequence) else (always,)) if (line := self.line(item)))
+        return TestDecl(
+            name.text, name, self.scalar(entries, "given"), tuple(legend), steps, self.scalar(entries, "expect"), lines,
+            self.number(entries, "seed", 0, 2**31 - 1),
+        )

@@ -1,0 +1,243 @@
+"""The table of keys: what each mapping of a rule file may contain. Shape checks, docs and the JSON Schema use it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key: one line for the docs, whether it must be there, and the shape of its value.
+
+    Shapes: ``text word words number flag mapping list line lines block any``.
+    """
+
+    shape: str
+    about: str
+    required: bool = False
+
+
+_BLOCK = {
+    "let": Key("mapping", "names for values, fixed here, in order, before the rules run"),
+    "do": Key("block", "a rule, a list of rules (one moment), or blocks in sequence"),
+    "then": Key("block", "what comes after: a rule, a list of rules (one moment), or blocks in sequence"),
+    "symmetry": Key("word", "`mirror`, `rotations` or `all`: the rules hold in these orientations at once"),
+    "conflicts": Key("word", "`drop_both` or `first_wins`: what happens when rules claim one cell"),
+}
+
+KEYS: dict[str, dict[str, Key]] = {
+    "pack": {
+        "pack": Key("word", "the pack's name", True),
+        "about": Key("text", "what it is, in a sentence"),
+        "needs": Key("words", "packs that must be loaded too"),
+        "conflicts": Key("words", "packs that must not be loaded too"),
+        "tags": Key("mapping", "tags that other packs give to their elements, with a sentence each"),
+        "properties": Key("mapping", "numbers that every element has"),
+        "fields": Key("mapping", "state that cells carry"),
+        "streams": Key("any", "sources of random numbers that rules share by name"),
+        "params": Key("mapping", "numbers that users override without editing the file"),
+        "kernels": Key("mapping", "neighbourhoods for `count` and `sum`"),
+        "sets": Key("mapping", "names for sets of elements"),
+        "elements": Key("mapping", "the pack's elements"),
+        "also": Key("mapping", "tags and property values for elements of other packs"),
+        "passes": Key("mapping", "what happens in a step"),
+        "tests": Key("list", "small worlds, and what becomes of them"),
+    },
+    "ruleset": {
+        "ruleset": Key("word", "the ruleset's name", True),
+        "about": Key("text", "what it is, in a sentence"),
+        "packs": Key("words", "the packs it is made of", True),
+        "slots": Key("number", "how many element ids there are, vacant ones included"),
+        "matrix": Key("words", "the channels of `World.matrix()`"),
+        "params": Key("mapping", "other values for the packs' parameters"),
+    },
+    "property": {
+        "type": Key("line", "its kind", True),
+        "default": Key("line", "the value of elements that do not say"),
+        "about": Key("text", "what it is, in a sentence"),
+    },
+    "field": {
+        "type": Key("line", "its kind", True),
+        "at": Key("word", "`element`: it travels with it; `place`: it stays", True),
+        "default": Key("line", "its value in a fresh cell"),
+        "of": Key("line", "the elements that have it; others read the default"),
+        "resets": Key("word", "`step`: back to the default when a step starts"),
+        "about": Key("text", "what it is, in a sentence"),
+    },
+    "stream": {
+        "bits": Key("number", "resolution of a draw: 16 or 32"),
+        "about": Key("text", "what it is for"),
+    },
+    "param": {
+        "type": Key("line", "its kind", True),
+        "default": Key("line", "its value unless the user says otherwise", True),
+        "about": Key("text", "what it does, in a sentence"),
+    },
+    "kernel": {
+        "rows": Key("words", "rows of whole weights, an odd number of each", True),
+        "edges": Key("word", "`nothing` (the default) or `wrap`: what lies outside the grid"),
+    },
+    "element": {
+        "id": Key("number", "its number, for good: 0 to 255", True),
+        "color": Key("word", 'its colour, quoted: "#RRGGBB"', True),
+        "glyph": Key("word", "one character for ASCII art; the first free letter of its name otherwise"),
+        "about": Key("text", "what it is, in a sentence"),
+        "tags": Key("words", "the tags it carries"),
+        "override": Key("flag", "yes: replaces an element of another pack"),
+    },
+    "also": {"tags": Key("words", "tags to add")},
+    "pass": {
+        "about": Key("text", "what it does, in a sentence"),
+        "after": Key("words", "passes that come before it"),
+        "before": Key("words", "passes that come after it"),
+        "scratch": Key("mapping", "fields of this pass alone, which start at their default: a kind each"),
+        **_BLOCK,
+    },
+    "block": _BLOCK,
+    "test": {
+        "given": Key("text", "the start world, in ASCII"),
+        "legend": Key("mapping", "what the characters mean, where glyphs will not do"),
+        "after": Key("text", "how many steps it runs: `50 steps`"),
+        "expect": Key("text", "what the world looks like then; `?` matches anything"),
+        "always": Key("any", "conditions over the whole world that hold after every step"),
+        "seed": Key("number", "the seed; several are tried without one"),
+    },
+}
+
+OPEN = {"element": "a property", "also": "a property", "property": "an element"}
+"""Mappings that take further keys, and what those name."""
+
+PREFIXES = {"pass": ("for ", "repeat "), "block": ("for ", "repeat ")}
+"""Keys that are read as lines: `for side in (left, right)`, `repeat 2`."""
+
+NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+MAX_NAME = 40
+
+
+def first_line(node: Node) -> Span:
+    """The first line of a node: underlining a whole block helps nobody."""
+    span = node.span
+    end = span.source.text.find("\n", span.start)
+    return Span(span.source, span.start, max(min(span.end, end if end >= 0 else span.end), span.start + 1))
+
+
+class Reader:
+    """Reads located YAML by the table of keys, reporting what does not fit."""
+
+    def __init__(self, reporter: Reporter):
+        self.reporter = reporter
+
+    def shape(self, node: Node, wanted: str, help_text: str = "") -> None:
+        """Report a node of the wrong shape."""
+        found = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
+        self.reporter.error(
+            "PD107", f"expected {wanted}, found {found}", first_line(node), f"this is {found}", helps=[help_text] if help_text else []
+        )
+
+    def mapping(self, node: Node, context: str, what: str) -> dict[str, tuple[Scalar, Node]]:
+        """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""
+        if not isinstance(node, Mapping):
+            self.shape(node, f"a mapping with the keys of {what}", "known keys: " + ", ".join(KEYS[context]))
+            return {}
+        known = KEYS[context]
+        entries: dict[str, tuple[Scalar, Node]] = {}
+        for key, value in node.entries:
+            prefixed = key.text.startswith(PREFIXES.get(context, ())) and bool(PREFIXES.get(context))
+            if key.text in known or prefixed or context in OPEN:
+                entries[key.text] = (key, value)
+                if key.text in known:
+                    self._check_shape(known[key.text], key, value)
+            else:
+                self.reporter.error(
+                    "PD108", f"unknown key `{key.text}`", key.span, f"not a key of {what}",
+                    helps=suggest(key.text, known, f"keys of {what}") or ["known keys: " + ", ".join(known)],
+                )
+        for name, key_row in known.items():
+            if key_row.required and name not in entries:
+                self.reporter.error(
+                    "PD109", f"{what} lacks `{name}`", Span(node.span.source, node.span.start, node.span.start + 1),
+                    f"`{name}` is missing", helps=[f"`{name}`: {key_row.about}"],
+                )
+        return entries
+
+    def _check_shape(self, row: Key, key: Scalar, value: Node) -> None:
+        wants_scalar = row.shape in ("text", "word", "number", "flag", "line")
+        if wants_scalar and not isinstance(value, Scalar):
+            help_text = "in a `{…}` a value with commas needs quotes, or a line of its own" if isinstance(value, Mapping) else ""
+            self.shape(value, f"a single value for `{key.text}`", help_text)
+
+    def named(self, node: Node | None, what: str) -> Iterator[tuple[Scalar, Node]]:
+        """Entries of a mapping whose keys are new names; bad names are reported and left out."""
+        if node is None or (isinstance(node, Scalar) and node.text == ""):
+            return
+        if not isinstance(node, Mapping):
+            self.shape(node, f"a mapping of {what}")
+            return
+        for key, value in node.entries:
+            if self.name(key, what):
+                yield key, value
+
+    def name(self, key: Scalar, what: str) -> bool:
+        """Whether a scalar can be a name; reports if not."""
+        if NAME.match(key.text) and len(key.text) <= MAX_NAME:
+            return True
+        clean = re.sub(r"[^A-Za-z0-9_]+", "_", key.text).strip("_")[:MAX_NAME]
+        helps = [f"write `{clean}`"] if NAME.match(clean) else []
+        if not key.text or set(key.text) & set("()%:"):
+            helps = ["inside `{…}` YAML ends a value at a comma: quote the line, or give it a line of its own"]
+        self.reporter.error(
+            "PD111", f"`{key.text[:MAX_NAME]}` cannot name {what}", key.span, "letters, digits and `_`, a letter first",
+            helps=helps,
+        )
+        return False
+
+    def words(self, node: Node | None) -> tuple[Scalar, ...]:
+        """A word or a list of words."""
+        if node is None or (isinstance(node, Scalar) and node.text == ""):
+            return ()
+        if isinstance(node, Scalar):
+            return (node,)
+        if isinstance(node, Sequence):
+            for item in node.items:
+                if not isinstance(item, Scalar):
+                    self.shape(item, "a word")
+            return tuple(item for item in node.items if isinstance(item, Scalar))
+        self.shape(node, "a word or a list of words")
+        return ()
+
+    def scalar(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> Scalar | None:
+        value = entries.get(key, (None, None))[1]
+        return value if isinstance(value, Scalar) else None
+
+    def text(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> str:
+        value = self.scalar(entries, key)
+        return " ".join(value.text.split()) if value else ""
+
+    def number(self, entries: dict[str, tuple[Scalar, Node]], key: str, lo: int, hi: int) -> int | None:
+        """A whole decimal number within bounds."""
+        value = self.scalar(entries, key)
+        if value is None:
+            return None
+        if not re.fullmatch(r"-?(0|[1-9][0-9]{0,8})", value.text):
+            self.reporter.error("PD110", f"`{key}` must be a whole number", value.span, "not a whole number")
+            return None
+        if not lo <= int(value.text) <= hi:
+            self.reporter.error("PD402", f"`{key}` must lie in {lo}..{hi}", value.span, "out of range")
+            return None
+        return int(value.text)
+
+    def choice(self, entries: dict[str, tuple[Scalar, Node]], key: str, options: tuple[str, ...]) -> str | None:
+        value = self.scalar(entries, key)
+        if value is None or value.text in options:
+            return value.text if value else None
+        listed = ", ".join(f"`{option}`" for option in options)
+        self.reporter.error(
+            "PD110", f"`{key}` must be one of {listed}", value.span, "not one of them",
+            helps=suggest(value.text, options, "one of"),
+        )
+        return None

@@ -1,0 +1,318 @@
+"""The checked model: what a ruleset means, resolved, typed and unrolled. Frozen, printable, no torch, no NumPy.
+
+Everything discrete has a declared range; every chance and count is explicit. The reference interpreter runs these
+values directly, and `ir/lower.py` lowers them; neither looks at syntax again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+
+from powderdsl.diagnostics import Span
+
+Offset = tuple[int, int]
+"""(rows down, columns right)."""
+
+Value = int | float | Fraction | tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a value is. `lo` and `hi` are inclusive bounds of ``int``, ``real`` and ``vec2`` components.
+
+    ``flag``        a mask over cells
+    ``int``         lo..hi
+    ``element``     an element id
+    ``direction``   0..7: right, right-down, down, … as octants, counted clockwise on the screen
+    ``chance``      an exact probability in 0..1 (constants, parameters, properties)
+    ``draw``        a random number strictly between lo and hi: a stream's draw, plus whole numbers
+    ``real``        float32;  ``vec2``  two float32, (rows, columns)
+    """
+
+    name: str
+    lo: float = 0
+    hi: float = 0
+
+    def __str__(self) -> str:
+        match self.name:
+            case "int":
+                return f"{self.lo:g}..{self.hi:g}"
+            case "real" | "vec2":
+                return f"{self.name}({self.lo:g}..{self.hi:g})" if self.hi > self.lo else self.name
+        return self.name
+
+
+FLAG, ELEMENT, DIRECTION, CHANCE = Kind("flag"), Kind("element"), Kind("direction"), Kind("chance")
+REAL, VEC2, DRAW = Kind("real"), Kind("vec2"), Kind("draw", 0, 1)
+
+
+def integer(lo: float, hi: float) -> Kind:
+    return Kind("int", lo, hi)
+
+
+@dataclass(frozen=True)
+class Expr:
+    """A typed expression. `op` is one of `OPS`; `value` is what the operation needs besides its arguments."""
+
+    op: str
+    kind: Kind
+    args: tuple[Expr, ...] = ()
+    value: object = None
+    span: Span | None = field(default=None, compare=False, repr=False)
+
+    def walk(self) -> Iterator[Expr]:
+        """This expression and everything in it."""
+        yield self
+        for arg in self.args:
+            yield from arg.walk()
+
+
+OPS: dict[str, str] = {
+    "const": "value: the constant",
+    "param": "value: the parameter's qualified name",
+    "element": "the element of this cell",
+    "property": "value: the property's name, as this cell's element has it (or as the cell overrides it)",
+    "field": "value: the field's name, or a pass's scratch field",
+    "let": "value: the name of a value fixed earlier in the pass",
+    "draw": "value: the stream's name; a number strictly between 0 and 1",
+    "coordinate": "value: (row, column or step, modulus)",
+    "inside": "value: offset; whether that neighbour lies inside the grid",
+    "look": "value: offset; the argument as it is at that neighbour (the grid wraps around)",
+    "member": "value: frozen set of ids; whether the argument is one of them",
+    "not": "",
+    "and": "",
+    "or": "",
+    "eq": "",
+    "lt": "",
+    "le": "",
+    "add": "",
+    "sub": "",
+    "mul": "",
+    "div": "real division; x / 0 is 0",
+    "neg": "",
+    "abs": "",
+    "min": "",
+    "max": "",
+    "mod": "value: the modulus, a whole number above 0",
+    "to_real": "an int, flag or chance as float32; a draw rounded to float32",
+    "count": "value: kernel; weighted number of neighbourhood cells where the argument holds",
+    "sum": "value: kernel; weighted sum of the argument, within a row from the left, then the rows from the top",
+    "choose": "condition, value if it holds, value otherwise",
+    "octant": "the direction a vec2 points to",
+    "length": "√(y² + x²) in float32",
+    "row_part": "the first component of a vec2",
+    "column_part": "the second component of a vec2",
+    "vector": "a vec2 from its two components",
+}
+"""Every operation of the model, and what its `value` is."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element: its id is stable across any selection of packs. `glyph` is one ASCII character."""
+
+    name: str
+    pack: str
+    id: int
+    color: str
+    glyph: str
+    about: str
+    tags: frozenset[str]
+    span: Span = field(compare=False, repr=False)
+
+    @property
+    def qualified(self) -> str:
+        return f"{self.pack}.{self.name}"
+
+
+@dataclass(frozen=True)
+class Property:
+    """A constant of each element; `stored` has the ids whose cells may override it one by one."""
+
+    name: str
+    kind: Kind
+    values: tuple[Value | str, ...]
+    """By element id, `slots` of them; a string names a parameter."""
+    stored: frozenset[int]
+    pack: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Field:
+    """State of a cell. `at` is ``element`` (travels with it) or ``place``; `of` limits it to some elements."""
+
+    name: str
+    kind: Kind
+    default: Value
+    at: str
+    resets: bool
+    of: frozenset[int] | None
+    pack: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A source of random numbers. `ident` enters the hash; `bits` is the resolution of a draw."""
+
+    name: str
+    ident: int
+    bits: int
+
+
+@dataclass(frozen=True)
+class Param:
+    """A number that a user may override without editing the file. `name` is ``pack.name``."""
+
+    name: str
+    kind: Kind
+    default: Value
+    about: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Weights by offset, row by row from the top left. `wrap`: the grid wraps, else outside counts as nothing."""
+
+    name: str
+    weights: tuple[tuple[int, int, int], ...]
+    wrap: bool
+
+    @property
+    def radius(self) -> int:
+        return max((max(abs(dy), abs(dx)) for dy, dx, _ in self.weights), default=0)
+
+
+@dataclass(frozen=True)
+class Assign:
+    """`field := value` at the cell `offset` away from each cell of the mask. `op` is ``:=``, ``+=`` or ``-=``."""
+
+    field: str
+    offset: Offset
+    op: str
+    value: Expr
+    mask: Expr | None
+    """None for an effect: it happens where its rule happens."""
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Cells of the mask become the target element."""
+
+    mask: Expr
+    target: Expr
+    effects: tuple[Assign, ...]
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Swap:
+    """Cells of the mask exchange what they hold with the neighbour `offset` away."""
+
+    mask: Expr
+    offset: Offset
+    effects: tuple[Assign, ...]
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Move:
+    """Cells of the mask move what they hold to the neighbour `offset` away and leave a fresh element behind."""
+
+    mask: Expr
+    offset: Offset
+    leaving: Expr
+    effects: tuple[Assign, ...]
+    span: Span = field(compare=False, repr=False)
+
+
+Rule = Transform | Swap | Move | Assign
+
+
+@dataclass(frozen=True)
+class Let:
+    """A value fixed where it stands."""
+
+    name: str
+    value: Expr
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One simultaneous sub-step: first `lets` in order, then all `rules`, which read the world before.
+
+    Writes land in this order: assignments, then transforms, swaps and moves, then effects.
+    `policy` says what happens to rules that claim one cell: ``prove`` (shown to be impossible), ``drop_both``,
+    ``first_wins``.
+    """
+
+    lets: tuple[Let, ...]
+    rules: tuple[Rule, ...]
+    policy: str
+    label: str
+    """The loop variables of this copy, for messages: ``side = left``."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """A named, ordered part of a step. `scratch` fields start at their default when the pass starts."""
+
+    name: str
+    pack: str
+    scratch: tuple[Field, ...]
+    moments: tuple[Moment, ...]
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Example:
+    """A test of a pack: a world drawn in ASCII, and what it must look like some steps later."""
+
+    name: str
+    given: tuple[str, ...]
+    legend: tuple[tuple[str, str], ...]
+    steps: int
+    expect: tuple[str, ...] | None
+    always: tuple[Expr, ...]
+    pack: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Ruleset:
+    """A checked ruleset. `slots` is the number of ids: one-hot layouts have this many channels, some may be vacant."""
+
+    name: str
+    about: str
+    packs: tuple[str, ...]
+    elements: tuple[Element, ...]
+    slots: int
+    properties: tuple[Property, ...]
+    fields: tuple[Field, ...]
+    streams: tuple[Stream, ...]
+    params: tuple[Param, ...]
+    kernels: tuple[Kernel, ...]
+    passes: tuple[Pass, ...]
+    matrix: tuple[str, ...]
+    tests: tuple[Example, ...] = ()
+
+    def element(self, name: str) -> Element | None:
+        """The element of a plain or qualified name."""
+        return next((e for e in self.elements if name in (e.name, e.qualified)), None)
+
+    def property(self, name: str) -> Property | None:
+        return next((p for p in self.properties if p.name == name), None)
+
+    def field(self, name: str) -> Field | None:
+        return next((f for f in self.fields if f.name == name), None)
+
+    def with_params(self, values: dict[str, Value]) -> Ruleset:
+        """The same ruleset with other defaults; the values are checked by `compiler.set_params`."""
+        params = tuple(replace(p, default=values.get(p.name, p.default)) for p in self.params)
+        return replace(self, params=params)

@@ -1,0 +1,182 @@
+"""Text of one line -> syntax tree. Positions are offsets in the whole file, so carets are always right."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from lark import Lark, Token, Tree
+from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
+from lark.utils import TextSlice
+
+from powderdsl.diagnostics import Reporter, Source, Span
+from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.yaml_tree import Scalar
+
+MAX_LENGTH = 2000
+MAX_DEPTH = 48
+STARTS = ("rule", "expression", "header")
+
+TERMINAL_WORDS = {
+    "NAME": "a name",
+    "INTEGER": "a whole number",
+    "DECIMAL": "a number",
+    "PERCENT": "a percentage",
+    "YES": "`yes`",
+    "NO": "`no`",
+    "UPDATE": "`:=`",
+    "COMPARE": "a comparison",
+    "LPAR": "`(`",
+    "RPAR": "`)`",
+    "COMMA": "`,`",
+    "DOT": "`.`",
+    "PLUS": "`+`",
+    "MINUS": "`-`",
+    "STAR": "`*`",
+    "SLASH": "`/`",
+    "QMARK": "`?`",
+    "__ANON_0": "`->`",
+    "__ANON_1": "`..`",
+    "$END": "the end of the line",
+}
+"""What each terminal is called in messages; keywords, which are missing here, are called by themselves."""
+
+_VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
+_HINTS = (
+    ("=", "compare with `==`, assign with `:=`"),
+    ("&", "write `and`"),
+    ("|", "write `or`"),
+    ("!", "write `not`, or `!=` between two values"),
+    ("{", "the line language has no braces; in YAML's `{…}` a rule with commas needs a block list"),
+    ("[", "sets are written `(a, b)`"),
+    ("→", "write `->`"),
+    ("≥", "write `>=`"),
+    ("≤", "write `<=`"),
+    ('"', "names stand without quotes"),
+    ("'", "names stand without quotes"),
+    (":", "assign with `:=`"),
+)
+
+
+@lru_cache(maxsize=1)
+def parser() -> Lark:
+    """The one parser of the line language."""
+    return Lark(
+        Path(__file__).with_name("grammar.lark").read_text(encoding="utf-8"),
+        parser="lalr",
+        lexer="basic",
+        start=list(STARTS),
+        propagate_positions=True,
+        maybe_placeholders=False,
+    )
+
+
+def reserved_words() -> frozenset[str]:
+    """Words of the grammar that cannot be names."""
+    words = set()
+    for terminal in parser().terminals:
+        pattern = terminal.pattern
+        if terminal.name in ("YES", "NO"):
+            words |= {"yes", "true", "no", "false"}
+        elif pattern.type == "str" and pattern.value.isalpha():
+            words.add(pattern.value)
+    return frozenset(words)
+
+
+def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | None:
+    """Parse a YAML scalar as `rule`, `expression` or `header`; report and return None if it is none."""
+    span = scalar.content
+    if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
+        reporter.error(
+            "PD203", "escapes in a quoted rule", scalar.span, "escaped or doubled quotes", helps=["write the line without quotes"]
+        )
+        return None
+    return parse_text(span.source, span.start, span.end, start, reporter)
+
+
+def parse_text(source: Source, begin: int, end: int, start: str, reporter: Reporter) -> Syntax | None:
+    """Parse characters `begin` to `end` of a source. Reports at most one syntax error."""
+    whole = Span(source, begin, max(end, begin + 1))
+    if end - begin > MAX_LENGTH:
+        reporter.error(
+            "PD202", f"a line of {end - begin:,} characters", Span(source, begin, begin + 1),
+            f"longer than {MAX_LENGTH:,}", helps=["give parts of it names with `let:`"],
+        )
+        return None
+    try:
+        tree = parser().parse(TextSlice(source.text, begin, end), start=start)
+    except UnexpectedInput as error:
+        _report_syntax_error(error, source, begin, end, reporter)
+        return None
+    try:
+        return _convert(tree, source, whole, 0)
+    except _TooDeep:
+        reporter.error(
+            "PD202", f"an expression nested more than {MAX_DEPTH} deep", Span(source, begin, begin + 1),
+            helps=["give parts of it names with `let:`"],
+        )
+        return None
+
+
+class _TooDeep(Exception):
+    pass
+
+
+def _convert(tree: Tree | Token, source: Source, fallback: Span, depth: int) -> Syntax:
+    if depth > MAX_DEPTH:
+        raise _TooDeep
+    if isinstance(tree, Token):
+        start = tree.start_pos if tree.start_pos is not None else fallback.start
+        stop = tree.end_pos if tree.end_pos is not None else fallback.end
+        return Syntax("token", (), str(tree), Span(source, start, stop))
+    meta = tree.meta
+    span = fallback if meta.empty else Span(source, meta.start_pos, meta.end_pos)
+    children = [_convert(child, source, span, depth + 1) for child in tree.children]
+    text = " ".join(child.text for child in children if child.kind == "token")
+    nodes = tuple(child for child in children if child.kind != "token")
+    return Syntax(str(tree.data), nodes, text, span)
+
+
+def _report_syntax_error(error: UnexpectedInput, source: Source, begin: int, end: int, reporter: Reporter) -> None:
+    text = source.text
+    helps: list[str] = []
+    if isinstance(error, UnexpectedCharacters):
+        start = error.pos_in_stream
+        char = text[start]
+        helps = [cure for hint, cure in _HINTS if char == hint][:1]
+        reporter.error("PD201", f"unexpected character `{char}`", Span(source, start, start + 1), "not part of a rule", helps=helps)
+        return
+    assert isinstance(error, UnexpectedToken)
+    token = error.token
+    at_end = token.type == "$END"
+    start = len(text[:end].rstrip()) if at_end else token.start_pos
+    start = min(max(start, begin), max(len(text) - 1, 0))
+    stop = start + (1 if at_end else len(token))
+    accepted = set(error.accepts or error.expected or ())
+    expected = _expected_words(accepted)
+    if token.type == "UPDATE" or (not at_end and token in (":=", "+=", "-=")):
+        helps = ["only a field of this cell, or of a neighbour, can be assigned"]
+    elif not at_end and token == "if" and "where" in {name.lower() for name in accepted}:
+        helps = ["an assignment says `where`: `field := value where condition`"]
+    elif not at_end and token == "where":
+        helps = ["only assignments say `where`; this rule says `if`"]
+    if at_end and text.count("(", begin, end) > text.count(")", begin, end):
+        helps = ["inside `{…}` YAML ends a value at a comma: quote the line, or give it a line of its own"]
+    what = "the line ends too early" if at_end else f"unexpected `{token}`"
+    label = f"expected {expected}" if expected else ""
+    reporter.error("PD201", what, Span(source, start, max(stop, start + 1)), label, helps=helps)
+
+
+def _expected_words(accepted: set[str]) -> str:
+    words = set()
+    rest = set(accepted)
+    if _VALUE_STARTS <= rest:
+        words.add("a value")
+        rest -= {"NAME", "INTEGER", "DECIMAL", "PERCENT", "YES", "NO", "LPAR", "ANY", "ALL", "MINUS", "NOT"}
+    operators = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "__ANON_1"}
+    if len(rest & operators) > 3:
+        words.add("an operator")
+        rest -= operators | {"DOT", "QMARK"}
+    for name in rest:
+        words.add(TERMINAL_WORDS.get(name, f"`{name.lower()}`"))
+    return ", ".join(sorted(words)[:8])

@@ -1,0 +1,193 @@
+"""YAML text -> located tree. YAML carries structure only: no tags, anchors, merges, or resolved scalars.
+
+Every node knows its span in the file. Scalars stay text; the schema decides what they mean, so YAML 1.1's
+surprises (`no` as false, `012` as ten, `1:30` as ninety) never happen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import yaml
+
+from powderdsl.diagnostics import Label, Reporter, Source, Span
+
+MAX_CHARACTERS = 1 << 20
+MAX_DEPTH = 32
+MAX_NODES = 50_000
+
+_Loader: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A scalar's text. `content` spans the text without quotes; `style` is one of ``plain quoted block``."""
+
+    text: str
+    span: Span
+    content: Span
+    style: str
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A list."""
+
+    items: tuple[Node, ...]
+    span: Span
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """A mapping, in the order of the file. Keys are unique scalars."""
+
+    entries: tuple[tuple[Scalar, Node], ...]
+    span: Span
+
+    def get(self, key: str) -> Node | None:
+        for name, value in self.entries:
+            if name.text == key:
+                return value
+        return None
+
+
+Node = Scalar | Sequence | Mapping
+
+
+def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
+    """Parse a whole file. Reports what is wrong and returns None where no tree can be had."""
+    text = source.text
+    if len(text) > MAX_CHARACTERS:
+        reporter.error(
+            "PD102",
+            f"file of {len(text):,} characters",
+            None,
+            notes=[f"{source.name}: a rule file may have {MAX_CHARACTERS:,} characters"],
+            helps=["split the pack, or check that this is the file you meant"],
+        )
+        return None
+    builder = _Builder(source, reporter)
+    try:
+        # Events are counted before anything recursive runs: the C loader's composer can be crashed by depth.
+        return builder.build(yaml.parse(text, Loader=_Loader))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        start = min(mark.index if mark else 0, max(len(text) - 1, 0))
+        problem = " ".join(str(error.problem or error.context or "not readable").split())
+        helps = ["text with `: ` or ` #` in it needs quotes or a `|` block"] if ":" in problem or "map" in problem else []
+        if "\\t" in problem or "'\\t'" in str(error):
+            helps = ["indent with spaces, not tabs"]
+        reporter.error("PD103", "invalid YAML", Span(source, start, start + 1), problem, helps=helps)
+    except yaml.YAMLError as error:
+        position = getattr(error, "position", 0) or 0
+        start = min(position if isinstance(position, int) else 0, max(len(text) - 1, 0))
+        reporter.error(
+            "PD103", "invalid YAML", Span(source, start, start + 1), "a character that YAML does not allow here"
+        )
+    except _Abort:
+        pass
+    return None
+
+
+class _Abort(Exception):
+    """Stops at the first thing that makes the rest of the document meaningless or dangerous."""
+
+
+class _Builder:
+    """Builds the tree from parser events with an explicit bound on depth and size."""
+
+    def __init__(self, source: Source, reporter: Reporter):
+        self.source = source
+        self.reporter = reporter
+        self.nodes = 0
+
+    def build(self, events) -> Node | None:  # type: ignore[no-untyped-def]
+        root: Node | None = None
+        documents = 0
+        for event in events:
+            if isinstance(event, yaml.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
+                    self._forbid(event, "a second document", "keep one pack to a file")
+            elif isinstance(event, yaml.NodeEvent):
+                root = self._node(event, events, 0)
+        return root
+
+    def _span(self, event) -> Span:  # type: ignore[no-untyped-def]
+        start, end = event.start_mark.index, event.end_mark.index
+        return Span(self.source, start, max(start, end))
+
+    def _forbid(self, event, what: str, cure: str) -> None:  # type: ignore[no-untyped-def]
+        span = self._span(event)
+        first_line_end = self.source.text.find("\n", span.start)
+        end = min(span.end, first_line_end if first_line_end >= 0 else span.end)
+        self.reporter.error("PD105", f"{what} is not allowed", Span(self.source, span.start, max(end, span.start + 1)), helps=[cure])
+        raise _Abort
+
+    def _node(self, event, events, depth: int) -> Node:  # type: ignore[no-untyped-def]
+        self.nodes += 1
+        if depth > MAX_DEPTH or self.nodes > MAX_NODES:
+            what = f"nested more than {MAX_DEPTH} deep" if depth > MAX_DEPTH else f"of more than {MAX_NODES:,} values"
+            start = event.start_mark.index
+            self.reporter.error("PD106", f"document {what}", Span(self.source, start, start + 1))
+            raise _Abort
+        if isinstance(event, yaml.AliasEvent):
+            self._forbid(event, f"the alias `*{event.anchor}`", "write the value out: rule files have no anchors")
+        if event.anchor:
+            self._forbid(event, f"the anchor `&{event.anchor}`", "write the value out: rule files have no anchors")
+        if event.tag is not None and event.tag != "!":
+            self._forbid(event, f"the tag `{event.tag}`", "remove it: rule files are plain data")
+        if isinstance(event, yaml.ScalarEvent):
+            return self._scalar(event)
+        if isinstance(event, yaml.SequenceStartEvent):
+            return self._sequence(event, events, depth)
+        return self._mapping(event, events, depth)
+
+    def _scalar(self, event) -> Scalar:  # type: ignore[no-untyped-def]
+        span = self._span(event)
+        if event.style in ("'", '"'):
+            return Scalar(event.value, span, Span(self.source, span.start + 1, max(span.start + 1, span.end - 1)), "quoted")
+        if event.style in ("|", ">"):
+            newline = self.source.text.find("\n", span.start)
+            body = newline + 1 if newline >= 0 else span.end
+            return Scalar(event.value, Span(self.source, span.start, span.start + 1), Span(self.source, body, max(body, span.end)), "block")
+        return Scalar(event.value, span, span, "plain")
+
+    def _sequence(self, start, events, depth: int) -> Sequence:  # type: ignore[no-untyped-def]
+        items = []
+        for event in events:
+            if isinstance(event, yaml.SequenceEndEvent):
+                break
+            items.append(self._node(event, events, depth + 1))
+        return Sequence(tuple(items), self._collection_span(start, items[-1].span if items else None))
+
+    def _mapping(self, start, events, depth: int) -> Mapping:  # type: ignore[no-untyped-def]
+        entries: list[tuple[Scalar, Node]] = []
+        seen: dict[str, Span] = {}
+        for event in events:
+            if isinstance(event, yaml.MappingEndEvent):
+                break
+            key = self._node(event, events, depth + 1)
+            value = self._node(next(events), events, depth + 1)
+            if not isinstance(key, Scalar):
+                self.reporter.error("PD107", "a key must be a word", key.span, helps=["a list or a mapping cannot be a key"])
+            elif key.text == "<<":
+                self.reporter.error("PD105", "the merge key `<<` is not allowed", key.span, helps=["write the entries out"])
+            elif key.text in seen:
+                self.reporter.error(
+                    "PD104",
+                    f"key `{key.text}` stands twice in one mapping",
+                    key.span,
+                    "second time here",
+                    secondary=[Label(seen[key.text], "first time here")],
+                    helps=["keep one of them, or join them"],
+                )
+            else:
+                seen[key.text] = key.span
+                entries.append((key, value))
+        return Mapping(tuple(entries), self._collection_span(start, entries[-1][1].span if entries else None))
+
+    def _collection_span(self, start, last: Span | None) -> Span:  # type: ignore[no-untyped-def]
+        # A block collection's end mark runs to the next token; the last child's end is where a reader sees it end.
+        begin = start.start_mark.index
+        return Span(self.source, begin, max(start.end_mark.index, last.end if last else 0, begin + 1))

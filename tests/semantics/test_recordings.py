@@ -1,0 +1,274 @@
+"""The Powderworld ruleset against recorded steps of the published engine, pass by pass.
+
+Each recording holds steps of the engine as it ran: the state before the step, the random numbers it drew, and the
+state after each of its twelve passes. Here the same state and the same numbers go into the ruleset, all steps of one
+file as one batch of worlds, on both backends, in two ways:
+
+* cumulative: passes 1..k in one step from the state before it, for each k. This is the only way to check piling and
+  flow, which read what the gravity pass of the same step left in a scratch field;
+* single: pass k alone from the recorded state after pass k - 1, for every other pass. A fault shows in the test of the
+  pass that has it.
+
+What must agree: element ids, gravity and clone in every cell; velocity within 1e-3 (2e-5 cells/step is usual: the
+two sum floats in another order); momentum in every cell before the wind. After the wind, ids may differ in one cell of
+10,000 (a velocity on the border of two octants may round either way), and momentum where the engine's one known
+quirk can explain it: see `quirk_can_explain`. What the ruleset should do in those cells instead is checked for
+itself, in `test_wind_carries_what_a_cell_holds`.
+
+The recordings in tests/data are a few steps of each file, chosen so that every event of the full files is among them
+(tests/data/make_recordings.py). To check against full recordings, or others of the same kind:
+
+    POWDERDSL_RECORDINGS=FOLDER pytest tests/semantics/test_recordings.py
+
+which reads every .npz file in FOLDER that has a `before_ids` array.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import powderdsl
+
+DATA = Path(__file__).parents[1] / "data"
+STREAMS = ("movement", "interact", "element")
+FIELDS = ("gravity", "momentum", "clone", "velocity")
+PASSES = (
+    "stone", "gravity", "piling", "flow", "melt", "freeze", "fire", "plant", "lava", "acid", "cloner", "wind",
+)  # fmt: skip
+# Passes that read the scratch field, which a step starts at zero: no recorded state can hold it.
+NEED_SCRATCH = ("piling", "flow")
+EMPTY = 0
+
+VELOCITY_TOLERANCE = 1e-3
+IDS_AFTER_WIND = 0.9999  # share of cells that must agree
+# The quirk shows in 0.05 % of cells over all full recordings, 0.12 % in the one that has most of it.
+QUIRK_SHARE_OVER_ALL = 0.001
+QUIRK_SHARE_IN_A_FILE = 0.002
+# An overrun cell lies within two cells of where its effect is found, in all full recordings; one more for others.
+QUIRK_REACH = 3
+MOVING_SPEED = 0.1  # the wind pass moves nothing below it
+
+
+@dataclass(frozen=True)
+class State:
+    """One recorded or computed state of B worlds: ids and integer fields [B, H, W], velocity float32 [B, 2, H, W]."""
+
+    ids: np.ndarray
+    gravity: np.ndarray
+    momentum: np.ndarray
+    clone: np.ndarray
+    velocity: np.ndarray
+
+
+@dataclass(frozen=True)
+class Recording:
+    """n recorded steps: `states[k]` after k passes (0: before the step), each draw of `random` float32 [n, H, W]."""
+
+    elements: tuple[str, ...]
+    passes: tuple[str, ...]
+    random: dict[str, np.ndarray]
+    states: tuple[State, ...]
+
+
+def recording_paths() -> list[Path]:
+    """The recordings to test against; FileNotFoundError when there are none, so that no run passes for want of them."""
+    folder = Path(os.environ.get("POWDERDSL_RECORDINGS") or DATA)
+    paths = []
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path, allow_pickle=False) as archive:
+            if "before_ids" in archive.files:
+                paths.append(path)
+    if not paths:
+        raise FileNotFoundError(f"no recordings in {folder}")
+    return paths
+
+
+@cache
+def read_recording(path: Path) -> Recording:
+    """Read one recording."""
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    names = ("ids", *FIELDS)
+    before = State(*(arrays[f"before_{name}"] for name in names))
+    after = [State(*(arrays[f"after_{name}"][k] for name in names)) for k in range(len(arrays["passes"]))]
+    draws = (arrays["random"].astype(np.float32) + np.float32(0.5)) / np.float32(256)
+    return Recording(
+        elements=tuple(arrays["elements"].tolist()),
+        passes=tuple(arrays["passes"].tolist()),
+        random=dict(zip(STREAMS, draws, strict=True)),
+        states=(before, *after),
+    )
+
+
+@dataclass(frozen=True)
+class Runner:
+    """The compiled ruleset on one backend, taking and giving NumPy arrays."""
+
+    backend: str
+    simulator: Any
+
+    def run(self, state: State, random: dict[str, np.ndarray], passes: tuple[str, ...]) -> State:
+        """The state after one step that runs only `passes`."""
+        world = self.simulator.world(self.given(state.ids))
+        world = self.simulator.replace(world, **{name: self.given(getattr(state, name)) for name in FIELDS})
+        draws = {stream: self.given(draw) for stream, draw in random.items()}
+        world = self.simulator.step(world, random=draws, passes=list(passes))
+        return State(np.asarray(world.ids), *(np.asarray(world[name]) for name in FIELDS))
+
+    def given(self, array: np.ndarray) -> Any:
+        """The array as the backend's own type."""
+        if self.backend == "reference":
+            return array
+        import torch
+
+        return torch.from_numpy(array.copy())
+
+
+@cache
+def compiled(backend: str) -> Runner:
+    """The Powderworld ruleset on one backend, compiled once for all tests."""
+    return Runner(backend, powderdsl.compile(powderdsl.load("powderworld"), backend=backend))
+
+
+@cache
+def wind_alone(backend: str, path: Path) -> State:
+    """The state after the wind pass alone, from each recorded state before it."""
+    recording = read_recording(path)
+    return compiled(backend).run(recording.states[-2], recording.random, ("wind",))
+
+
+@pytest.fixture(params=["reference", "torch"])
+def runner(request: pytest.FixtureRequest) -> Runner:
+    """The ruleset on each backend in turn."""
+    return compiled(request.param)
+
+
+@pytest.fixture(params=recording_paths(), ids=lambda path: path.stem)
+def path(request: pytest.FixtureRequest) -> Path:
+    """Each recording's path in turn."""
+    return request.param
+
+
+@pytest.fixture
+def recording(path: Path) -> Recording:
+    """Each recording in turn."""
+    return read_recording(path)
+
+
+def near(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Cells [B, H, W] within `reach` rows and columns of a cell of the mask, around the edges too."""
+    for axis in (-2, -1):
+        mask = np.any([np.roll(mask, shift, axis) for shift in range(-reach, reach + 1)], axis=0)
+    return mask
+
+
+def quirk_can_explain(before_wind: State) -> np.ndarray:
+    """Cells [B, H, W] whose momentum after the wind the engine's quirk may have falsified.
+
+    When a cell moves into an empty cell that itself moves in that very sub-step, the engine subtracts the empty
+    cell's leftover momentum from the arriving cell's. So there must have been, close by, an empty cell with a
+    momentum and wind to move it; the wind pass carries nothing far.
+    """
+    leftover = (before_wind.ids == EMPTY) & (before_wind.momentum != 0)
+    windy = np.hypot(before_wind.velocity[:, 0], before_wind.velocity[:, 1]) > MOVING_SPEED
+    # The wind pass moves everything twice: wind beside a cell in the first round may be on it in the second.
+    return near(leftover & near(windy, 1), QUIRK_REACH)
+
+
+def where_first(mask: np.ndarray) -> str:
+    """How many cells a mask [B, H, W] has, and the first few of them, for a message."""
+    cells = [tuple(cell) for cell in np.argwhere(mask)[:5].tolist()]
+    return f"{np.count_nonzero(mask)} of {mask.size} cells, the first (world, row, column): {cells}"
+
+
+def assert_same(ours: State, recording: Recording, passes_done: int) -> None:
+    """Fail unless a state is the recorded one after so many passes, within what the module's head allows."""
+    engine = recording.states[passes_done]
+    other_ids = ours.ids != engine.ids
+    other_momentum = ours.momentum != engine.momentum
+    if recording.passes[passes_done - 1] == "wind":
+        assert other_ids.mean() <= 1 - IDS_AFTER_WIND, f"ids: {where_first(other_ids)}"
+        # A cell that rounding sent elsewhere took all its fields along.
+        unexplained = other_momentum & ~other_ids & ~quirk_can_explain(recording.states[passes_done - 1])
+        assert not unexplained.any(), f"momentum, no quirk near: {where_first(unexplained)}"
+        assert other_momentum.mean() <= QUIRK_SHARE_IN_A_FILE, f"momentum: {where_first(other_momentum)}"
+    else:
+        assert not other_ids.any(), f"ids: {where_first(other_ids)}"
+        assert not other_momentum.any(), f"momentum: {where_first(other_momentum)}"
+    for name in ("gravity", "clone"):
+        other = (getattr(ours, name) != getattr(engine, name)) & ~other_ids
+        assert not other.any(), f"{name}: {where_first(other)}"
+    assert ours.velocity.dtype == np.float32
+    far = ~(np.abs(ours.velocity - engine.velocity) <= VELOCITY_TOLERANCE).all(axis=1)  # ~ and <=: NaN is far too
+    assert not far.any(), f"velocity: {where_first(far)}"
+
+
+def test_names_and_order_are_the_engines(runner: Runner, recording: Recording) -> None:
+    assert tuple(runner.simulator.elements) == recording.elements
+    assert tuple(runner.simulator.passes) == recording.passes == PASSES
+
+
+@pytest.mark.parametrize("last", PASSES)
+def test_cumulative(runner: Runner, recording: Recording, last: str) -> None:
+    done = PASSES.index(last) + 1
+    assert_same(runner.run(recording.states[0], recording.random, PASSES[:done]), recording, done)
+
+
+@pytest.mark.parametrize("alone", [name for name in PASSES if name not in (*NEED_SCRATCH, "wind")])
+def test_single_pass(runner: Runner, recording: Recording, alone: str) -> None:
+    done = PASSES.index(alone) + 1
+    assert_same(runner.run(recording.states[done - 1], recording.random, (alone,)), recording, done)
+
+
+def test_wind_alone(runner: Runner, path: Path) -> None:
+    assert_same(wind_alone(runner.backend, path), read_recording(path), len(PASSES))
+
+
+def test_wind_carries_what_a_cell_holds(runner: Runner, path: Path) -> None:
+    """In each world, the non-empty cells are the same before and after the wind, with all they hold.
+
+    With the quirk they would not be: this is what the ruleset does where the engine cannot be followed.
+    """
+
+    def cells(state: State, world: int) -> np.ndarray:
+        held = np.stack([state.ids, state.gravity, state.momentum, state.clone]).astype(int)[:, world]
+        solid = held[:, held[0] != EMPTY]
+        return solid[:, np.lexsort(solid)]
+
+    before, after = read_recording(path).states[-2], wind_alone(runner.backend, path)
+    for world in range(len(before.ids)):
+        np.testing.assert_array_equal(cells(after, world), cells(before, world))
+
+
+def test_quirk_is_rare(runner: Runner) -> None:
+    """Momentum differs in under 0.1 % of cells after the wind, all recordings taken together."""
+    cells = differing = 0
+    for path in recording_paths():
+        engine, ours = read_recording(path).states[-1], wind_alone(runner.backend, path)
+        cells += engine.ids.size
+        differing += np.count_nonzero(ours.momentum != engine.momentum)
+    assert differing < QUIRK_SHARE_OVER_ALL * cells
+
+
+@pytest.mark.skipif("POWDERDSL_RECORDINGS" in os.environ, reason="a statement about the recordings in tests/data")
+def test_small_recordings_show_everything() -> None:
+    """The recordings kept here hold every element, gusts of wind, and something for each pass to do."""
+    recordings = [read_recording(path) for path in recording_paths()]
+    assert len(recordings) == 4
+    present = {element for recording in recordings for element in np.unique(recording.states[0].ids).tolist()}
+    assert present == set(range(14))
+    assert any(np.abs(recording.states[0].velocity).max() > 10 for recording in recordings)
+    for index, name in enumerate(PASSES):
+        field = "gravity" if name == "stone" else "ids"
+        changed = sum(
+            np.count_nonzero(getattr(recording.states[index], field) != getattr(recording.states[index + 1], field))
+            for recording in recordings
+        )
+        assert changed >= 20, name
