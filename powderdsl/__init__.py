@@ -1,0 +1,36 @@
+"""Physics as data, compiled to tensor kernels, trained on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from powderdsl.compiler import compile, load
+    from powderdsl.diagnostics import CompileError
+    from powderdsl.simulator import Simulator, World
+    from powderdsl.worlds.store import load_world, save
+
+_HOMES = {
+    "load": "powderdsl.compiler",
+    "compile": "powderdsl.compiler",
+    "CompileError": "powderdsl.diagnostics",
+    "Simulator": "powderdsl.simulator",
+    "World": "powderdsl.simulator",
+    "save": "powderdsl.worlds.store",
+    "load_world": "powderdsl.worlds.store",
+}
+
+__all__ = ["CompileError", "Simulator", "World", "compile", "load", "load_world", "save"]
+
+
+def __getattr__(name: str) -> Any:
+    """Public names are imported when first used: torch only comes in with what needs it."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'powderdsl' has no attribute {name!r}")
+    from importlib import import_module
+
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value

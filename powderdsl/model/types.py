@@ -282,6 +282,7 @@ class Example:
     always: tuple[Expr, ...]
     pack: str
     span: Span = field(compare=False, repr=False)
+    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -297,7 +298,6 @@ class Ruleset:
     fields: tuple[Field, ...]
     streams: tuple[Stream, ...]
     params: tuple[Param, ...]
-    kernels: tuple[Kernel, ...]
     passes: tuple[Pass, ...]
     matrix: tuple[str, ...]
     tests: tuple[Example, ...] = ()

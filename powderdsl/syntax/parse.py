@@ -22,8 +22,6 @@ TERMINAL_WORDS = {
     "INTEGER": "a whole number",
     "DECIMAL": "a number",
     "PERCENT": "a percentage",
-    "YES": "`yes`",
-    "NO": "`no`",
     "UPDATE": "`:=`",
     "COMPARE": "a comparison",
     "LPAR": "`(`",
@@ -76,9 +74,7 @@ def reserved_words() -> frozenset[str]:
     words = set()
     for terminal in parser().terminals:
         pattern = terminal.pattern
-        if terminal.name in ("YES", "NO"):
-            words |= {"yes", "true", "no", "false"}
-        elif pattern.type == "str" and pattern.value.isalpha():
+        if pattern.type == "str" and pattern.value.isalpha():
             words.add(pattern.value)
     return frozenset(words)
 
@@ -172,7 +168,7 @@ def _expected_words(accepted: set[str]) -> str:
     rest = set(accepted)
     if _VALUE_STARTS <= rest:
         words.add("a value")
-        rest -= {"NAME", "INTEGER", "DECIMAL", "PERCENT", "YES", "NO", "LPAR", "ANY", "ALL", "MINUS", "NOT"}
+        rest -= {"NAME", "INTEGER", "DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE", "LPAR", "CHANCE", "ANY", "ALL", "MINUS", "NOT"}
     operators = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "__ANON_1"}
     if len(rest & operators) > 3:
         words.add("an operator")

@@ -2,15 +2,15 @@
 
     python tests/data/make_recordings.py FOLDER
 
-A full recording holds steps of the published Powderworld engine, one state after every pass. This script keeps the
-few steps of each file that show everything: steps are taken one at a time, each time the one that adds the most events
-not seen so far, until every event of the file is seen. An event is a pass putting one element in the place of another
-somewhere, or raising or lowering the gravity, momentum or clone of a cell of an element, or changing its velocity.
-Array names and types stay as they are, so that tests read small and full recordings alike; `population.npz`, counts of
-elements only, is copied whole.
+A full recording holds steps of the published Powderworld engine, one state after every pass. This script
+keeps the few steps of each file that show everything: steps are taken one at a time, each time the one that
+adds the most events not seen so far, until every event of the file is seen. An event is a pass putting one
+element in the place of another somewhere, or raising or lowering the gravity, momentum or clone of a cell
+of an element, or changing its velocity. Array names and types stay as they are, so that tests read small
+and full recordings alike; `population.npz`, counts of elements only, is copied whole.
 
-The output depends on nothing but the input. Files are zip archives packed with LZMA, which finds the repetition from
-pass to pass that deflate's short window misses; `numpy.load` reads them like any other.
+The output depends on nothing but the input. Files are zip archives packed with LZMA, which finds the
+repetition from pass to pass that deflate's short window misses; `numpy.load` reads them like any other.
 """
 
 from __future__ import annotations

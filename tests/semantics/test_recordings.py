@@ -1,22 +1,22 @@
 """The Powderworld ruleset against recorded steps of the published engine, pass by pass.
 
-Each recording holds steps of the engine as it ran: the state before the step, the random numbers it drew, and the
-state after each of its twelve passes. Here the same state and the same numbers go into the ruleset, all steps of one
-file as one batch of worlds, on both backends, in two ways:
+Each recording holds steps of the engine as it ran: the state before the step, the random numbers it drew,
+and the state after each of its twelve passes. Here the same state and the same numbers go into the ruleset,
+all steps of one file as one batch of worlds, on both backends, in two ways:
 
-* cumulative: passes 1..k in one step from the state before it, for each k. This is the only way to check piling and
-  flow, which read what the gravity pass of the same step left in a scratch field;
-* single: pass k alone from the recorded state after pass k - 1, for every other pass. A fault shows in the test of the
-  pass that has it.
+* cumulative: passes 1..k in one step from the state before it, for each k. This is the only way to check
+  piling and flow, which read what the gravity pass of the same step left in a scratch field;
+* single: pass k alone from the recorded state after pass k - 1, for every other pass. A fault shows in the
+  test of the pass that has it.
 
-What must agree: element ids, gravity and clone in every cell; velocity within 1e-3 (2e-5 cells/step is usual: the
-two sum floats in another order); momentum in every cell before the wind. After the wind, ids may differ in one cell of
-10,000 (a velocity on the border of two octants may round either way), and momentum where the engine's one known
-quirk can explain it: see `quirk_can_explain`. What the ruleset should do in those cells instead is checked for
-itself, in `test_wind_carries_what_a_cell_holds`.
+What must agree: element ids, gravity and clone in every cell; velocity within 1e-3 (4e-6 is what another
+order of summing floats makes of it); momentum in every cell before the wind. After the wind, ids may differ
+in one cell of 10,000 (a velocity on the border of two octants may round either way), and momentum where the
+engine's one known quirk can explain it: see `quirk_can_explain`. What the ruleset does in those cells
+instead is checked for itself, in `test_wind_carries_what_a_cell_holds`.
 
-The recordings in tests/data are a few steps of each file, chosen so that every event of the full files is among them
-(tests/data/make_recordings.py). To check against full recordings, or others of the same kind:
+The recordings in tests/data are a few steps of each file, chosen so that every event of the full files is
+among them (tests/data/make_recordings.py). To check against full recordings, or others of the same kind:
 
     POWDERDSL_RECORDINGS=FOLDER pytest tests/semantics/test_recordings.py
 
@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 import powderdsl
@@ -48,17 +49,17 @@ EMPTY = 0
 
 VELOCITY_TOLERANCE = 1e-3
 IDS_AFTER_WIND = 0.9999  # share of cells that must agree
-# The quirk shows in 0.05 % of cells over all full recordings, 0.12 % in the one that has most of it.
-QUIRK_SHARE_OVER_ALL = 0.001
-QUIRK_SHARE_IN_A_FILE = 0.002
-# An overrun cell lies within two cells of where its effect is found, in all full recordings; one more for others.
+QUIRK_SHARE = 0.001  # of cells, over all recordings; it is 0.05 % in the full ones
+# Cells between the start of an overrun cell and the effect: up to 2 in the full recordings, and one to spare.
 QUIRK_REACH = 3
 MOVING_SPEED = 0.1  # the wind pass moves nothing below it
+
+Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class State:
-    """One recorded or computed state of B worlds: ids and integer fields [B, H, W], velocity float32 [B, 2, H, W]."""
+    """A state of B worlds, recorded or computed: velocity float32 [B, 2, H, W], others integer [B, H, W]."""
 
     ids: np.ndarray
     gravity: np.ndarray
@@ -69,7 +70,7 @@ class State:
 
 @dataclass(frozen=True)
 class Recording:
-    """n recorded steps: `states[k]` after k passes (0: before the step), each draw of `random` float32 [n, H, W]."""
+    """n recorded steps: `states[k]` is the state after k passes, `random` the draws, float32 [n, H, W]."""
 
     elements: tuple[str, ...]
     passes: tuple[str, ...]
@@ -78,7 +79,7 @@ class Recording:
 
 
 def recording_paths() -> list[Path]:
-    """The recordings to test against; FileNotFoundError when there are none, so that no run passes for want of them."""
+    """The recordings to test against; FileNotFoundError when there are none."""
     folder = Path(os.environ.get("POWDERDSL_RECORDINGS") or DATA)
     paths = []
     for path in sorted(folder.glob("*.npz")):
@@ -153,7 +154,8 @@ def runner(request: pytest.FixtureRequest) -> Runner:
 @pytest.fixture(params=recording_paths(), ids=lambda path: path.stem)
 def path(request: pytest.FixtureRequest) -> Path:
     """Each recording's path in turn."""
-    return request.param
+    chosen: Path = request.param
+    return chosen
 
 
 @pytest.fixture
@@ -162,27 +164,37 @@ def recording(path: Path) -> Recording:
     return read_recording(path)
 
 
-def near(mask: np.ndarray, reach: int) -> np.ndarray:
+def near(mask: Mask, reach: int) -> Mask:
     """Cells [B, H, W] within `reach` rows and columns of a cell of the mask, around the edges too."""
-    for axis in (-2, -1):
-        mask = np.any([np.roll(mask, shift, axis) for shift in range(-reach, reach + 1)], axis=0)
-    return mask
+    shifts = range(-reach, reach + 1)
+    found = np.zeros_like(mask)
+    for down in shifts:
+        for right in shifts:
+            found |= np.roll(mask, (down, right), (-2, -1))
+    return found
 
 
-def quirk_can_explain(before_wind: State) -> np.ndarray:
+def may_be_overrun(before_wind: State) -> Mask:
+    """Empty cells [B, H, W] that hold a momentum and have wind to move them when the wind pass begins.
+
+    The pass moves everything twice: wind beside a cell in the first round may be on it in the second.
+    """
+    windy = np.hypot(before_wind.velocity[:, 0], before_wind.velocity[:, 1]) > MOVING_SPEED
+    may: Mask = (before_wind.ids == EMPTY) & (before_wind.momentum != 0) & near(windy, 1)
+    return may
+
+
+def quirk_can_explain(before_wind: State) -> Mask:
     """Cells [B, H, W] whose momentum after the wind the engine's quirk may have falsified.
 
-    When a cell moves into an empty cell that itself moves in that very sub-step, the engine subtracts the empty
-    cell's leftover momentum from the arriving cell's. So there must have been, close by, an empty cell with a
-    momentum and wind to move it; the wind pass carries nothing far.
+    When a cell moves into an empty cell that itself moves in that very sub-step, the engine subtracts the
+    empty cell's leftover momentum from the arriving cell's. So there was such an empty cell, and close by,
+    since the wind carries nothing far.
     """
-    leftover = (before_wind.ids == EMPTY) & (before_wind.momentum != 0)
-    windy = np.hypot(before_wind.velocity[:, 0], before_wind.velocity[:, 1]) > MOVING_SPEED
-    # The wind pass moves everything twice: wind beside a cell in the first round may be on it in the second.
-    return near(leftover & near(windy, 1), QUIRK_REACH)
+    return near(may_be_overrun(before_wind), QUIRK_REACH)
 
 
-def where_first(mask: np.ndarray) -> str:
+def where_first(mask: Mask) -> str:
     """How many cells a mask [B, H, W] has, and the first few of them, for a message."""
     cells = [tuple(cell) for cell in np.argwhere(mask)[:5].tolist()]
     return f"{np.count_nonzero(mask)} of {mask.size} cells, the first (world, row, column): {cells}"
@@ -194,11 +206,15 @@ def assert_same(ours: State, recording: Recording, passes_done: int) -> None:
     other_ids = ours.ids != engine.ids
     other_momentum = ours.momentum != engine.momentum
     if recording.passes[passes_done - 1] == "wind":
+        before = recording.states[passes_done - 1]
         assert other_ids.mean() <= 1 - IDS_AFTER_WIND, f"ids: {where_first(other_ids)}"
         # A cell that rounding sent elsewhere took all its fields along.
-        unexplained = other_momentum & ~other_ids & ~quirk_can_explain(recording.states[passes_done - 1])
+        other_momentum &= ~other_ids
+        unexplained = other_momentum & ~quirk_can_explain(before)
         assert not unexplained.any(), f"momentum, no quirk near: {where_first(unexplained)}"
-        assert other_momentum.mean() <= QUIRK_SHARE_IN_A_FILE, f"momentum: {where_first(other_momentum)}"
+        # One overrun falsifies one cell, so there are no more of those than cells to overrun.
+        at_most = np.count_nonzero(may_be_overrun(before))
+        assert np.count_nonzero(other_momentum) <= at_most, f"momentum: {where_first(other_momentum)}"
     else:
         assert not other_ids.any(), f"ids: {where_first(other_ids)}"
         assert not other_momentum.any(), f"momentum: {where_first(other_momentum)}"
@@ -206,8 +222,8 @@ def assert_same(ours: State, recording: Recording, passes_done: int) -> None:
         other = (getattr(ours, name) != getattr(engine, name)) & ~other_ids
         assert not other.any(), f"{name}: {where_first(other)}"
     assert ours.velocity.dtype == np.float32
-    far = ~(np.abs(ours.velocity - engine.velocity) <= VELOCITY_TOLERANCE).all(axis=1)  # ~ and <=: NaN is far too
-    assert not far.any(), f"velocity: {where_first(far)}"
+    close = (np.abs(ours.velocity - engine.velocity) <= VELOCITY_TOLERANCE).all(axis=1)  # NaN is not close
+    assert close.all(), f"velocity: {where_first(~close)}"
 
 
 def test_names_and_order_are_the_engines(runner: Runner, recording: Recording) -> None:
@@ -249,15 +265,14 @@ def test_wind_carries_what_a_cell_holds(runner: Runner, path: Path) -> None:
 
 def test_quirk_is_rare(runner: Runner) -> None:
     """Momentum differs in under 0.1 % of cells after the wind, all recordings taken together."""
-    cells = differing = 0
-    for path in recording_paths():
-        engine, ours = read_recording(path).states[-1], wind_alone(runner.backend, path)
-        cells += engine.ids.size
-        differing += np.count_nonzero(ours.momentum != engine.momentum)
-    assert differing < QUIRK_SHARE_OVER_ALL * cells
+    differ = [
+        (wind_alone(runner.backend, path).momentum != read_recording(path).states[-1].momentum).ravel()
+        for path in recording_paths()
+    ]
+    assert np.concatenate(differ).mean() < QUIRK_SHARE
 
 
-@pytest.mark.skipif("POWDERDSL_RECORDINGS" in os.environ, reason="a statement about the recordings in tests/data")
+@pytest.mark.skipif("POWDERDSL_RECORDINGS" in os.environ, reason="says what tests/data holds")
 def test_small_recordings_show_everything() -> None:
     """The recordings kept here hold every element, gusts of wind, and something for each pass to do."""
     recordings = [read_recording(path) for path in recording_paths()]
@@ -265,10 +280,10 @@ def test_small_recordings_show_everything() -> None:
     present = {element for recording in recordings for element in np.unique(recording.states[0].ids).tolist()}
     assert present == set(range(14))
     assert any(np.abs(recording.states[0].velocity).max() > 10 for recording in recordings)
-    for index, name in enumerate(PASSES):
+    for k, name in enumerate(PASSES):
         field = "gravity" if name == "stone" else "ids"
-        changed = sum(
-            np.count_nonzero(getattr(recording.states[index], field) != getattr(recording.states[index + 1], field))
+        changed = [
+            np.count_nonzero(getattr(recording.states[k], field) != getattr(recording.states[k + 1], field))
             for recording in recordings
-        )
-        assert changed >= 20, name
+        ]
+        assert sum(changed) >= 10, name

@@ -1,0 +1,79 @@
+# Everything a developer types. `make` or `make help` lists the targets.
+# A fresh Debian needs: apt install make python3 python3-venv
+
+PYTHON ?= python3
+# Extra options of pip's for torch alone, e.g. --extra-index-url https://download.pytorch.org/whl/cpu where no GPU is wanted.
+TORCH_FLAGS ?=
+# More options for pytest, and how many processes it may use: `make test ARGS="-k melt" JOBS=0`.
+ARGS ?=
+JOBS ?= auto
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+INSTALL := $(PIP) --constraint constraints.txt
+TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
+
+# One thread a process: pytest runs several processes, and small tensors gain nothing from threads.
+test golden: export OMP_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test check lint types format golden wheel clean distclean
+
+help:  ## list these targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
+
+# Two stamps: what running needs, and what developing needs on top. The second call of either is instant.
+# torch comes first and by exact version: a range would take the newest release, with gigabytes of CUDA beside it.
+$(VENV)/.core: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "powderdsl needs Python 3.11 or newer; try: make PYTHON=python3.11 $(MAKECMDGOALS)" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' || { echo "Python's venv module is missing; on Debian: apt install python3-venv" >&2; exit 1; }
+	@echo "setting up $(VENV): torch $(TORCH) and powderdsl (a minute or two, once)"
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	@$(PIP) $(TORCH_FLAGS) torch==$(TORCH)
+	@$(INSTALL) hatchling
+	@$(INSTALL) --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/.ready: $(VENV)/.core
+	@echo "setting up $(VENV): tools for tests, checks, training and video"
+	@$(INSTALL) --no-build-isolation --editable '.[dev,rl,video]'
+	@touch $@
+
+setup: $(VENV)/.ready  ## make .venv with everything a developer needs
+
+demo: $(VENV)/.core  ## run a designed world and write demo.gif
+	@$(BIN)/powderdsl run powderworld --world garden --steps 240 --out demo.gif
+	@echo "$(CURDIR)/demo.gif"
+
+test: $(VENV)/.ready  ## run the tests (ARGS=... for pytest, JOBS=0 for one process)
+	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 $(ARGS)
+
+check: lint types test  ## lint, types and test
+
+lint: $(VENV)/.ready  ## ruff: mistakes and layout
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+types: $(VENV)/.ready  ## mypy over the package
+	@$(BIN)/mypy
+
+format: $(VENV)/.ready  ## lay the code out as `make lint` wants it
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+golden: $(VENV)/.ready  ## write the golden files anew; read the diff before committing it
+	@$(BIN)/python -m pytest --quiet -m golden --update-golden $(ARGS)
+	@git status --short tests
+
+wheel: $(VENV)/.ready  ## build dist/*.whl
+	@$(BIN)/python -m build --wheel --no-isolation
+	@ls -l dist/*.whl
+
+clean:  ## remove what the targets made, except .venv
+	@rm -rf build dist demo.gif .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@find powderdsl tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+distclean: clean  ## clean, and remove .venv
+	@rm -rf $(VENV)

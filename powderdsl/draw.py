@@ -1,0 +1,150 @@
+"""Worlds -> RGB pictures, one pixel a cell. NumPy in, NumPy out; torch tensors stay on their device."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.model.types import Element
+
+Array = Any
+"""A NumPy array or a torch tensor. Torch is imported only once a tensor is given."""
+
+MOTION_COLOR = (200, 100, 100)
+"""What a cell is tinted towards where its velocity is not 0."""
+
+MAX_TINT = 0.5
+"""The tint at speed 1 and above; slower cells are tinted in proportion."""
+
+Colors = Sequence[str] | NDArray[np.uint8]
+"""Colours by element id: ``#RRGGBB`` each, or uint8 [n, 3]."""
+
+
+def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
+    """The elements' colours by id, uint8 [highest id + 1, 3]; ids that no element has are black."""
+    table = np.zeros((max((element.id for element in elements), default=-1) + 1, 3), dtype=np.uint8)
+    for element in elements:
+        table[element.id] = _components(element.color)
+    return table
+
+
+def rgb(ids: Array, colors: Colors, velocity: Array | None = None) -> Any:
+    """Pictures uint8 [..., H, W, 3] of ids [..., H, W] (any integers), of the same kind, on the same device.
+
+    With `velocity`, float [..., 2, H, W], cells are tinted towards MOTION_COLOR by clamp(|v|/2, 0, 0.5).
+    Raises ValueError for ids without a colour and shapes that do not fit, TypeError for ids of another type.
+    """
+    table = _table(colors)
+    tensor = _is_tensor(ids)
+    if not tensor:
+        ids = np.asarray(ids)
+    _check(ids, velocity, len(table), tensor)
+    if tensor:
+        return _rgb_torch(ids, table, velocity)
+    image = table[ids]
+    if velocity is None:
+        return image
+    speed = np.hypot(*np.moveaxis(np.asarray(velocity, dtype=np.float32), -3, 0))
+    weight = np.nan_to_num(np.clip(speed / 2, 0, MAX_TINT))[..., None]
+    motion = np.array(MOTION_COLOR, dtype=np.float32)
+    return (image + (motion - image) * weight + 0.5).astype(np.uint8)
+
+
+def _rgb_torch(ids: Any, table: NDArray[np.uint8], velocity: Any) -> Any:
+    import torch
+
+    image = torch.as_tensor(table, device=ids.device)[ids.long()]
+    if velocity is None:
+        return image
+    weight = (torch.hypot(*velocity.float().unbind(-3)) / 2).clamp(0, MAX_TINT).nan_to_num()[..., None]
+    motion = torch.tensor(MOTION_COLOR, dtype=torch.float32, device=ids.device)
+    return (image + (motion - image) * weight + 0.5).to(torch.uint8)
+
+
+def scale(image: Array, factor: int) -> Any:
+    """Every pixel of [..., H, W, 3] as a square of `factor` by `factor`. Raises ValueError below 1."""
+    if factor < 1:
+        raise ValueError(f"a picture cannot be scaled by {factor}: the factor is a whole number from 1")
+    if factor == 1:
+        return image
+    if _is_tensor(image):
+        return image.repeat_interleave(factor, dim=-3).repeat_interleave(factor, dim=-2)
+    return np.repeat(np.repeat(image, factor, axis=-3), factor, axis=-2)
+
+
+def contact_sheet(
+    images: Array | Sequence[Array],
+    *,
+    columns: int | None = None,
+    gap: int = 2,
+    background: tuple[int, int, int] = (255, 255, 255),
+) -> NDArray[np.uint8]:
+    """Pictures of one size, uint8 [N, H, W, 3], side by side on one, uint8 [H', W', 3], row by row.
+
+    `columns` defaults to a square of pictures; `gap` pixels of background stand between and around them.
+    Raises ValueError for no pictures, for pictures of different sizes, and for bad numbers.
+    """
+    pictures = [to_numpy(image) for image in images]
+    if not pictures:
+        raise ValueError("a contact sheet needs at least one picture")
+    height, width = pictures[0].shape[:2]
+    if any(picture.shape != (height, width, 3) for picture in pictures):
+        raise ValueError(f"pictures of different shapes: {sorted({picture.shape for picture in pictures})}")
+    columns = math.ceil(math.sqrt(len(pictures))) if columns is None else columns
+    if columns < 1 or gap < 0:
+        raise ValueError(f"columns={columns} must be at least 1, gap={gap} at least 0")
+    columns = min(columns, len(pictures))
+    rows = math.ceil(len(pictures) / columns)
+    sheet = np.empty((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), dtype=np.uint8)
+    sheet[:] = background
+    for place, picture in enumerate(pictures):
+        top, left = gap + place // columns * (height + gap), gap + place % columns * (width + gap)
+        sheet[top : top + height, left : left + width] = picture
+    return sheet
+
+
+def to_numpy(image: Array) -> NDArray[Any]:
+    """An array or tensor, wherever it is, as a NumPy array."""
+    return image.detach().cpu().numpy() if _is_tensor(image) else np.asarray(image)
+
+
+def _is_tensor(value: object) -> bool:
+    # By its class' module: asking torch itself would import it for people who only use arrays.
+    return any(base.__module__.partition(".")[0] == "torch" for base in type(value).__mro__)
+
+
+def _check(ids: Any, velocity: Any, colors: int, tensor: bool) -> None:
+    integer = not (ids.is_floating_point() or ids.is_complex()) if tensor else ids.dtype.kind in "iu"
+    if not integer or str(ids.dtype).endswith("bool"):
+        raise TypeError(f"ids must be integers, not {ids.dtype}")
+    if ids.ndim < 2:
+        raise ValueError(f"ids must have shape [..., H, W], not {tuple(ids.shape)}")
+    if math.prod(ids.shape) and not 0 <= int(ids.min()) <= int(ids.max()) < colors:
+        raise ValueError(
+            f"ids reach from {int(ids.min())} to {int(ids.max())}, but there are {colors} colours"
+        )
+    if velocity is None:
+        return
+    expected = (*ids.shape[:-2], 2, *ids.shape[-2:])
+    if tuple(velocity.shape) != expected:
+        raise ValueError(f"velocity must have shape {expected}, not {tuple(velocity.shape)}")
+
+
+def _table(colors: Colors) -> NDArray[np.uint8]:
+    if isinstance(colors, np.ndarray):
+        if colors.ndim != 2 or colors.shape[1] != 3 or colors.dtype != np.uint8:
+            raise ValueError(f"colours must be uint8 [n, 3], not {colors.dtype} {colors.shape}")
+        return colors
+    return np.array([_components(color) for color in colors], dtype=np.uint8).reshape(-1, 3)
+
+
+def _components(color: str) -> tuple[int, int, int]:
+    if not re.fullmatch(r"#[0-9A-Fa-f]{6}", color):
+        raise ValueError(f"{color!r} is not a colour: write '#RRGGBB'")
+    red, green, blue = bytes.fromhex(color[1:])
+    return red, green, blue

@@ -1,0 +1,247 @@
+"""Arithmetic and comparisons: kinds, ranges and exact constant folding.
+
+Whole numbers carry their bounds; draws add up with whole numbers only and compare exactly; everything else is
+float32, one rounding an operation, in the order written.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from math import ceil, floor
+from typing import TYPE_CHECKING
+
+from powderdsl.diagnostics import Span
+from powderdsl.model.builtins import COORDINATES
+from powderdsl.model.operands import FALSE, TRUE, Number, Operand, constant, negation
+from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Expr, Kind, integer
+from powderdsl.syntax.ast import Syntax
+
+if TYPE_CHECKING:
+    from powderdsl.model.expressions import Scope, Typer
+
+Value = Expr | Number
+
+_FLIP = {"<": ">", ">": "<", "<=": ">=", ">=": "<=", "==": "==", "!=": "!="}
+
+
+def compare(typer: Typer, operator: str, left: Value, right: Value, span: Span) -> Expr:
+    """A comparison as `eq`, `lt` or `le`, maybe negated."""
+    if operator == "!=":
+        return negation(compare(typer, "==", left, right, span), span)
+    if operator in (">", ">="):
+        return compare(typer, _FLIP[operator], right, left, span)
+    if isinstance(left, Number) and isinstance(right, Number):
+        holds = {"==": left.value == right.value, "<": left.value < right.value, "<=": left.value <= right.value}[operator]
+        return TRUE if holds else FALSE
+    op = {"==": "eq", "<": "lt", "<=": "le"}[operator]
+    kinds = {operand.kind.name for operand in (left, right) if isinstance(operand, Expr)}
+    if "draw" in kinds:
+        return _compare_draw(typer, op, left, right, span)
+    if kinds & {"element", "direction", "flag", "vec2"}:
+        return _compare_discrete(typer, op, left, right, span)
+    if kinds == {"int"}:
+        return _compare_whole(typer, op, left, right, span)
+    return Expr(op, FLAG, (typer.real(left, span), typer.real(right, span)), span=span)
+
+
+def _compare_discrete(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
+    for value, other in ((left, right), (right, left)):
+        if isinstance(value, Expr) and value.kind in (FLAG, ELEMENT, DIRECTION):
+            if not isinstance(other, Expr) or other.kind != value.kind:
+                raise typer.wrong(other, f"{value.kind} to compare with {value.kind}", span)
+            if op != "eq":
+                raise typer.fail("PD401", f"a {value.kind} is not more or less than another", span, "use `==` or `!=`")
+            return Expr(op, FLAG, (left, right), span=span)  # type: ignore[arg-type]
+    raise typer.fail("PD401", "vectors are not compared", span, helps=("compare `length(…)`, or `.row` and `.column`",))
+
+
+def _compare_whole(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
+    """Whole numbers with whole numbers; a bound such as 1.5 is rounded to the whole number that means the same."""
+    if isinstance(left, Number) and left.value.denominator != 1:
+        if op == "eq":
+            return FALSE
+        left = Number(Fraction(floor(left.value) + (op == "le")))
+    elif isinstance(right, Number) and right.value.denominator != 1:
+        if op == "eq":
+            return FALSE
+        right = Number(Fraction(ceil(right.value) - (op == "le")))
+    a, b = typer.whole(left, span), typer.whole(right, span)
+    return Expr(op, FLAG, (a, b), span=span)
+
+
+def _compare_draw(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
+    if op == "eq":
+        raise typer.fail("PD401", "a draw never equals anything exactly", span, "compare with `<` or `>`")
+    draw, other = (left, right) if isinstance(left, Expr) and left.kind.name == "draw" else (right, left)
+    assert isinstance(draw, Expr)
+    if isinstance(other, Expr) and other.kind.name == "draw":
+        raise typer.fail("PD401", "two draws are not compared", span, "one side must be a number")
+    if isinstance(other, Number):
+        if not draw.kind.lo <= other.value <= draw.kind.hi:
+            if (draw.kind.lo, draw.kind.hi) == (0, 1):
+                raise typer.fail(
+                    "PD403", f"a chance of {float(other.value * 100):g}%", span, "draws lie between 0 and 1",
+                    ("write a chance as `20%` or `0.2`",),
+                )
+            return TRUE if (other.value > draw.kind.hi) == (draw is left) else FALSE
+        kind = CHANCE if 0 <= other.value <= 1 else Kind("number")
+        other = Expr("const", kind, value=other.value, span=span)
+        _check_resolution(typer, draw, other, span)
+    if other.kind.name == "real":
+        draw = Expr("to_real", REAL, (draw,), span=span)
+    elif other.kind.name not in ("chance", "number", "int"):
+        raise typer.wrong(other, "a chance to compare the draw with", span)
+    # A draw lies strictly between two multiples of its resolution's half step: `<` and `<=` mean the same.
+    pair = (draw, other) if isinstance(left, Expr) and left.kind.name == "draw" else (other, draw)
+    return Expr("lt", FLAG, pair, span=span)
+
+
+def _check_resolution(typer: Typer, draw: Expr, other: Expr, span: Span) -> None:
+    if draw.op != "draw" or not isinstance(other.value, Fraction) or not 0 < other.value < 1:
+        return
+    stream = typer.symbols.streams.get(str(draw.value))
+    steps = 1 << (stream.bits if stream else 32)
+    p = other.value
+    nearest = Fraction(max(0, ceil(p * steps - Fraction(1, 2))), steps)
+    if abs(nearest - p) > p / 20:
+        typer.reporter.report(
+            "PD404", f"a chance of {float(p):.3g} is drawn as {float(nearest):.3g}", span, f"steps of 1/{steps}",
+            helps=["declare the stream with `bits: 32`, or say `with chance`"],
+        )
+
+
+def binary(typer: Typer, kind: str, left: Value, right: Value, syntax: Syntax) -> Operand:
+    """`+ - * /` on numbers and vectors."""
+    op = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div"}[kind]
+    span = syntax.span
+    if isinstance(left, Number) and isinstance(right, Number):
+        if op == "div" and right.value == 0:
+            raise typer.fail("PD402", "division by zero", span)
+        value = {"add": left.value + right.value, "sub": left.value - right.value, "mul": left.value * right.value,
+                 "div": left.value / (right.value or 1)}[op]  # fmt: skip
+        if abs(value) > 10**6 or value.denominator > 10**18:
+            raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
+        return Number(value)
+    kinds = {operand.kind.name for operand in (left, right) if isinstance(operand, Expr)}
+    if kinds & {"flag", "element", "direction"}:
+        bad = next(o for o in (left, right) if isinstance(o, Expr) and o.kind.name in ("flag", "element", "direction"))
+        raise typer.wrong(bad, "a number", span)
+    if "vec2" in kinds:
+        return _vector_arithmetic(typer, op, left, right, span)
+    if isinstance(right, Number) and right.value == 0 and op == "div":
+        raise typer.fail("PD402", "division by zero", span)
+    whole = all((o.value.denominator == 1) if isinstance(o, Number) else o.kind.name == "int" for o in (left, right))
+    if whole and op != "div":
+        a, b = typer.whole(left, span), typer.whole(right, span)
+        return typer.bounded(Expr(op, _bounds(op, a.kind, b.kind), (a, b), span=span), span)
+    if "draw" in kinds:
+        draws = [o for o in (left, right) if isinstance(o, Expr) and o.kind.name == "draw"]
+        rest = [o for o in (left, right) if not (isinstance(o, Expr) and o.kind.name == "draw")]
+        if op in ("add", "sub") and len(draws) == 1 and not (op == "sub" and right is draws[0]):
+            other = rest[0]
+            if isinstance(other, Number) or other.kind.name == "int":
+                other = typer.whole(other, span)
+                bounds = _bounds(op, draws[0].kind, other.kind)
+                args = (left, other) if left is draws[0] else (other, draws[0])
+                return Expr(op, Kind("draw", bounds.lo, bounds.hi), args, span=span)  # type: ignore[arg-type]
+    return Expr(op, REAL, (typer.real(left, span), typer.real(right, span)), span=span)
+
+
+def _bounds(op: str, a: Kind, b: Kind) -> Kind:
+    if op == "add":
+        return integer(a.lo + b.lo, a.hi + b.hi)
+    if op == "sub":
+        return integer(a.lo - b.hi, a.hi - b.lo)
+    corners = [x * y for x in (a.lo, a.hi) for y in (b.lo, b.hi)]
+    return integer(min(corners), max(corners))
+
+
+def _vector_arithmetic(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
+    left_is, right_is = (isinstance(o, Expr) and o.kind.name == "vec2" for o in (left, right))
+    if op in ("add", "sub") and not (left_is and right_is):
+        raise typer.fail("PD401", "a vector adds up with vectors only", span, helps=("write `vector(rows, columns)`",))
+    if (op == "mul" and left_is and right_is) or (op == "div" and right_is):
+        raise typer.fail("PD401", "a vector is multiplied or divided by a number", span)
+    if op == "div" and isinstance(right, Number) and right.value == 0:
+        raise typer.fail("PD402", "division by zero", span)
+    a = left if left_is else typer.real(left, span)
+    b = right if right_is else typer.real(right, span)
+    return Expr(op, VEC2, (a, b), span=span)  # type: ignore[arg-type]
+
+
+def negate(typer: Typer, value: Value, span: Span) -> Operand:
+    if isinstance(value, Number):
+        return Number(-value.value)
+    if value.kind.name == "int":
+        return Expr("neg", integer(-value.kind.hi, -value.kind.lo), (value,), span=span)
+    if value.kind.name == "vec2":
+        return Expr("neg", VEC2, (value,), span=span)
+    return Expr("neg", REAL, (typer.real(value, span),), span=span)
+
+
+def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
+    """`x mod n` for a whole constant n; coordinates (and their sums) may only appear here."""
+    left, right = syntax.children
+    divisor = typer.value(typer.evaluate(right, scope), right.span)
+    if not isinstance(divisor, Number) or divisor.value.denominator != 1 or not 1 <= divisor.value <= 64:
+        raise typer.fail("PD405", "`mod` takes a whole constant", right.span, "expected 1 to 64")
+    modulus = int(divisor.value)
+    value = _coordinate_sum(typer, left, modulus, scope)
+    if isinstance(value, Number):
+        if value.value.denominator != 1:
+            raise typer.fail("PD401", "`mod` takes whole numbers", left.span)
+        return Number(Fraction(int(value.value) % modulus))
+    return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
+
+
+def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Value:
+    """Sums of coordinates, each reduced by the modulus, so that every part has a small declared range."""
+    if syntax.kind == "name" and syntax.text in COORDINATES:
+        return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
+    if syntax.kind in ("add", "subtract"):
+        left, right = (_coordinate_sum(typer, child, modulus, scope) for child in syntax.children)
+        result = binary(typer, syntax.kind, left, right, syntax)
+        assert isinstance(result, (Expr, Number))
+        return result
+    value = typer.value(typer.evaluate(syntax, scope), syntax.span)
+    return value if isinstance(value, Number) else typer.whole(value, syntax.span)
+
+
+def part(vector: Expr, name: str, span: Span) -> Expr:
+    return Expr("row_part" if name == "row" else "column_part", REAL, (vector,), span=span)
+
+
+def choose(
+    typer: Typer, condition: Expr, yes: tuple[Operand, Span], no: tuple[Operand, Span], span: Span
+) -> Expr:
+    """`a if c else b`, both of one kind; whole numbers join their ranges."""
+    a, b = typer.value(*yes), typer.value(*no)
+    kinds = [o.kind.name if isinstance(o, Expr) else "number" for o in (a, b)]
+    if set(kinds) <= {"int", "number"} and all(not isinstance(o, Number) or o.value.denominator == 1 for o in (a, b)):
+        first, second = typer.whole(a, yes[1]), typer.whole(b, no[1])
+        kind = integer(min(first.kind.lo, second.kind.lo), max(first.kind.hi, second.kind.hi))
+        return Expr("choose", kind, (condition, first, second), span=span)
+    if set(kinds) <= {"chance", "number"} and all(not isinstance(o, Number) or 0 <= o.value <= 1 for o in (a, b)):
+        return Expr("choose", CHANCE, (condition, typer.chance(a, yes[1]), typer.chance(b, no[1])), span=span)
+    if set(kinds) <= {"int", "number", "real", "chance", "draw"}:
+        return Expr("choose", REAL, (condition, typer.real(a, yes[1]), typer.real(b, no[1])), span=span)
+    target = next(o for o in (a, b) if isinstance(o, Expr)).kind
+    first, second = typer.of_kind(yes[0], target, yes[1]), typer.of_kind(no[0], target, no[1])
+    return Expr("choose", target, (condition, first, second), span=span)
+
+
+def extreme(typer: Typer, op: str, values: list[tuple[Value, Span]], span: Span) -> Operand:
+    """`min` or `max` of several numbers."""
+    result, _ = values[0]
+    for value, _ in values[1:]:
+        if isinstance(result, Number) and isinstance(value, Number):
+            result = Number((min if op == "min" else max)(result.value, value.value))
+            continue
+        whole = all((o.value.denominator == 1) if isinstance(o, Number) else o.kind.name == "int" for o in (result, value))
+        if whole:
+            a, b = typer.whole(result, span), typer.whole(value, span)
+            pick = min if op == "min" else max
+            result = Expr(op, integer(pick(a.kind.lo, b.kind.lo), pick(a.kind.hi, b.kind.hi)), (a, b), span=span)
+        else:
+            result = Expr(op, REAL, (typer.real(result, span), typer.real(value, span)), span=span)
+    return constant(result, span) if isinstance(result, Number) and result.value.denominator == 1 else result

@@ -1,0 +1,265 @@
+"""Declarations -> checked model. One straight function; each step reports all it can."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from powderdsl.diagnostics import Reporter, suggest
+from powderdsl.model.compose import Composition, compose
+from powderdsl.model.elaborate import Elaborated, Elaborator
+from powderdsl.model.examples import check_examples
+from powderdsl.model.expressions import Scope, Typer
+from powderdsl.model.logic import check_logic, overridden_ids, produced_ids
+from powderdsl.model.operands import Asleep, Broken, Poisoned
+from powderdsl.model.packs import PackDecl, RulesetDecl, TypedDecl
+from powderdsl.model.satisfy import Facts
+from powderdsl.model.symbols import (
+    Symbols,
+    base_symbols,
+    check_param_names,
+    default_of,
+    field_from,
+    number_value,
+    read_kind,
+)
+from powderdsl.model.types import CHANCE, FLAG, Element, Kind, Param, Property, Ruleset, Stream, Value
+from powderdsl.syntax.ast import Syntax
+
+
+def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Ruleset:
+    """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter."""
+    composition = compose(packs, ruleset, reporter)
+    symbols = base_symbols(composition)
+    typer = Typer(symbols, reporter)
+    typer.set_definitions = {name: (named.pack, named.decl[1]) for name, named in composition.sets.items()}
+    check_param_names(symbols, reporter)
+    _params(symbols, typer)
+    _properties(symbols, typer)
+    _fields(symbols, typer)
+    _property_values(symbols, typer)
+    _sets(typer)
+    elaborated = Elaborator(typer).run(composition.passes)
+    examples = check_examples(composition, typer)
+    reporter.raise_if_errors()
+
+    elements = tuple(_tagged(element, composition) for element in composition.elements.values())
+    passes = tuple(elaborated.passes)
+    facts = _facts(symbols)
+    stored = {name: overridden_ids(passes, name, facts) for name in elaborated.overridden}
+    symbols.properties = {name: replace(p, stored=stored.get(name, frozenset())) for name, p in symbols.properties.items()}
+    facts = _facts(symbols)
+    check_logic(passes, facts, elaborated.asleep, reporter)
+    _check_use(composition, typer, produced_ids(passes, facts), reporter)
+    matrix = _matrix(composition, symbols, reporter)
+    reporter.raise_if_errors()
+    return Ruleset(
+        name=composition.name,
+        about=composition.about,
+        packs=tuple(pack.name.text for pack in packs),
+        elements=elements,
+        slots=composition.slots,
+        properties=tuple(symbols.properties.values()),
+        fields=tuple(symbols.fields.values()),
+        streams=_streams(symbols, elaborated, reporter),
+        params=tuple(symbols.params.values()),
+        passes=passes,
+        matrix=matrix,
+        tests=examples,
+    )
+
+
+def _facts(symbols: Symbols) -> Facts:
+    limited = {name: f.of for name, f in symbols.fields.items() if f.of is not None}
+    return Facts(symbols.ids, symbols.properties, limited, {name: symbols.fields[name].default for name in limited})
+
+
+def _params(symbols: Symbols, typer: Typer) -> None:
+    for qualified, named in symbols.composition.params.items():
+        decl = named.decl
+        try:
+            kind = read_kind(decl.type, typer) if decl.type else None
+            if decl.default is None:
+                continue
+            if kind is None:
+                kind = _kind_of_literal(decl, typer)
+            if kind.name not in ("chance", "int", "real", "flag"):
+                raise typer.fail("PD401", f"a parameter cannot be a {kind}", decl.name.span, helps=("kinds: chance, LOW..HIGH, real(LOW..HIGH), flag",))
+            value = _constant(decl.default, kind, Scope(named.pack, {}), typer)
+        except Poisoned:
+            continue
+        symbols.params[qualified] = Param(qualified, kind, value, decl.about, decl.name.span)
+    for key, syntax in symbols.composition.ruleset.params if symbols.composition.ruleset else ():
+        param = symbols.params.get(key.text)
+        if param is None:
+            typer.reporter.error("PD309", f"unknown parameter `{key.text}`", key.span, "no loaded pack has it", helps=suggest(key.text, symbols.params, "parameters"))
+            continue
+        try:
+            symbols.params[key.text] = replace(param, default=_constant(syntax, param.kind, Scope("", {}), typer))
+        except Poisoned:
+            continue
+
+
+def _kind_of_literal(decl: TypedDecl, typer: Typer) -> Kind:
+    """`melt: 2%` is a chance, `wet: yes` a flag; other numbers must say their range."""
+    assert decl.default is not None
+    if decl.default.kind == "percent":
+        return CHANCE
+    if decl.default.kind in ("yes", "no"):
+        return FLAG
+    raise typer.fail(
+        "PD401", f"the parameter `{decl.name.text}` does not say its kind", decl.default.span, "not a percentage",
+        (f"write `{decl.name.text}: {{type: 0..9, default: {decl.default.span.text}}}`",),
+    )
+
+
+def _constant(syntax: Syntax, kind: Kind, scope: Scope, typer: Typer) -> Value:
+    try:
+        value = typer.of_kind(typer.evaluate(syntax, scope), kind, syntax.span)
+    except Asleep as asleep:
+        raise typer.fail("PD301", f"unknown name `{asleep.name}`", syntax.span) from None
+    if value.op != "const" and not (value.op == "vector" and all(arg.op == "const" for arg in value.args)):
+        raise typer.fail("PD405", "expected a constant", syntax.span, "depends on the world")
+    return number_value(value, kind)
+
+
+def _properties(symbols: Symbols, typer: Typer) -> None:
+    for name, named in symbols.composition.properties.items():
+        try:
+            if named.decl.type is None:
+                continue
+            kind = read_kind(named.decl.type, typer)
+            if kind.name in ("real", "vec2", "element", "direction"):
+                raise typer.fail("PD401", f"a property cannot be a {kind}", named.decl.type.span, helps=("kinds of properties: LOW..HIGH, flag, chance",))
+        except Poisoned:
+            continue
+        symbols.properties[name] = Property(name, kind, (), frozenset(), named.pack, named.decl.name.span)
+
+
+def _property_values(symbols: Symbols, typer: Typer) -> None:
+    composition = symbols.composition
+    given: dict[tuple[str, str], tuple[Syntax, str]] = {}
+    sources = [(named.pack, name, named.decl.values) for name, named in composition.element_decls.items()]
+    for pack in composition.packs:
+        sources += [(pack.name.text, also.element.text.removesuffix("?"), also.values) for also in pack.also]
+    for pack_name, element, values in sources:
+        for key, syntax in values:
+            name = key.text.removesuffix("?")
+            if name in composition.properties:
+                given[(name, element)] = (syntax, pack_name)
+            elif not key.text.endswith("?"):
+                typer.reporter.error(
+                    "PD108", f"unknown property `{name}`", key.span, "no loaded pack declares it",
+                    helps=[*suggest(name, [*composition.properties, "id", "color", "glyph", "about", "tags"], "properties"),
+                           f"if its pack may be absent, write `{name}?`"],  # fmt: skip
+                )
+    for name, named in composition.properties.items():
+        for key, syntax in named.decl.values:
+            element = key.text.removesuffix("?")
+            if element in composition.elements:
+                given[(name, element)] = (syntax, named.pack)
+            elif not key.text.endswith("?"):
+                typer.reporter.error("PD301", f"unknown element `{element}`", key.span, helps=[*suggest(element, composition.elements, "elements"), f"if its pack may be absent, write `{element}?`"])
+        if name in symbols.properties:
+            prop = symbols.properties[name]
+            symbols.properties[name] = replace(prop, values=_values(prop, named.decl, named.pack, given, symbols, typer))
+
+
+def _values(
+    prop: Property, decl: TypedDecl, pack: str, given: dict[tuple[str, str], tuple[Syntax, str]], symbols: Symbols, typer: Typer
+) -> tuple[Value | str, ...]:
+    """A property's values by id. A value may name a parameter, which stays changeable."""
+
+    def value(syntax: Syntax, owner: str) -> Value | str:
+        try:
+            expr = typer.of_kind(typer.evaluate(syntax, Scope(owner, {})), prop.kind, syntax.span)
+        except (Poisoned, Asleep):
+            return default_of(prop.kind)
+        if expr.op == "param":
+            return str(expr.value)
+        if expr.op != "const":
+            typer.fail("PD405", "expected a constant or a parameter", syntax.span, "depends on the world")
+            return default_of(prop.kind)
+        return number_value(expr, prop.kind)
+
+    default = value(decl.default, pack) if decl.default else default_of(prop.kind)
+    values: list[Value | str] = [default] * symbols.composition.slots
+    for name, element in symbols.composition.elements.items():
+        if (prop.name, name) in given:
+            values[element.id] = value(*given[(prop.name, name)])
+    return tuple(values)
+
+
+def _fields(symbols: Symbols, typer: Typer) -> None:
+    for name, named in symbols.composition.fields.items():
+        decl = named.decl
+        scope = Scope(named.pack, {})
+        try:
+            if decl.type is None:
+                continue
+            kind = read_kind(decl.type, typer)
+            if kind.name == "chance":
+                raise typer.fail("PD401", "a field cannot be a chance", decl.type.span, helps=("use `real(0..1)`",))
+            default = _constant(decl.default, kind, scope, typer) if decl.default else default_of(kind)
+            of = None
+            if decl.of is not None:
+                of = frozenset(typer.set_of(typer.evaluate(decl.of, scope), decl.of.span).ids)
+                if decl.at != "element":
+                    raise typer.fail("PD401", "`of` needs `at: element`", decl.of.span, "a field of a place belongs to no element")
+        except Poisoned:
+            continue
+        symbols.fields[name] = field_from(decl, named.pack, kind, default, of)
+
+
+def _sets(typer: Typer) -> None:
+    for name, (_, syntax) in typer.set_definitions.items():
+        try:
+            if name not in typer.symbols.constants:
+                typer.resolve_set(name, syntax.span)
+        except (Poisoned, Asleep):
+            typer.symbols.constants.setdefault(name, Broken())
+    typer.used.clear()
+
+
+def _tagged(element: Element, composition: Composition) -> Element:
+    return replace(element, tags=frozenset(tag for tag, ids in composition.tags.items() if element.id in ids))
+
+
+def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tuple[Stream, ...]:
+    streams = [*symbols.streams.values(), *elaborated.streams]
+    by_ident: dict[int, str] = {}
+    for stream in streams:
+        other = by_ident.setdefault(stream.ident, stream.name)
+        if other != stream.name:
+            reporter.error("PD302", f"streams `{other}` and `{stream.name}` would draw the same numbers", None, helps=["rename one of them"])
+    return tuple(streams)
+
+
+def _check_use(composition: Composition, typer: Typer, produced: frozenset[int], reporter: Reporter) -> None:
+    for qualified, param in composition.params.items():
+        if qualified not in typer.used and not any(qualified in map(str, p.values) for p in typer.symbols.properties.values()):
+            reporter.report("PD507", f"the parameter `{qualified}` is never used", param.decl.name.span, "no rule reads it", helps=["remove it"])
+    for name, named_set in composition.sets.items():
+        if name not in typer.used:
+            reporter.report("PD507", f"the set `{name}` is never used", named_set.decl[0].span, "no rule reads it", helps=["remove it"])
+    for name, kernel in composition.kernels.items():
+        if name not in typer.used:
+            reporter.report("PD507", f"the kernel `{name}` is never used", kernel.decl.name.span, "no rule reads it", helps=["remove it"])
+    for name, ids in composition.tags.items():
+        if not ids and name in typer.used:
+            reporter.report("PD505", f"nothing has the tag `{name}`", composition.tag_spans[name], "rules that ask for it stay quiet", helps=["load a pack whose elements have it"])
+    for element in composition.elements.values():
+        if element.id not in produced:
+            reporter.report("PD504", f"no rule produces `{element.name}`", element.span, "it must be in the start world, or painted")
+
+
+def _matrix(composition: Composition, symbols: Symbols, reporter: Reporter) -> tuple[str, ...]:
+    """The channels of `World.matrix()`: as the ruleset says, or elements, then everything a cell holds."""
+    holds = [*(p.name for p in symbols.properties.values() if p.stored), *(n for n, f in symbols.fields.items() if not f.resets)]
+    if composition.ruleset is None or not composition.ruleset.matrix:
+        return ("elements", *holds)
+    known = ["elements", *symbols.properties, *symbols.fields]
+    for scalar in composition.ruleset.matrix:
+        if scalar.text.removesuffix("?") not in known and not scalar.text.endswith("?"):
+            reporter.error("PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property", helps=[*suggest(scalar.text, known, "channels"), f"if its pack may be absent, write `{scalar.text}?`"])
+    return tuple(s.text.removesuffix("?") for s in composition.ruleset.matrix)

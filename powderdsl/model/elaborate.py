@@ -1,0 +1,333 @@
+"""Passes as written -> passes of the checked model: loops unrolled, symmetries written out, every rule typed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from powderdsl.diagnostics import Span, suggest
+from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
+from powderdsl.model.compose import Named
+from powderdsl.model.expressions import IDENTITY, Matrix, Scope, Typer, turned
+from powderdsl.model.operands import (
+    FALSE,
+    Absent,
+    Asleep,
+    Broken,
+    Number,
+    Operand,
+    Place,
+    Poisoned,
+    conjunction,
+    constant,
+)
+from powderdsl.model.packs import Block, PassDecl
+from powderdsl.model.symbols import default_of, read_kind, stream_ident
+from powderdsl.model.types import (
+    REAL,
+    VEC2,
+    Assign,
+    Expr,
+    Field,
+    Kind,
+    Let,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Rule,
+    Stream,
+    Swap,
+    Transform,
+)
+from powderdsl.syntax.ast import Syntax
+
+MAX_MOMENTS = 1000
+MAX_RULES = 5000
+
+_MIRROR: Matrix = ((1, 0), (0, -1))
+_TURN: Matrix = ((0, 1), (-1, 0))
+
+
+def _times(a: Matrix, b: Matrix) -> Matrix:
+    rows = [[sum(a[i][k] * b[k][j] for k in range(2)) for j in range(2)] for i in range(2)]
+    return ((rows[0][0], rows[0][1]), (rows[1][0], rows[1][1]))
+
+
+_QUARTERS = (IDENTITY, _TURN, _times(_TURN, _TURN), _times(_TURN, _times(_TURN, _TURN)))
+ORIENTATIONS: dict[str | None, tuple[Matrix, ...]] = {
+    None: (IDENTITY,),
+    "mirror": (IDENTITY, _MIRROR),
+    "rotations": _QUARTERS,
+    "all": (*_QUARTERS, *(_times(_MIRROR, quarter) for quarter in _QUARTERS)),
+}
+"""The orientations in which a rule under `symmetry:` holds."""
+
+
+@dataclass
+class Elaborated:
+    """What came of the passes, besides the passes: facts that later checks and stages need."""
+
+    passes: list[Pass] = field(default_factory=list)
+    streams: list[Stream] = field(default_factory=list)
+    overridden: set[str] = field(default_factory=set)
+    asleep: dict[Span, str] = field(default_factory=dict)
+    awake: set[Span] = field(default_factory=set)
+
+
+class Elaborator:
+    """Turns declared passes into checked ones, one after the other."""
+
+    def __init__(self, typer: Typer):
+        self.typer = typer
+        self.result = Elaborated()
+        self._rules = 0
+
+    def run(self, passes: tuple[Named[PassDecl], ...]) -> Elaborated:
+        for named in passes:
+            try:
+                self.result.passes.append(self._pass(named))
+            except Poisoned:
+                continue
+        for span, name in self.result.asleep.items():
+            if span not in self.result.awake:
+                self.typer.reporter.report(
+                    "PD506", f"this rule is asleep: `{name}` is not loaded", span, "left out", helps=[f"it wakes up with a pack that defines `{name}`"]
+                )
+        return self.result
+
+    def _pass(self, named: Named[PassDecl]) -> Pass:
+        decl = named.decl
+        self._name, self._pack = decl.name.text, named.pack
+        self._chances = 0
+        self._lets: dict[str, int] = {}
+        self._pending: list[Let] = []
+        self._moments: list[Moment] = []
+        scratch: dict[str, Field] = {}
+        names: dict[str, Operand] = {}
+        for item in decl.scratch:
+            qualified = f"{self._name}.{item.name.text}"
+            self._fresh(item.name.text, item.name.span, Scope(named.pack, names))
+            try:
+                kind = read_kind(item.type, self.typer) if item.type else None
+            except Poisoned:
+                kind = None
+            if kind is None:
+                names[item.name.text] = Broken()
+                continue
+            scratch[qualified] = Field(qualified, kind, default_of(kind), "place", True, None, named.pack, item.name.span)
+            names[item.name.text] = Expr("field", kind, value=qualified, span=item.name.span)
+        self._scratch = scratch
+        self._block(decl.block, Scope(named.pack, names), "", None, None)
+        if self._pending:
+            self._moments.append(Moment(tuple(self._pending), (), "prove", ""))
+        return Pass(self._name, named.pack, tuple(scratch.values()), tuple(self._moments), decl.name.span)
+
+    def _fresh(self, name: str, span: Span, scope: Scope) -> None:
+        """A new local name may not hide another."""
+        if name in scope.locals or self.typer.find(name, span, Scope(scope.pack, {})) is not None:
+            self.typer.reporter.error(
+                "PD308", f"`{name}` already means something here", span, "the same word", helps=["choose another name"]
+            )
+
+    def _block(self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None) -> None:
+        symmetry, policy = block.symmetry or symmetry, block.policy or policy
+        for scalar, syntax in block.lets:
+            self._fresh(scalar.text, scalar.span, scope)
+            scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope)})
+        for inner, inner_label in self._rounds(block, scope, label):
+            if block.rules:
+                self._moment(block.rules, inner, inner_label, symmetry, policy)
+            for child in block.blocks:
+                self._block(child, inner, inner_label, symmetry, policy)
+        for child in block.then:
+            self._block(child, scope, label, symmetry, policy)
+
+    def _rounds(self, block: Block, scope: Scope, label: str) -> list[tuple[Scope, str]]:
+        header = block.header
+        if header is None:
+            return [(scope, label)]
+        if header.kind == "repeat":
+            rounds = int(header.text) if len(header.text) < 4 else 1000
+            if not 1 <= rounds <= 64:
+                self.typer.reporter.error("PD508", f"a loop of {header.text} rounds", header.span, "1 to 64 are possible")
+                return []
+            return [(scope, f"{label}round {i + 1}") for i in range(rounds)]
+        try:
+            scopes = self.typer.bindings(header.children, scope)
+        except (Poisoned, Asleep):
+            return []
+        variables = [binding.children[0].text for binding in header.children]
+        for variable in variables:
+            self.typer.used.discard(variable)
+        return [(inner, ", ".join([*filter(None, [label]), *(f"{v} = {_show(inner.locals[v])}" for v in variables)])) for inner in scopes]
+
+    def _let(self, name: str, syntax: Syntax, scope: Scope) -> Operand:
+        try:
+            operand = self.typer.evaluate(syntax, scope)
+            if isinstance(operand, (Number, Place)):
+                return operand
+            value = self.typer.value(operand, syntax.span)
+        except Poisoned:
+            return Broken()
+        except Asleep as asleep:
+            return Absent(asleep.name)
+        value = constant(value) if isinstance(value, Number) else value
+        if value.kind.name == "draw":
+            return value  # draws are fixed for the whole step anyway
+        count = self._lets.get(name, 0)
+        self._lets[name] = count + 1
+        unique = name if count == 0 else f"{name}#{count + 1}"
+        self._pending.append(Let(unique, value, syntax.span))
+        return Expr("let", value.kind, value=unique, span=syntax.span)
+
+    def _moment(self, rules: tuple[Syntax, ...], scope: Scope, label: str, symmetry: str | None, policy: str | None) -> None:
+        found: list[Rule] = []
+        for syntax in rules:
+            for matrix in ORIENTATIONS[symmetry]:
+                found.extend(rule for rule in self._rule(syntax, replace(scope, orientation=matrix)) if rule not in found)
+        self._rules += len(found)
+        if self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
+            raise self.typer.fail(
+                "PD508", f"loops unroll to more than {MAX_MOMENTS} moments or {MAX_RULES} rules", rules[0].span, "here", ("loop over fewer things",)
+            )
+        self._moments.append(Moment(tuple(self._pending), tuple(found), policy or "prove", label))
+        self._pending = []
+
+    # Rules
+
+    def _rule(self, syntax: Syntax, scope: Scope) -> list[Rule]:
+        self.typer.absent.clear()
+        try:
+            rules = {
+                "transform": self._transform, "swap": self._swap, "move": self._move, "assign": self._assign, "push": self._push,
+            }[syntax.kind](syntax, scope)  # fmt: skip
+        except Poisoned:
+            self.result.awake.add(syntax.span)
+            return []
+        except Asleep as asleep:
+            self.result.asleep[syntax.span] = asleep.name
+            return []
+        rules = [rule for rule in rules if not (rule.mask == FALSE and self.typer.absent)]
+        if rules:
+            self.result.awake.add(syntax.span)
+        else:
+            self.result.asleep[syntax.span] = ", ".join(sorted(self.typer.absent))
+        return rules
+
+    def _mask(self, subjects: list[Expr], syntax: Syntax, scope: Scope) -> Expr:
+        parts = subjects
+        for kind in ("condition", "where"):
+            if clause := syntax.child(kind):
+                parts.append(self.typer.condition(clause.children[0], scope))
+        if clause := syntax.child("chance"):
+            self._chances += 1
+            name = f"{self._pack}.{self._name}#{self._chances}"
+            self.result.streams.append(Stream(name, stream_ident(name), 32))
+            parts.append(self.typer.chance_draw(name, clause.children[0], scope))
+        return conjunction(parts, syntax.span)
+
+    def _transform(self, syntax: Syntax, scope: Scope) -> list[Rule]:
+        who, target = syntax.children[:2]
+        mask = self._mask([self.typer.condition(who, scope)], syntax, scope)
+        value = self.typer.element(self.typer.evaluate(target, scope), target.span)
+        return [Transform(mask, value, self._effects(syntax, scope), syntax.span)]
+
+    def _swap(self, syntax: Syntax, scope: Scope) -> list[Rule]:
+        subject, place = syntax.children[:2]
+        subjects = [self.typer.condition(child, scope) for child in subject.children]
+        offset = self._neighbour(place, scope)
+        mask = self._mask(subjects, syntax, scope)
+        return [Swap(mask, offset, self._effects(syntax, scope), syntax.span)]
+
+    def _move(self, syntax: Syntax, scope: Scope) -> list[Rule]:
+        who, place, leaving = syntax.children[:3]
+        offset = self._neighbour(place, scope)
+        mask = self._mask([self.typer.condition(who, scope)], syntax, scope)
+        left = self.typer.element(self.typer.evaluate(leaving, scope), leaving.span)
+        if left.op != "const":
+            raise self.typer.fail("PD405", "what is left behind must be one element", leaving.span, "name it")
+        return [Move(mask, offset, left, self._effects(syntax, scope), syntax.span)]
+
+    def _neighbour(self, syntax: Syntax, scope: Scope) -> Offset:
+        place = self.typer.place(self.typer.evaluate(syntax, scope), syntax.span)
+        if place.offset == (0, 0):
+            raise self.typer.fail("PD401", "a cell cannot move to itself", syntax.span, "expected a neighbour")
+        return self.typer.offset(place.offset, syntax.span)
+
+    def _effects(self, syntax: Syntax, scope: Scope) -> tuple[Assign, ...]:
+        clause = syntax.child("then")
+        return tuple(self._update(update, scope, None) for update in clause.children) if clause else ()
+
+    def _assign(self, syntax: Syntax, scope: Scope) -> list[Rule]:
+        return [self._update(syntax.children[0], scope, self._mask([], syntax, scope))]
+
+    def _update(self, syntax: Syntax, scope: Scope, mask: Expr | None) -> Assign:
+        target, value = syntax.children
+        name, kind, offset = self._target(target, scope)
+        operand = self.typer.evaluate(value, scope)
+        if syntax.text == ":=":
+            expr = self.typer.of_kind(operand, kind, value.span)
+            self._check_fits(expr, kind, value.span, name)
+        elif kind.name in ("int", "real", "vec2"):
+            wide = Kind(kind.name, -1e6, 1e6)
+            expr = self.typer.of_kind(operand, wide, value.span)
+        else:
+            raise self.typer.fail("PD407", f"`{syntax.text}` needs a number", syntax.span, f"`{name}` is a {kind}", ("assign with `:=`",))
+        return Assign(name, offset, syntax.text, expr, mask, syntax.span)
+
+    def _check_fits(self, value: Expr, kind: Kind, span: Span, name: str) -> None:
+        if kind.name == "int" and (value.kind.lo < kind.lo or value.kind.hi > kind.hi):
+            self.typer.reporter.report(
+                "PD408", f"a value of {value.kind} goes into `{name}`, which holds {kind}", span, "it is cut off at the bounds",
+                helps=[f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"],
+            )
+
+    def _target(self, syntax: Syntax, scope: Scope) -> tuple[str, Kind, Offset]:
+        """The field that is assigned, its kind, and where."""
+        operand: Operand
+        offset = (0, 0)
+        if syntax.kind == "attribute":
+            base = self.typer.place(self.typer.evaluate(syntax.children[0], scope), syntax.children[0].span)
+            offset = self.typer.offset(base.offset, syntax.span)
+            operand = self.typer.lookup(syntax.text, syntax.span, scope)
+        else:
+            operand = self.typer.evaluate(syntax, scope)
+        if isinstance(operand, Absent):
+            raise Asleep(operand.name)
+        if not isinstance(operand, Expr) or operand.op not in ("field", "property"):
+            fields = [*self.typer.symbols.fields, *self.typer.symbols.properties, *(n.split(".")[1] for n in self._scratch)]
+            raise self.typer.fail(
+                "PD407", f"`{syntax.span.text}` cannot be assigned", syntax.span, "not a field or property", suggest(syntax.text, fields, "fields")
+            )
+        name = str(operand.value)
+        if operand.op == "property":
+            if operand.kind.name == "chance":
+                raise self.typer.fail("PD407", f"the chance `{name}` cannot be assigned", syntax.span, "chances belong to elements", ("declare it as a whole number",))
+            self.result.overridden.add(name)
+        return name, operand.kind, offset
+
+    def _push(self, syntax: Syntax, scope: Scope) -> list[Rule]:
+        target, amount, source = syntax.children[:3]
+        name, kind, _ = self._target(target, scope)
+        if kind.name != "vec2":
+            raise self.typer.fail("PD401", f"`{name}` is no vector", target.span, f"this is a {kind}", ("`push` works on vec2 fields",))
+        mask = self._mask([self.typer.condition(source, scope)], syntax, scope)
+        strength = self.typer.real(self.typer.evaluate(amount, scope), amount.span)
+        zero = Expr("const", REAL, value=0.0)
+        rules: list[Rule] = []
+        for dy, dx in DIRECTION_SETS["sides"]:
+            dy, dx = turned((dy, dx), scope.orientation)
+            parts = tuple(zero if d == 0 else strength if d > 0 else Expr("neg", REAL, (strength,)) for d in (dy, dx))
+            vector = Expr("vector", VEC2, parts, span=amount.span)
+            rules.append(Assign(name, (dy, dx), "+=", vector, mask, syntax.span))
+        return rules
+
+
+def _show(operand: Operand) -> str:
+    match operand:
+        case Place():
+            names = [n for n, o in DIRECTIONS.items() if o == operand.offset]
+            return names[0] if names else f"at{operand.offset}".replace(" ", "")
+        case Number():
+            return str(operand.value)
+    return str(getattr(operand, "name", operand))

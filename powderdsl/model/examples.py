@@ -1,0 +1,59 @@
+"""Tests inside packs: small worlds drawn in ASCII, and what must become of them."""
+
+from __future__ import annotations
+
+from powderdsl.diagnostics import Span, suggest
+from powderdsl.model.compose import Composition
+from powderdsl.model.expressions import Scope, Typer
+from powderdsl.model.operands import Asleep, Poisoned
+from powderdsl.model.packs import TestDecl
+from powderdsl.model.types import Example, Expr
+from powderdsl.syntax.yaml_tree import Scalar
+
+MAX_SIDE = 64
+
+
+def check_examples(composition: Composition, typer: Typer) -> tuple[Example, ...]:
+    """The tests of all packs, checked: characters known, rows equally long."""
+    examples = []
+    for pack in composition.packs:
+        for decl in pack.tests:
+            try:
+                examples.append(_example(decl, pack.name.text, composition, typer))
+            except (Poisoned, Asleep):
+                continue
+    return tuple(examples)
+
+
+def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) -> Example:
+    legend = {element.glyph: name for name, element in composition.elements.items()}
+    for key, value in decl.legend:
+        if value.text not in composition.elements:
+            raise typer.fail("PD301", f"unknown element `{value.text}`", value.span, helps=suggest(value.text, composition.elements, "elements"))
+        if len(key.text) != 1:
+            raise typer.fail("PD110", "a legend explains single characters", key.span)
+        legend[key.text] = value.text
+    if decl.given is None:
+        raise typer.fail("PD109", f"the test `{decl.name}` has no start world", decl.scalar.span, "`given` is missing")
+    given = _rows(decl.given, legend, typer, wildcard=False)
+    expect = _rows(decl.expect, legend, typer, wildcard=True) if decl.expect else None
+    if expect is not None and decl.expect is not None and (len(expect), len(expect[0])) != (len(given), len(given[0])):
+        raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span)
+    if expect is None and not decl.always:
+        raise typer.fail("PD109", f"the test `{decl.name}` checks nothing", decl.scalar.span, "`expect` or `always` is missing")
+    always: list[Expr] = [typer.condition(syntax, Scope(pack, {})) for syntax in decl.always]
+    return Example(
+        decl.name, given, tuple(sorted(legend.items())), decl.steps, expect, tuple(always), pack, decl.scalar.span, decl.seed
+    )
+
+
+def _rows(scalar: Scalar, legend: dict[str, str], typer: Typer, *, wildcard: bool) -> tuple[str, ...]:
+    rows = tuple("".join(line.split()) for line in scalar.text.splitlines() if line.strip())
+    if not rows or len({len(row) for row in rows}) != 1 or max(len(rows), len(rows[0])) > MAX_SIDE:
+        raise typer.fail("PD110", "rows of a world are equally long", scalar.span, f"expected 1 to {MAX_SIDE} equal rows")
+    for char in sorted(set("".join(rows))):
+        if char not in legend and not (wildcard and char == "?"):
+            place = scalar.content.start + max(scalar.content.text.find(char), 0)
+            known = " ".join(f"{glyph}={name}" for glyph, name in sorted(legend.items()))
+            raise typer.fail("PD301", f"`{char}` stands for nothing", Span(scalar.span.source, place, place + 1), "not in the legend", (f"known: {known}",))
+    return rows

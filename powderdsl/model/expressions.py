@@ -1,0 +1,382 @@
+"""Syntax of one expression -> operand: names looked up, kinds checked, constants folded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import product
+
+from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.model import arithmetic
+from powderdsl.model.builtins import COORDINATES, FUNCTIONS
+from powderdsl.model.calls import CALLS
+from powderdsl.model.literals import read_bounds, read_number
+from powderdsl.model.operands import (
+    FALSE,
+    TRUE,
+    Absent,
+    Asleep,
+    Bounds,
+    Broken,
+    Coercer,
+    Items,
+    Number,
+    Operand,
+    Place,
+    Poisoned,
+    SetOf,
+    conjunction,
+    disjunction,
+    look,
+    member,
+    negation,
+)
+from powderdsl.model.symbols import Symbols
+from powderdsl.model.types import CHANCE, DIRECTION, DRAW, FLAG, Expr, Kernel, Offset
+from powderdsl.syntax.ast import Syntax
+
+Matrix = tuple[tuple[int, int], tuple[int, int]]
+IDENTITY: Matrix = ((1, 0), (0, 1))
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Where an expression stands: its pack, the local names, and how it is turned by a symmetry."""
+
+    pack: str
+    locals: dict[str, Operand]
+    orientation: Matrix = IDENTITY
+
+    def bind(self, **names: Operand) -> Scope:
+        return replace(self, locals={**self.locals, **names})
+
+
+class Typer(Coercer):
+    """Checks expressions against the symbols of a composition."""
+
+    def __init__(self, symbols: Symbols, reporter: Reporter):
+        super().__init__(reporter)
+        self.symbols = symbols
+        self.used: set[str] = set()
+        self.absent: set[str] = set()
+        self.set_definitions: dict[str, tuple[str, Syntax]] = {}
+        self.resolving: list[str] = []
+
+    def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
+        """What the syntax stands for. Raises Poisoned after reporting, Asleep if it hangs on an absent name."""
+        return HANDLERS[syntax.kind](self, syntax, scope)
+
+    def condition(self, syntax: Syntax, scope: Scope) -> Expr:
+        return self.flag(self.evaluate(syntax, scope), syntax.span)
+
+    # Names
+
+    def lookup(self, name: str, span: Span, scope: Scope) -> Operand:
+        found = self.find(name, span, scope)
+        if found is not None:
+            return found
+        known = [*scope.locals, *self.symbols.names()]
+        packs = "+".join(pack.name.text for pack in self.symbols.composition.packs)
+        label = f"nothing of this name in {packs}"
+        helps = suggest(name, known) or ("is its pack loaded? if it may be absent, write `" + name + "?`",)
+        raise self.fail("PD301", f"unknown name `{name}`", span, label, helps)
+
+    def find(self, name: str, span: Span, scope: Scope) -> Operand | None:
+        """The operand of a name, or None if there is none."""
+        symbols = self.symbols
+        self.used.add(name)
+        if name in scope.locals:
+            if isinstance(scope.locals[name], Broken):
+                raise Poisoned
+            return self.turn(scope.locals[name], scope)
+        if name in self.set_definitions and name not in symbols.constants:
+            return self.resolve_set(name, span)
+        if name in symbols.constants:
+            return self.turn(symbols.constants[name], scope)
+        if name in symbols.properties:
+            return Expr("property", symbols.properties[name].kind, value=name, span=span)
+        if name in symbols.fields:
+            return Expr("field", symbols.fields[name].kind, value=name, span=span)
+        if name in symbols.streams:
+            return Expr("draw", DRAW, value=name, span=span)
+        param = symbols.params.get(f"{scope.pack}.{name}")
+        if param is not None:
+            self.used.add(param.name)
+            return Expr("param", param.kind, value=param.name, span=span)
+        return None
+
+    def resolve_set(self, name: str, span: Span) -> Operand:
+        if name in self.resolving:
+            raise self.fail("PD307", f"the set `{name}` is defined by itself", span)
+        pack, syntax = self.set_definitions[name]
+        self.resolving.append(name)
+        try:
+            result = self.set_of(self.evaluate(syntax, Scope(pack, {})), syntax.span)
+        finally:
+            self.resolving.pop()
+        result = SetOf(result.ids)
+        self.symbols.constants[name] = result
+        return result
+
+    def turn(self, operand: Operand, scope: Scope) -> Operand:
+        """Places and kernels as the scope's symmetry turns them."""
+        if scope.orientation == IDENTITY:
+            return operand
+        match operand:
+            case Place():
+                return Place(turned(operand.offset, scope.orientation))
+            case Items():
+                return Items(tuple(self.turn(item, scope) for item in operand.items))
+            case Kernel():
+                weights = sorted((*turned((dy, dx), scope.orientation), w) for dy, dx, w in operand.weights)
+                return replace(operand, weights=tuple(weights))
+        return operand
+
+    def name(self, syntax: Syntax, scope: Scope) -> Operand:
+        if syntax.text in COORDINATES:
+            raise self.fail(
+                "PD406", f"`{syntax.text}` stands with `mod`", syntax.span, helps=(f"write `{syntax.text} mod 2`",)
+            )
+        if syntax.text in FUNCTIONS:
+            raise self.fail("PD406", f"`{syntax.text}` is a function", syntax.span, helps=(f"write `{FUNCTIONS[syntax.text].signature}`",))
+        return self.lookup(syntax.text, syntax.span, scope)
+
+    def optional_name(self, syntax: Syntax, scope: Scope) -> Operand:
+        found = self.find(syntax.text, syntax.span, scope)
+        if found is None:
+            self.absent.add(syntax.text)
+            return Absent(syntax.text)
+        return found
+
+    def attribute(self, syntax: Syntax, scope: Scope) -> Operand:
+        base_syntax = syntax.children[0]
+        if base_syntax.kind == "name":
+            qualified = f"{base_syntax.text}.{syntax.text}"
+            if qualified in self.symbols.params and self.find(base_syntax.text, syntax.span, Scope("", scope.locals)) is None:
+                self.used.add(qualified)
+                param = self.symbols.params[qualified]
+                return Expr("param", param.kind, value=qualified, span=syntax.span)
+        base = self.evaluate(base_syntax, scope)
+        word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
+        if isinstance(base, Absent):
+            raise Asleep(base.name)
+        if isinstance(base, Expr) and base.kind.name == "vec2":
+            if syntax.text in ("row", "column"):
+                return arithmetic.part(base, syntax.text, syntax.span)
+            raise self.fail("PD301", f"a vector has no `{syntax.text}`", word, helps=("parts of a vector: `.row`, `.column`",))
+        if not isinstance(base, Place):
+            raise self.wrong(base, "a neighbour before the dot", base_syntax.span, "such as `below.density`")
+        value = self.lookup(syntax.text, word, scope)
+        match value:
+            case Place():
+                offset = (base.offset[0] + value.offset[0], base.offset[1] + value.offset[1])
+                return Place(self.offset(offset, syntax.span))
+            case Expr():
+                return look(value, self.offset(base.offset, syntax.span), syntax.span)
+            case SetOf():
+                text = f"{base_syntax.span.text} is {syntax.text}"
+                raise self.fail("PD401", f"`{syntax.text}` is {'an element' if value.name else 'a set'}", word, helps=(f"write `{text}`",))
+        raise self.wrong(value, "a field, property or neighbour after the dot", word)
+
+    # Literals and lists
+
+    def number(self, syntax: Syntax, scope: Scope) -> Operand:
+        return Number(read_number(syntax, self))
+
+    def truth(self, syntax: Syntax, scope: Scope) -> Operand:
+        return TRUE if syntax.kind == "yes" else FALSE
+
+    def range(self, syntax: Syntax, scope: Scope) -> Operand:
+        return Bounds(*read_bounds(syntax, self))
+
+    def tuple(self, syntax: Syntax, scope: Scope) -> Operand:
+        items = tuple(self.evaluate(child, scope) for child in syntax.children)
+        if all(isinstance(item, (SetOf, Absent)) for item in items):
+            return self.set_of(Items(items), syntax.span)
+        return Items(items)
+
+    def any(self, syntax: Syntax, scope: Scope) -> Operand:
+        return SetOf(self.symbols.ids)
+
+    def any_but(self, syntax: Syntax, scope: Scope) -> Operand:
+        left_out = self.set_of(self.evaluate(syntax.children[0], scope), syntax.children[0].span)
+        return SetOf(tuple(i for i in self.symbols.ids if i not in left_out.ids))
+
+    # Logic
+
+    def logic(self, syntax: Syntax, scope: Scope) -> Operand:
+        operands = [self.evaluate(child, scope) for child in syntax.children]
+        if all(isinstance(operand, (SetOf, Absent)) for operand in operands):
+            sets = [set(self.set_of(operand, syntax.span).ids) for operand in operands]
+            ids = sets[0] | sets[1] if syntax.kind == "or_" else sets[0] & sets[1]
+            return SetOf(tuple(sorted(ids)))
+        flags = [self.flag(operand, child.span) for operand, child in zip(operands, syntax.children, strict=True)]
+        return (disjunction if syntax.kind == "or_" else conjunction)(flags, syntax.span)
+
+    def not_(self, syntax: Syntax, scope: Scope) -> Operand:
+        return negation(self.condition(syntax.children[0], scope), syntax.span)
+
+    def compare(self, syntax: Syntax, scope: Scope) -> Operand:
+        operands = [self.evaluate(child, scope) for child in syntax.children]
+        headings = any(isinstance(operand, Expr) and operand.kind == DIRECTION for operand in operands)
+        values = [
+            self.direction(operand, child.span) if headings and isinstance(operand, Place) else self.value(operand, child.span)
+            for operand, child in zip(operands, syntax.children, strict=True)
+        ]
+        parts = []
+        for i, operator in enumerate(syntax.text.split()):
+            span = syntax.children[i].span.to(syntax.children[i + 1].span)
+            parts.append(arithmetic.compare(self, operator, values[i], values[i + 1], span))
+        return conjunction(parts, syntax.span)
+
+    def is_(self, syntax: Syntax, scope: Scope) -> Operand:
+        positive = syntax.kind in ("is_", "in_")
+        left, right = (self.evaluate(child, scope) for child in syntax.children)
+        result = self.holds(left, right, syntax)
+        return result if positive else negation(result, syntax.span)
+
+    def holds(self, left: Operand, right: Operand, syntax: Syntax) -> Expr:
+        """Whether `left` is, or lies in, `right`."""
+        span = syntax.span
+        first, second = syntax.children
+        match left, right:
+            case Place(), Place():
+                return TRUE if left == right else FALSE
+            case Place(), Items() if all(isinstance(item, Place) for item in right.items):
+                return TRUE if left in right.items else FALSE
+            case Place(), Expr() if right.kind == FLAG:
+                return look(right, left.offset, span)
+            case Number(), Number():
+                return TRUE if left == right else FALSE
+            case SetOf(), SetOf() if left.name is not None:
+                return TRUE if left.ids[0] in right.ids else FALSE
+            case Expr(), Place():
+                return arithmetic.compare(self, "==", left, self.direction(right, second.span), span)
+            case _, Bounds():
+                value = self.value(left, first.span)
+                low, high = Number(Fraction(right.lo)), Number(Fraction(right.hi))
+                return conjunction(
+                    [arithmetic.compare(self, "<=", low, value, span), arithmetic.compare(self, "<=", value, high, span)], span
+                )
+            case _, Items() if any(isinstance(item, (Number, Place)) for item in right.items):
+                return disjunction([self.holds(left, item, syntax) for item in right.items], span)
+            case _, Number():
+                raise self.fail("PD401", "`is` asks for an element or a direction", span, helps=("compare numbers with `==`",))
+            case _, Absent():
+                return FALSE
+            case Absent(), _:
+                raise Asleep(left.name)
+        ids = self.set_of(right, second.span).ids
+        if isinstance(left, SetOf) and left.name is None:
+            raise self.wrong(left, "a place or an element before `is`", first.span, "such as `below is …`")
+        return member(self.element(left, first.span), ids, span)
+
+    def choose(self, syntax: Syntax, scope: Scope) -> Operand:
+        yes, condition, no = syntax.children
+        chosen = self.condition(condition, scope)
+        if chosen in (TRUE, FALSE):
+            return self.evaluate(yes if chosen == TRUE else no, scope)
+        first, second = self.evaluate(yes, scope), self.evaluate(no, scope)
+        return arithmetic.choose(self, chosen, (first, yes.span), (second, no.span), syntax.span)
+
+    def quantifier(self, syntax: Syntax, scope: Scope) -> Operand:
+        body, binding = syntax.children
+        flags = [self.condition(body, inner) for inner in self.bindings((binding,), scope)]
+        return (disjunction if syntax.kind == "any_of" else conjunction)(flags, syntax.span)
+
+    def bindings(self, bindings: tuple[Syntax, ...], scope: Scope) -> list[Scope]:
+        """The scopes of a loop's rounds: the first variable turns slowest."""
+        domains: list[list[tuple[str, Operand]]] = []
+        for binding in bindings:
+            variable, domain = binding.children
+            if self.find(variable.text, variable.span, scope) is not None or any(d and d[0][0] == variable.text for d in domains):
+                raise self.fail("PD308", f"`{variable.text}` already means something here", variable.span, "choose another name")
+            self.used.add(variable.text)
+            domains.append([(variable.text, value) for value in self.domain(domain, scope)])
+        return [scope.bind(**dict(choice)) for choice in product(*domains)]
+
+    def domain(self, syntax: Syntax, scope: Scope) -> list[Operand]:
+        operand = self.evaluate(syntax, scope)
+        names = {element.id: name for name, element in self.symbols.composition.elements.items()}
+        match operand:
+            case Bounds():
+                if operand.hi - operand.lo >= 64:
+                    raise self.fail("PD508", f"a loop of {operand.hi - operand.lo + 1} rounds", syntax.span, "the limit is 64")
+                return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
+            case SetOf():
+                return [SetOf((i,), names[i]) for i in operand.ids]
+            case Items():
+                return list(operand.items)
+            case Absent():
+                return []
+        raise self.wrong(operand, "a range, a set or a list", syntax.span, "such as `0..4`, a tag, or `(left, right)`")
+
+    def call(self, syntax: Syntax, scope: Scope) -> Operand:
+        function = FUNCTIONS.get(syntax.text)
+        name_span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(syntax.text))
+        if function is None:
+            raise self.fail("PD301", f"unknown function `{syntax.text}`", name_span, "not a function", suggest(syntax.text, FUNCTIONS, "functions"))
+        lo, hi = function.arity
+        if not lo <= len(syntax.children) <= hi:
+            raise self.fail("PD406", f"`{syntax.text}` takes {lo if lo == hi else f'{lo} to {hi}'} values, found {len(syntax.children)}", syntax.span, helps=(f"write `{function.signature}`",))
+        return CALLS[syntax.text](self, syntax, scope)
+
+    def binary(self, syntax: Syntax, scope: Scope) -> Operand:
+        left, right = (self.value(self.evaluate(child, scope), child.span) for child in syntax.children)
+        return arithmetic.binary(self, syntax.kind, left, right, syntax)
+
+    def negate(self, syntax: Syntax, scope: Scope) -> Operand:
+        value = self.value(self.evaluate(syntax.children[0], scope), syntax.children[0].span)
+        return arithmetic.negate(self, value, syntax.span)
+
+    def mod(self, syntax: Syntax, scope: Scope) -> Operand:
+        return arithmetic.modulo(self, syntax, scope)
+
+    def chance_draw(self, stream: str, syntax: Syntax, scope: Scope) -> Expr:
+        """`with chance P`: a draw of the rule's own stream below P."""
+        threshold = self.chance(self.evaluate(syntax, scope), syntax.span)
+        draw = Expr("draw", DRAW, value=stream, span=syntax.span)
+        if threshold.kind == CHANCE:
+            return arithmetic.compare(self, "<", draw, threshold, syntax.span)
+        return Expr("lt", FLAG, (Expr("to_real", threshold.kind, (draw,)), threshold), span=syntax.span)
+
+
+def turned(offset: Offset, matrix: Matrix) -> Offset:
+    (a, b), (c, d) = matrix
+    return (a * offset[0] + b * offset[1], c * offset[0] + d * offset[1])
+
+
+HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
+    "name": Typer.name,
+    "optional_name": Typer.optional_name,
+    "attribute": Typer.attribute,
+    "integer": Typer.number,
+    "decimal": Typer.number,
+    "percent": Typer.number,
+    "yes": Typer.truth,
+    "no": Typer.truth,
+    "range": Typer.range,
+    "tuple": Typer.tuple,
+    "any": Typer.any,
+    "any_but": Typer.any_but,
+    "or_": Typer.logic,
+    "and_": Typer.logic,
+    "not_": Typer.not_,
+    "compare": Typer.compare,
+    "is_": Typer.is_,
+    "is_not": Typer.is_,
+    "in_": Typer.is_,
+    "not_in": Typer.is_,
+    "choose": Typer.choose,
+    "any_of": Typer.quantifier,
+    "all_of": Typer.quantifier,
+    "call": Typer.call,
+    "add": Typer.binary,
+    "subtract": Typer.binary,
+    "multiply": Typer.binary,
+    "divide": Typer.binary,
+    "negate": Typer.negate,
+    "mod": Typer.mod,
+}
+"""One handler for every kind of syntax node that can stand in an expression."""

@@ -1,0 +1,164 @@
+"""The logic of rules, decided before anything runs: movements that collide, writes that clash, rules that never fire."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.operands import ELEMENT_HERE, negation
+from powderdsl.model.operands import member as member_of
+from powderdsl.model.satisfy import Facts, satisfiable
+from powderdsl.model.types import (
+    Assign,
+    Expr,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Rule,
+    Swap,
+    Transform,
+)
+
+HERE: Offset = (0, 0)
+
+
+def check_logic(passes: tuple[Pass, ...], facts: Facts, sleeping: dict[Span, str], reporter: Reporter) -> None:
+    """Report conflicts (errors) and rules that never fire or do nothing (warnings)."""
+    alive: dict[Span, bool] = {}
+    useful: dict[Span, bool] = {}
+    for pass_ in passes:
+        for moment in pass_.moments:
+            lets = {let.name: let.value for let in moment.lets}
+            live = []
+            for rule in moment.rules:
+                fires = rule.mask is None or satisfiable(facts, [(rule.mask, HERE)], lets)
+                alive[rule.span] = alive.get(rule.span, False) or fires
+                useful[rule.span] = useful.get(rule.span, False) or not fires or _changes(rule, facts, lets)
+                if fires:
+                    live.append(rule)
+            if moment.policy == "prove":
+                _check_moment(pass_, moment, live, facts, lets, reporter)
+    for span, fires in alive.items():
+        if not fires and span in sleeping:
+            reporter.report("PD506", f"this rule is asleep: {sleeping[span]}", span, "cannot fire with these packs")
+        elif not fires:
+            reporter.report(
+                "PD503", "this rule can never fire", span, "its condition contradicts itself",
+                helps=["check which elements have the properties it asks for: `powderdsl show`"],
+            )
+        elif not useful[span]:
+            reporter.report("PD509", "this rule changes nothing", span, "the cell already is what it becomes")
+
+
+def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
+    if isinstance(rule, Transform) and rule.target.op == "const" and not rule.effects:
+        same = member_of(ELEMENT_HERE, (rule.target.value,))  # type: ignore[arg-type]
+        return satisfiable(facts, [(rule.mask, HERE), (negation(same), HERE)], lets)
+    return True
+
+
+def _check_moment(
+    pass_: Pass, moment: Moment, rules: list[Rule], facts: Facts, lets: dict[str, Expr], reporter: Reporter
+) -> None:
+    where = f" ({moment.label})" if moment.label else ""
+    movers = [rule for rule in rules if not isinstance(rule, Assign)]
+    for i, first in enumerate(movers):
+        for second in movers[i:]:
+            for shift in _claims(first, second):
+                if satisfiable(facts, [(first.mask, HERE), (second.mask, shift)], lets):
+                    _report_conflict(pass_, first, second, where, reporter)
+                    break
+    assigns = [rule for rule in rules if isinstance(rule, Assign) and rule.op == ":="]
+    for i, a in enumerate(assigns):
+        for b in assigns[i + 1 :]:
+            if a.field != b.field or a.value == b.value:
+                continue
+            shift = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
+            assert a.mask is not None and b.mask is not None
+            if satisfiable(facts, [(a.mask, HERE), (b.mask, shift)], lets):
+                reporter.error(
+                    "PD502", f"two rules may assign `{a.field}` of one cell in the same moment{where}", b.span,
+                    "this one, and", secondary=[Label(a.span, "this one")],
+                    helps=["make their conditions exclude each other, or put one under `then:`"],
+                )
+
+
+def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
+    """Where, relative to the first rule's cell, the second would claim one of the same cells."""
+    if isinstance(first, Transform) and isinstance(second, Transform):
+        if first is not second and first.target != second.target:
+            yield HERE
+        return
+    if isinstance(first, Move) and isinstance(second, Move):
+        # A move into a place that is being left is fine: what stands there goes first.
+        if first is not second:
+            yield HERE
+            yield (first.offset[0] - second.offset[0], first.offset[1] - second.offset[1])
+        return
+    seen = set()
+    for a in _footprint(first):
+        for b in _footprint(second):
+            shift = (a[0] - b[0], a[1] - b[1])
+            if shift not in seen and not (first is second and shift == HERE):
+                seen.add(shift)
+                yield shift
+
+
+def _footprint(rule: Rule) -> tuple[Offset, ...]:
+    return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)
+
+
+def _report_conflict(pass_: Pass, first: Rule, second: Rule, where: str, reporter: Reporter) -> None:
+    if first is second or first.span == second.span:
+        reporter.error(
+            "PD501", f"a cell may be both mover and target{where}", first.span, "two of these swaps can meet in one cell",
+            notes=["swaps of one moment happen at once: no cell may take part in two of them"],
+            helps=[
+                "add a condition that a target cannot fulfil, such as a comparison of densities",
+                "or choose what happens then: `conflicts: drop_both`",
+            ],
+        )
+        return
+    movement = isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move))
+    reporter.error(
+        "PD501" if movement else "PD502",
+        f"two rules may claim one cell in the same moment{where}", second.span, "this one, and",
+        secondary=[Label(first.span, "this one")],
+        helps=[
+            "make their conditions exclude each other, or put one under `then:`",
+            "or choose what happens then: `conflicts: first_wins` or `conflicts: drop_both`",
+        ],
+    )
+
+
+def overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
+    """The ids whose cells may hold their own value of a property: those that some rule assigns it to."""
+    found: set[int] = set()
+    for pass_ in passes:
+        for moment in pass_.moments:
+            lets = {let.name: let.value for let in moment.lets}
+            for rule in moment.rules:
+                assigns = [rule] if isinstance(rule, Assign) else list(rule.effects)
+                for assign in assigns:
+                    if assign.field != name:
+                        continue
+                    if assign.mask is None or assign.offset != HERE:
+                        return frozenset(facts.ids)
+                    found |= {
+                        i for i in facts.ids if i not in found
+                        and satisfiable(facts, [(member_of(ELEMENT_HERE, (i,)), HERE), (assign.mask, HERE)], lets)
+                    }  # fmt: skip
+    return frozenset(found)
+
+
+def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
+    """The ids that some rule may bring about."""
+    found: set[int] = set()
+    for pass_ in passes:
+        for moment in pass_.moments:
+            for rule in moment.rules:
+                target = rule.target if isinstance(rule, Transform) else rule.leaving if isinstance(rule, Move) else None
+                if target is not None:
+                    found |= {target.value} if target.op == "const" else set(facts.ids)  # type: ignore[arg-type]
+    return frozenset(found)

@@ -1,0 +1,338 @@
+"""What a piece of syntax can stand for while it is checked, and how one kind becomes another.
+
+Compile-time operands (sets, places, numbers) vanish before the checked model; `Expr` stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+from powderdsl.diagnostics import Reporter, Span
+from powderdsl.model.builtins import MAX_MAGNITUDE, MAX_OFFSET, OCTANTS
+from powderdsl.model.types import (
+    CHANCE,
+    DIRECTION,
+    ELEMENT,
+    FLAG,
+    REAL,
+    VEC2,
+    Expr,
+    Kernel,
+    Kind,
+    Offset,
+    integer,
+)
+
+
+@dataclass(frozen=True)
+class SetOf:
+    """A set of elements, ids ascending. `name` is given if it was written as one element's name."""
+
+    ids: tuple[int, ...]
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class Place:
+    """This cell or a neighbour. As a value it is the element found there."""
+
+    offset: Offset
+
+
+@dataclass(frozen=True)
+class Number:
+    """An exact constant."""
+
+    value: Fraction
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """`lo..hi`, both included."""
+
+    lo: int
+    hi: int
+
+
+@dataclass(frozen=True)
+class Items:
+    """A parenthesised list."""
+
+    items: tuple[Operand, ...]
+
+
+@dataclass(frozen=True)
+class Absent:
+    """`name?` of something that no loaded pack defines."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A name whose definition has been reported: using it is no second mistake."""
+
+
+Operand = Expr | SetOf | Place | Number | Bounds | Items | Kernel | Absent | Broken
+
+
+class Poisoned(Exception):
+    """This expression has been reported already: whatever contains it stays silent."""
+
+
+class Asleep(Exception):
+    """This rule needs `name`, which no loaded pack defines, and says so with a `?`."""
+
+    def __init__(self, name: str):
+        super().__init__(name)
+        self.name = name
+
+
+ELEMENT_HERE = Expr("element", ELEMENT)
+TRUE, FALSE = Expr("const", FLAG, value=1), Expr("const", FLAG, value=0)
+
+
+def describe(operand: Operand) -> str:
+    """An operand's kind in words, for messages."""
+    match operand:
+        case Expr():
+            return {"int": "a whole number", "flag": "a condition", "element": "an element", "direction": "a direction",
+                    "chance": "a chance", "draw": "a random draw", "real": "a number", "vec2": "a vector"}[operand.kind.name]  # fmt: skip
+        case SetOf():
+            return "an element" if operand.name else "a set of elements"
+        case Place():
+            return "a place"
+        case Number():
+            return "a number"
+        case Bounds():
+            return "a range"
+        case Items():
+            return "a list"
+        case Kernel():
+            return "a kernel"
+        case Absent():
+            return f"`{operand.name}`, which is not loaded"
+    return "something broken"
+
+
+class Coercer:
+    """Turns operands into the kind that their place wants, or reports why not."""
+
+    def __init__(self, reporter: Reporter):
+        self.reporter = reporter
+
+    def fail(self, code: str, message: str, span: Span, label: str = "", helps: tuple[str, ...] = ()) -> Poisoned:
+        self.reporter.error(code, message, span, label, helps=helps)
+        return Poisoned()
+
+    def wrong(self, operand: Operand, wanted: str, span: Span, *helps: str) -> Poisoned:
+        return self.fail("PD401", f"expected {wanted}, found {describe(operand)}", span, f"this is {describe(operand)}", helps)
+
+    def flag(self, operand: Operand, span: Span) -> Expr:
+        match operand:
+            case Expr() if operand.kind == FLAG:
+                return operand
+            case SetOf():
+                return member(ELEMENT_HERE, operand.ids, span)
+            case Items():
+                return self.flag(self.set_of(operand, span), span)
+            case Absent():
+                return FALSE
+            case Expr() if operand.kind.name == "int":
+                raise self.wrong(operand, "a condition", span, "compare it: `… > 0`")
+            case Place():
+                raise self.wrong(operand, "a condition", span, "say what is there: `… is ELEMENT`")
+        raise self.wrong(operand, "a condition", span)
+
+    def set_of(self, operand: Operand, span: Span) -> SetOf:
+        match operand:
+            case SetOf():
+                return operand
+            case Absent():
+                return SetOf(())
+            case Items():
+                ids: set[int] = set()
+                for item in operand.items:
+                    ids |= set(self.set_of(item, span).ids)
+                return SetOf(tuple(sorted(ids)))
+        raise self.wrong(operand, "a set of elements", span)
+
+    def place(self, operand: Operand, span: Span) -> Place:
+        if isinstance(operand, Place):
+            return operand
+        if isinstance(operand, Absent):
+            raise Asleep(operand.name)
+        raise self.wrong(operand, "a neighbour", span, "such as `below`, `above.left`, or `at(2, -1)`")
+
+    def element(self, operand: Operand, span: Span) -> Expr:
+        match operand:
+            case Expr() if operand.kind == ELEMENT:
+                return operand
+            case Place():
+                return look(ELEMENT_HERE, operand.offset, span)
+            case SetOf() if operand.name is not None:
+                return Expr("const", ELEMENT, value=operand.ids[0], span=span)
+            case SetOf():
+                raise self.wrong(operand, "one element", span, "name the element itself")
+            case Absent():
+                raise Asleep(operand.name)
+        raise self.wrong(operand, "an element", span)
+
+    def value(self, operand: Operand, span: Span) -> Expr | Number:
+        """A runtime value or a number: what arithmetic and comparison work on."""
+        match operand:
+            case Expr() | Number():
+                return operand
+            case Place():
+                return look(ELEMENT_HERE, operand.offset, span)
+            case SetOf() if operand.name is not None:
+                return self.element(operand, span)
+            case SetOf():
+                return self.flag(operand, span)
+            case Absent():
+                raise Asleep(operand.name)
+        raise self.wrong(operand, "a value", span)
+
+    def real(self, operand: Operand, span: Span) -> Expr:
+        value = self.value(operand, span)
+        if isinstance(value, Number):
+            return Expr("const", REAL, value=float(value.value), span=span)
+        if value.kind.name == "real":
+            return value
+        if value.kind.name in ("int", "chance", "draw", "flag"):
+            return Expr("to_real", REAL, (value,), span=span)
+        raise self.wrong(value, "a number", span)
+
+    def whole(self, operand: Operand, span: Span) -> Expr:
+        value = self.value(operand, span)
+        if isinstance(value, Number):
+            if value.value.denominator != 1:
+                raise self.fail("PD401", "expected a whole number", span, f"{float(value.value):g} is not whole")
+            return constant(value, span)
+        if value.kind.name == "int":
+            return value
+        raise self.wrong(value, "a whole number", span)
+
+    def chance(self, operand: Operand, span: Span) -> Expr:
+        """A probability: a constant within 0..1, or a property, parameter or field that is one."""
+        value = self.value(operand, span)
+        if isinstance(value, Number):
+            if not 0 <= value.value <= 1:
+                shown = f"{float(value.value * 100):g}%"
+                raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%")
+            return Expr("const", CHANCE, value=value.value, span=span)
+        if value.kind.name in ("chance", "real"):
+            return value
+        if value.kind.name == "int":
+            return self.real(value, span)
+        raise self.wrong(value, "a chance", span, "such as `5%`, or a parameter")
+
+    def of_kind(self, operand: Operand, kind: Kind, span: Span) -> Expr:
+        """A value to store in something of `kind`. Constants out of range are reported."""
+        match kind.name:
+            case "flag":
+                if isinstance(operand, Number) and operand.value in (0, 1):
+                    return Expr("const", FLAG, value=int(operand.value), span=span)
+                return self.flag(operand, span)
+            case "element":
+                return self.element(operand, span)
+            case "direction":
+                return self.direction(operand, span)
+            case "chance":
+                return self.chance(operand, span)
+            case "vec2":
+                if isinstance(operand, Number) and operand.value == 0:
+                    zero = Expr("const", REAL, value=0.0, span=span)
+                    return Expr("vector", VEC2, (zero, zero), span=span)
+                value = self.value(operand, span)
+                if isinstance(value, Expr) and value.kind.name == "vec2":
+                    return value
+                raise self.wrong(value, "a vector", span, "such as `vector(1, 0)`: rows down, columns right")
+            case "real":
+                value = self.real(operand, span)
+            case _:
+                value = self.whole(operand, span)
+        if value.op == "const" and isinstance(value.value, (int, float)) and not kind.lo <= value.value <= kind.hi:
+            raise self.fail("PD402", f"{value.value:g} lies outside {kind}", span, f"the range is {kind.lo:g}..{kind.hi:g}")
+        return value
+
+    def direction(self, operand: Operand, span: Span) -> Expr:
+        if isinstance(operand, Place):
+            if operand.offset in OCTANTS:
+                return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
+            raise self.fail("PD401", "not a direction", span, "directions are the eight neighbours")
+        if isinstance(operand, Expr) and operand.kind == DIRECTION:
+            return operand
+        if isinstance(operand, Absent):
+            raise Asleep(operand.name)
+        raise self.wrong(operand, "a direction", span, "such as `left`, or `octant(…)`")
+
+    def offset(self, offset: Offset, span: Span) -> Offset:
+        if max(abs(offset[0]), abs(offset[1])) > MAX_OFFSET:
+            raise self.fail("PD409", "a neighbour too far away", span, f"rules reach {MAX_OFFSET} cells a step")
+        return offset
+
+    def bounded(self, value: Expr, span: Span) -> Expr:
+        """A whole number whose declared range is still reasonable."""
+        if max(abs(value.kind.lo), abs(value.kind.hi)) > MAX_MAGNITUDE:
+            raise self.fail("PD402", f"numbers up to {max(abs(value.kind.lo), abs(value.kind.hi)):,}", span, f"the limit is {MAX_MAGNITUDE:,}")
+        return value
+
+
+def constant(number: Number, span: Span | None = None) -> Expr:
+    """A number as a constant: an int if it is whole, else a real."""
+    if number.value.denominator == 1:
+        whole = int(number.value)
+        return Expr("const", integer(whole, whole), value=whole, span=span)
+    return Expr("const", REAL, value=float(number.value), span=span)
+
+
+def look(value: Expr, offset: Offset, span: Span | None = None) -> Expr:
+    """The value as it is at a neighbour; looks of looks add up, constants are the same everywhere."""
+    if value.op == "look":
+        inner = value.value
+        assert isinstance(inner, tuple)
+        offset = (offset[0] + inner[0], offset[1] + inner[1])
+        value = value.args[0]
+    if offset == (0, 0) or value.op in ("const", "param"):
+        return value
+    return Expr("look", value.kind, (value,), offset, span)
+
+
+def member(value: Expr, ids: tuple[int, ...], span: Span | None = None) -> Expr:
+    return Expr("member", FLAG, (value,), frozenset(ids), span)
+
+
+def negation(value: Expr, span: Span | None = None) -> Expr:
+    if value.op == "const":
+        return FALSE if value.value else TRUE
+    return value.args[0] if value.op == "not" else Expr("not", FLAG, (value,), span=span)
+
+
+def conjunction(values: list[Expr], span: Span | None = None) -> Expr:
+    """All of them, constants folded."""
+    kept: list[Expr] = []
+    for value in values:
+        if value == FALSE:
+            return FALSE
+        if value != TRUE:
+            kept.append(value)
+    result = kept[0] if kept else TRUE
+    for value in kept[1:]:
+        result = Expr("and", FLAG, (result, value), span=span)
+    return result
+
+
+def disjunction(values: list[Expr], span: Span | None = None) -> Expr:
+    """Any of them, constants folded."""
+    kept: list[Expr] = []
+    for value in values:
+        if value == TRUE:
+            return TRUE
+        if value != FALSE:
+            kept.append(value)
+    result = kept[0] if kept else FALSE
+    for value in kept[1:]:
+        result = Expr("or", FLAG, (result, value), span=span)
+    return result

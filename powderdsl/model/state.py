@@ -1,0 +1,59 @@
+"""What a world of a ruleset holds: one slot for the elements, each stored property, and each field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from powderdsl.model.types import ELEMENT, Kind, Ruleset, Value
+
+SNAP = 2.0**-20
+"""Real fields are kept to multiples of nothing, but what is smaller than this is zero: motion dies out, and no
+backend ever meets denormal numbers."""
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One array of a world's state.
+
+    `dtype` is the NumPy name of its storage: uint8 for elements, flags and directions, the smallest signed
+    integer type that holds the range of whole numbers, float32 for reals. `planes` is 2 for vec2, else 1.
+    """
+
+    name: str
+    kind: Kind
+    default: Value
+    travels: bool
+    resets: bool
+    of: frozenset[int] | None
+    dtype: str
+    planes: int
+
+    @property
+    def is_real(self) -> bool:
+        return self.kind.name in ("real", "vec2")
+
+
+def storage(kind: Kind) -> str:
+    """The NumPy dtype in which values of a kind are stored."""
+    if kind.name in ("real", "vec2"):
+        return "float32"
+    if kind.name != "int":
+        return "uint8"
+    for dtype, bits in (("int8", 7), ("int16", 15)):
+        if -(1 << bits) <= kind.lo and kind.hi < 1 << bits:
+            return dtype
+    return "int32"
+
+
+def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
+    """All slots of a ruleset's worlds: the element, stored properties, then fields, in load order."""
+    found = [Slot("element", ELEMENT, 0, True, False, None, "uint8", 1)]
+    for prop in ruleset.properties:
+        if prop.stored:
+            found.append(Slot(prop.name, prop.kind, 0, True, False, None, storage(prop.kind), 1))
+    for item in ruleset.fields:
+        planes = 2 if item.kind.name == "vec2" else 1
+        found.append(
+            Slot(item.name, item.kind, item.default, item.at == "element", item.resets, item.of, storage(item.kind), planes)
+        )
+    return tuple(found)

@@ -1,0 +1,137 @@
+"""Every global name of a composition, resolved: what the checker looks words up in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, grid_kernel
+from powderdsl.model.literals import read_bounds
+from powderdsl.model.compose import Composition, Named
+from powderdsl.model.operands import (
+    Coercer,
+    Expr,
+    Items,
+    Operand,
+    Place,
+    SetOf,
+)
+from powderdsl.model.packs import TypedDecl
+from powderdsl.model.types import (
+    CHANCE,
+    DIRECTION,
+    ELEMENT,
+    FLAG,
+    Field,
+    Kind,
+    Param,
+    Property,
+    Stream,
+    Value,
+    integer,
+)
+from powderdsl.syntax.ast import Syntax
+
+
+def stream_ident(name: str) -> int:
+    """The number under which a stream enters the hash: FNV-1a of its name, 32 bits. Packs never shift it."""
+    ident = 0x811C9DC5
+    for byte in name.encode():
+        ident = (ident ^ byte) * 0x01000193 & 0xFFFFFFFF
+    return ident
+
+
+@dataclass
+class Symbols:
+    """Names known everywhere. Filled in order by `resolve_symbols`; frozen in use afterwards."""
+
+    composition: Composition
+    properties: dict[str, Property] = field(default_factory=dict)
+    fields: dict[str, Field] = field(default_factory=dict)
+    streams: dict[str, Stream] = field(default_factory=dict)
+    params: dict[str, Param] = field(default_factory=dict)
+    constants: dict[str, Operand] = field(default_factory=dict)
+    """Elements, tags, sets, kernels, directions."""
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        return tuple(element.id for element in self.composition.elements.values())
+
+    def names(self) -> list[str]:
+        """All words that an expression can use, for suggestions."""
+        return [*self.constants, *self.properties, *self.fields, *self.streams, *(p.split(".")[1] for p in self.params)]
+
+
+def base_symbols(composition: Composition) -> Symbols:
+    """Symbols with what needs no evaluation: directions, kernels, elements, tags, streams."""
+    symbols = Symbols(composition)
+    constants = symbols.constants
+    constants |= {name: Place(offset) for name, offset in DIRECTIONS.items()}
+    constants |= {name: Items(tuple(Place(o) for o in offsets)) for name, offsets in DIRECTION_SETS.items()}
+    constants |= KERNELS
+    constants |= {name: grid_kernel(name, k.decl.rows, k.decl.wrap) for name, k in composition.kernels.items()}
+    constants |= {name: SetOf((element.id,), name) for name, element in composition.elements.items()}
+    constants |= {name: SetOf(tuple(sorted(ids))) for name, ids in composition.tags.items()}
+    symbols.streams |= {name: Stream(name, stream_ident(name), s.decl.bits) for name, s in composition.streams.items()}
+    return symbols
+
+
+def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
+    """A kind as written: ``0..7``, ``flag``, ``element``, ``chance``, ``real(0..1)``, ``vec2(-10..10)``."""
+    helps = ("kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",)
+    if syntax.kind == "range":
+        lo, hi = read_bounds(syntax, coercer)
+        return integer(lo, hi)
+    if syntax.kind == "name":
+        plain = {"flag": FLAG, "element": ELEMENT, "direction": DIRECTION, "chance": CHANCE}.get(syntax.text)
+        if plain is not None:
+            return plain
+        if syntax.text in ("real", "vec2"):
+            raise coercer.fail("PD401", f"`{syntax.text}` needs bounds", syntax.span, helps=(f"write `{syntax.text}(-100..100)`",))
+    if syntax.kind == "call" and syntax.text in ("real", "vec2") and len(syntax.children) == 1:
+        lo, hi = read_bounds(syntax.children[0], coercer)
+        return Kind(syntax.text, lo, hi)
+    raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", helps)
+
+
+def default_of(kind: Kind) -> Value:
+    """The value of something whose file gives no default: zero, or the nearest bound to it."""
+    if kind.name == "vec2":
+        return (0.0, 0.0)
+    if kind.name in ("int", "real"):
+        zero = min(max(0, kind.lo), kind.hi)
+        return int(zero) if kind.name == "int" else float(zero)
+    return 0
+
+
+def field_from(decl: TypedDecl, pack: str, kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
+    return Field(decl.name.text, kind, default, decl.at, decl.resets, of, pack, decl.name.span)
+
+
+def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
+    """A parameter may not hide a global word: a rule would read the other one without a sign."""
+    composition = symbols.composition
+    spans: dict[str, Span] = {name: element.span for name, element in composition.elements.items()}
+    spans |= composition.tag_spans
+    tables: tuple[dict[str, Named[TypedDecl]], ...] = (composition.properties, composition.fields)
+    for table in tables:
+        spans |= {name: named.decl.name.span for name, named in table.items()}
+    spans |= {name: named.decl.name.span for name, named in composition.streams.items()}
+    spans |= {name: named.decl[0].span for name, named in composition.sets.items()}
+    spans |= {name: named.decl.name.span for name, named in composition.kernels.items()}
+    for qualified, named in composition.params.items():
+        name = qualified.split(".")[1]
+        if name in spans:
+            reporter.error(
+                "PD308", f"the parameter `{name}` hides another `{name}`", named.decl.name.span, "the same word",
+                secondary=[Label(spans[name], "this one")], helps=["rename the parameter"],
+            )
+
+
+def number_value(expr: Expr, kind: Kind) -> Value:
+    """The constant in an expression that `Coercer.of_kind` accepted."""
+    if kind.name == "vec2":
+        parts = [arg.value for arg in expr.args]
+        return (float(parts[0]), float(parts[1]))  # type: ignore[arg-type]
+    assert expr.op == "const"
+    return expr.value  # type: ignore[return-value]

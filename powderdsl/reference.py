@@ -1,0 +1,435 @@
+"""The oracle: a slow, obvious NumPy interpreter of the checked model. It defines what rules mean.
+
+It shares nothing with the compiler: no IR, no passes. Arrays are [B, H, W] ([B, 2, H, W] for vectors). Whole numbers
+are int64 here, reals float32 with one rounding an operation, draws float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from powderdsl.model.state import SNAP, Slot, slots
+from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Offset, Pass, Ruleset, Swap, Transform
+
+Array = np.ndarray[Any, Any]
+State = dict[str, Array]
+
+FAN = {op: np.dtype("float32").type(value) for op, value in (("near", 0.92387953251128674), ("far", 0.38268343236508977))}
+"""cos(π/8) and cos(3π/8): the borders of the octants."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What the random numbers of a batch hang on: arrays [B] of seed (64 bits), world index and step."""
+
+    seed: Array
+    index: Array
+    step: Array
+
+
+# Random numbers
+
+
+def mix(x: Array) -> Array:
+    """A 32-bit finaliser (xor-shift-multiply). Input and output: uint64 arrays below 2³²."""
+    mask = np.uint64(0xFFFFFFFF)
+    x = x & mask
+    x = x ^ (x >> np.uint64(16))
+    x = (x * np.uint64(0x7FEB352D)) & mask
+    x = x ^ (x >> np.uint64(15))
+    x = (x * np.uint64(0x846CA68B)) & mask
+    return x ^ (x >> np.uint64(16))
+
+
+def key(clock: Clock, stream: int, start: int) -> Array:
+    """One 32-bit key a world: seed, world index, step and stream mixed in one after the other."""
+    seed = clock.seed.astype(np.uint64)
+    result = np.full(seed.shape, start, np.uint64)
+    parts = (seed, seed >> np.uint64(32), clock.index, clock.step, np.uint64(stream))
+    for part in parts:
+        result = mix(result + (np.asarray(part).astype(np.uint64) & np.uint64(0xFFFFFFFF)))
+    return result
+
+
+def draw(clock: Clock, stream: int, bits: int, height: int, width: int) -> Array:
+    """Uniform draws, float64 [B, H, W], strictly between 0 and 1.
+
+    Bit j of the 32 cells (y, 32 w) … (y, 32 w + 31) is one 32-bit hash, of word number (y ⌈W/32⌉ + w) 32 + j. The
+    first bit is the most significant one; a draw of n bits k stands for (k + ½) / 2ⁿ.
+    """
+    key0 = key(clock, stream, 0x243F6A88)[:, None, None]
+    key1 = key(clock, stream, 0x85A308D3)[:, None, None]
+    mask = np.uint64(0xFFFFFFFF)
+    y, x = np.mgrid[:height, :width].astype(np.uint64)
+    word = y * np.uint64(-(-width // 32)) + x // np.uint64(32)
+    value = np.zeros((len(clock.seed), height, width), np.float64)
+    for j in range(bits):
+        n = (word * np.uint64(32) + np.uint64(j)) * np.uint64(0x9E3779B1)
+        h = (n + key0) & mask
+        h = h ^ (h >> np.uint64(16))
+        h = (h * np.uint64(0x7FEB352D)) & mask
+        h = h ^ (h >> np.uint64(15))
+        h = ((h + key1) * np.uint64(0x846CA68B)) & mask
+        h = h ^ (h >> np.uint64(16))
+        value += ((h >> (x % np.uint64(32))) & np.uint64(1)).astype(np.float64) * 2.0 ** (bits - 1 - j)
+    return (value + 0.5) / 2.0**bits
+
+
+# Neighbours
+
+
+def look(value: Array, offset: Offset) -> Array:
+    """The array as seen from each cell at its neighbour `offset`; the grid wraps around."""
+    return np.roll(value, (-offset[0], -offset[1]), (-2, -1))
+
+
+def look_or_nothing(value: Array, offset: Offset) -> Array:
+    """Like `look`, but zero outside the grid."""
+    return np.where(inside(value.shape[-2:], offset), look(value, offset), np.zeros((), value.dtype))
+
+
+def inside(shape: tuple[int, ...], offset: Offset) -> Array:
+    """bool [H, W]: whether the neighbour lies inside the grid."""
+    height, width = shape
+    y, x = np.mgrid[:height, :width]
+    return (y + offset[0] >= 0) & (y + offset[0] < height) & (x + offset[1] >= 0) & (x + offset[1] < width)
+
+
+def neighbourhood(value: Array, kernel: Kernel) -> Array:
+    """The weighted sum over a kernel: each row from the left, then the rows from the top."""
+    see = look if kernel.wrap else look_or_nothing
+    rows: dict[int, Array] = {}
+    for dy, dx, weight in kernel.weights:
+        seen = see(value, (dy, dx))
+        term = seen if weight == 1 else seen * value.dtype.type(weight)
+        rows[dy] = rows[dy] + term if dy in rows else term
+    totals = list(rows.values())
+    result = totals[0] if totals else np.zeros_like(value)
+    for total in totals[1:]:
+        result = result + total
+    return result
+
+
+# Expressions
+
+
+@dataclass
+class Context:
+    """What an expression reads: the world as the moment finds it, values fixed earlier, draws, parameters."""
+
+    ruleset: Ruleset
+    state: State
+    params: Mapping[str, Array]
+    draws: dict[str, Array]
+    clock: Clock
+    lets: dict[str, Array] = field(default_factory=dict)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        batch, height, width = self.state["element"].shape
+        return batch, height, width
+
+
+def evaluate(expr: Expr, at: Context) -> Array:
+    """The value of an expression in every cell."""
+    with np.errstate(all="ignore"):
+        return np.asarray(_OPS[expr.op](expr, at, *(evaluate(arg, at) for arg in expr.args)))
+
+
+def _constant(expr: Expr, at: Context) -> Array:
+    return _as_kind(expr.kind.name, expr.value, at.shape)
+
+
+def _as_kind(kind: str, value: Any, shape: tuple[int, ...]) -> Array:
+    dtype = {"flag": np.bool_, "real": np.float32, "chance": np.float64, "number": np.float64}.get(kind, np.int64)
+    if kind in ("chance", "number"):
+        value = float(value)
+    return np.broadcast_to(np.asarray(value, dtype), shape)
+
+
+def _parameter(expr: Expr, at: Context) -> Array:
+    value = at.params[str(expr.value)]
+    return np.broadcast_to(value[:, None, None], at.shape)
+
+
+def _property(expr: Expr, at: Context) -> Array:
+    prop = at.ruleset.property(str(expr.value))
+    assert prop is not None
+    if prop.stored:
+        return at.state[prop.name]
+    ids = at.state["element"]
+    result = np.zeros(at.shape, _as_kind(prop.kind.name, 0, ()).dtype)
+    for identity, value in enumerate(prop.values):
+        one = at.params[value][:, None, None] if isinstance(value, str) else _as_kind(prop.kind.name, value, ())
+        result = np.where(ids == identity, one, result)
+    return result
+
+
+def _draw(expr: Expr, at: Context) -> Array:
+    name = str(expr.value)
+    if name not in at.draws:
+        stream = next(s for s in at.ruleset.streams if s.name == name)
+        at.draws[name] = draw(at.clock, stream.ident, stream.bits, *at.shape[1:])
+    return at.draws[name]
+
+
+def _coordinate(expr: Expr, at: Context) -> Array:
+    name, modulus = expr.value  # type: ignore[misc]
+    _, height, width = at.shape
+    y, x = np.mgrid[:height, :width]
+    values = {"row": y, "column": x, "step": at.clock.step.astype(np.int64)[:, None, None]}
+    return np.broadcast_to(values[name] % modulus, at.shape)
+
+
+def _divide(expr: Expr, at: Context, a: Array, b: Array) -> Array:
+    a, b = _vector_with_number(a, b)
+    return np.where(b == 0, np.float32(0), a / b)
+
+
+def _vector_with_number(a: Array, b: Array) -> tuple[Array, Array]:
+    """Vectors are [B, 2, H, W]: a number beside one gets an axis to match."""
+    if a.ndim == b.ndim:
+        return a, b
+    return (a, b[:, None]) if a.ndim == 4 else (a[:, None], b)
+
+
+def _multiply(expr: Expr, at: Context, a: Array, b: Array) -> Array:
+    a, b = _vector_with_number(a, b)
+    return a * b
+
+
+def _length(expr: Expr, at: Context, v: Array) -> Array:
+    y, x = v[:, 0], v[:, 1]
+    return np.sqrt(y * y + x * x)
+
+
+def _octant(expr: Expr, at: Context, v: Array) -> Array:
+    """The octant of the angle acos(x / (|v| + 0.001)), by comparing x with the octants' borders."""
+    y, x = v[:, 0], v[:, 1]
+    reach = np.sqrt(y * y + x * x) + np.float32(0.001)
+    near, far = FAN["near"] * reach, FAN["far"] * reach
+    half = np.select([x > near, x > far, x > -far, x > -near], [0, 1, 2, 3], 4)
+    return np.where(y < 0, (8 - half) % 8, half)
+
+
+def _member(expr: Expr, at: Context, ids: Array) -> Array:
+    return np.isin(ids, sorted(expr.value))  # type: ignore[call-overload,no-any-return]
+
+
+def _choose(expr: Expr, at: Context, condition: Array, yes: Array, no: Array) -> Array:
+    return np.where(condition[:, None] if yes.ndim == 4 else condition, yes, no)
+
+
+_OPS: dict[str, Any] = {
+    "const": _constant,
+    "param": _parameter,
+    "element": lambda e, at: at.state["element"],
+    "property": _property,
+    "field": lambda e, at: at.state[e.value],
+    "let": lambda e, at: at.lets[e.value],
+    "draw": _draw,
+    "coordinate": _coordinate,
+    "inside": lambda e, at: np.broadcast_to(inside(at.shape[1:], e.value), at.shape),
+    "look": lambda e, at, a: look(a, e.value),
+    "member": _member,
+    "not": lambda e, at, a: ~a,
+    "and": lambda e, at, a, b: a & b,
+    "or": lambda e, at, a, b: a | b,
+    "eq": lambda e, at, a, b: a == b,
+    "lt": lambda e, at, a, b: a < b,
+    "le": lambda e, at, a, b: a <= b,
+    "add": lambda e, at, a, b: a + b,
+    "sub": lambda e, at, a, b: a - b,
+    "mul": _multiply,
+    "div": _divide,
+    "neg": lambda e, at, a: -a,
+    "abs": lambda e, at, a: np.abs(a),
+    "min": lambda e, at, a, b: np.minimum(a, b),
+    "max": lambda e, at, a, b: np.maximum(a, b),
+    "mod": lambda e, at, a: a % e.value,
+    "to_real": lambda e, at, a: a.astype(np.float32),
+    "count": lambda e, at, a: neighbourhood(a.astype(np.int64), e.value),
+    "sum": lambda e, at, a: neighbourhood(a, e.value),
+    "choose": _choose,
+    "octant": _octant,
+    "length": _length,
+    "row_part": lambda e, at, v: v[:, 0],
+    "column_part": lambda e, at, v: v[:, 1],
+    "vector": lambda e, at, y, x: np.stack([y, x], 1),
+}
+
+
+# Moments
+
+
+def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
+    """The state after one simultaneous sub-step. `at.lets` gains the moment's lets."""
+    for let in moment.lets:
+        at.lets[let.name] = evaluate(let.value, at)
+    masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None}
+    claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
+    if moment.policy != "prove":
+        _settle_claims(moment.policy, claims, masks)
+    writes = [(rule, masks[id(rule)]) for rule in moment.rules if isinstance(rule, Assign)]
+    effects = [(effect, masks[id(rule)]) for rule in claims for effect in rule.effects]
+    values = {id(write): evaluate(write.value, at) for write, _ in (*writes, *effects)}
+
+    state = dict(at.state)
+    for write, mask in writes:
+        _assign(write, values[id(write)], mask, state, table)
+    before = dict(state)
+    for rule in claims:
+        mask = masks[id(rule)]
+        if isinstance(rule, Transform):
+            _become(evaluate(rule.target, at), mask, state, at, table)
+        elif isinstance(rule, Move):
+            _become(evaluate(rule.leaving, at), mask, state, at, table)
+    for rule in claims:
+        if isinstance(rule, (Swap, Move)):
+            back = (-rule.offset[0], -rule.offset[1])
+            mask = masks[id(rule)]
+            for name, slot in table.items():
+                if slot.travels:
+                    arrived = _where(look(mask, back), look(before[name], back), state[name])
+                    state[name] = _where(mask, look(before[name], rule.offset), arrived) if isinstance(rule, Swap) else arrived
+    for write, mask in effects:
+        _assign(write, values[id(write)], mask, state, table)
+    for name, slot in table.items():
+        if slot.of is not None:
+            state[name] = np.where(np.isin(state["element"], sorted(slot.of)), state[name], slot.default)  # type: ignore[arg-type]
+    return state
+
+
+def _where(mask: Array, yes: Array, no: Array) -> Array:
+    return np.where(mask[:, None] if yes.ndim == 4 else mask, yes, no)
+
+
+def _become(target: Array, mask: Array, state: State, at: Context, table: Mapping[str, Slot]) -> None:
+    """Fresh cells: element, stored properties and fields that travel, as a new cell of the target has them."""
+    for name, slot in table.items():
+        if not slot.travels:
+            continue
+        if name == "element":
+            fresh = target
+        elif (prop := at.ruleset.property(name)) is not None:
+            fresh = np.zeros(at.shape, np.int64)
+            for identity, value in enumerate(prop.values):
+                one = at.params[value][:, None, None] if isinstance(value, str) else value
+                fresh = np.where(target == identity, one, fresh)
+            fresh = fresh.astype(state[name].dtype)
+        elif slot.planes == 2:
+            fresh = np.broadcast_to(np.asarray(slot.default, np.float32)[None, :, None, None], state[name].shape)
+        else:
+            fresh = np.broadcast_to(np.asarray(slot.default, state[name].dtype), at.shape)
+        state[name] = _where(mask, fresh, state[name])
+
+
+def _assign(write: Assign, value: Array, mask: Array, state: State, table: Mapping[str, Slot]) -> None:
+    """`field op value` at the cell `write.offset` away from each cell of the mask; whole numbers are cut off."""
+    back = (-write.offset[0], -write.offset[1])
+    mask, value = look(mask, back), look(value, back)
+    old = state[write.field]
+    new = {":=": value, "+=": old + value, "-=": old - value}[write.op] if write.op != ":=" else value
+    kind = table[write.field].kind
+    if kind.name == "int":
+        new = np.clip(new, int(kind.lo), int(kind.hi))
+    state[write.field] = _where(mask, new, old)
+
+
+def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> None:
+    """Apply a conflict policy: narrow the masks so that no two rules claim one cell."""
+    wanted = {id(rule): masks[id(rule)] for rule in claims}
+
+    def claimed(rule: Any, mask: Array) -> Array:
+        """The cells that a rule with this mask takes part in."""
+        return mask | look(mask, (-rule.offset[0], -rule.offset[1])) if isinstance(rule, (Swap, Move)) else mask
+
+    def touches(rule: Any, cells: Array) -> Array:
+        """Where a rule would touch one of these cells."""
+        return cells | look(cells, rule.offset) if isinstance(rule, (Swap, Move)) else cells
+
+    taken = np.zeros_like(next(iter(wanted.values()))) if wanted else None
+    for rule in claims:
+        mask = wanted[id(rule)]
+        if isinstance(rule, (Swap, Move)):  # pairs of one rule that share a cell have no order: none of them happens
+            back = (-rule.offset[0], -rule.offset[1])
+            mask = mask & ~(look(wanted[id(rule)], rule.offset) | look(wanted[id(rule)], back))
+        if policy == "drop_both":
+            for other in claims:
+                if other is not rule:
+                    mask = mask & ~touches(rule, claimed(other, wanted[id(other)]))
+        else:
+            mask = mask & ~touches(rule, taken)  # type: ignore[arg-type]
+            taken = taken | claimed(rule, mask)  # type: ignore[operator]
+        masks[id(rule)] = mask
+
+
+# Steps
+
+
+def settle(state: State, table: Mapping[str, Slot]) -> State:
+    """Real fields within their range, no number that is none, and nothing smaller than SNAP."""
+    settled = dict(state)
+    for name, slot in table.items():
+        if slot.is_real:
+            value = np.where(np.isnan(state[name]), np.float32(0), state[name])
+            value = np.clip(value, np.float32(slot.kind.lo), np.float32(slot.kind.hi))
+            settled[name] = np.where(np.abs(value) < np.float32(SNAP), np.float32(0), value)
+    return settled
+
+
+def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
+    """The state after one pass."""
+    scratch = {f.name: Slot(f.name, f.kind, f.default, False, True, None, "", 2 if f.kind.name == "vec2" else 1) for f in pass_.scratch}
+    shape = at.shape
+    for name, slot in scratch.items():
+        at.state = {**at.state, name: _fresh(slot, shape)}
+    at.lets = {}
+    everything = {**table, **scratch}
+    for moment in pass_.moments:
+        at.state = run_moment(moment, at, everything)
+    return settle({name: value for name, value in at.state.items() if name in table}, table)
+
+
+def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
+    batch, height, width = shape
+    if slot.planes == 2:
+        return np.zeros((batch, 2, height, width), np.float32)
+    dtype = {"flag": np.bool_, "real": np.float32}.get(slot.kind.name, np.int64)
+    return np.full(shape, slot.default, dtype)  # type: ignore[arg-type]
+
+
+def step(
+    ruleset: Ruleset,
+    state: State,
+    clock: Clock,
+    params: Mapping[str, Array],
+    *,
+    passes: frozenset[str] | None = None,
+    draws: Mapping[str, Array] | None = None,
+) -> State:
+    """One step of every world.
+
+    Args:
+        state: arrays by slot name in their storage dtypes (`model.state`); not changed.
+        clock: what the random numbers hang on.
+        params: [B] arrays by qualified name.
+        passes: names of the passes to run; all of them by default.
+        draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
+    """
+    table = {slot.name: slot for slot in slots(ruleset)}
+    wide = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
+    working = {name: value.astype(wide.get(table[name].kind.name, np.int64)) for name, value in state.items()}
+    shape = state["element"].shape
+    for name, slot in table.items():
+        if slot.resets:
+            working[name] = _fresh(slot, shape)  # type: ignore[arg-type]
+    at = Context(ruleset, working, params, dict(draws or {}), clock)
+    for pass_ in ruleset.passes:
+        if passes is None or pass_.name in passes:
+            at.state = run_pass(pass_, at, table)
+    return {name: value.astype(table[name].dtype) for name, value in at.state.items()}

@@ -1,0 +1,379 @@
+"""Worlds and the simulator: state in, state out. Worlds are immutable; every method returns a new one.
+
+All arrays are torch tensors on the simulator's device, in the storage dtypes of `model.state`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.programs import make_program
+from powderdsl.diagnostics import suggest
+from powderdsl.model.state import SNAP, Slot, slots
+from powderdsl.model.types import Ruleset
+
+MAX_CELLS = 1 << 31
+
+
+@dataclass(frozen=True)
+class World:
+    """A batch of worlds of one ruleset.
+
+    `state` has one tensor a slot; `seed`, `index` and `step` (int64 [B]) are what the random numbers hang on: the
+    same three give the same future, whatever stands beside a world in its batch.
+    """
+
+    sim: Simulator
+    state: Mapping[str, Tensor]
+    seed: Tensor
+    index: Tensor
+    step: Tensor
+
+    @property
+    def ids(self) -> Tensor:
+        """Element ids, uint8 [B, H, W]."""
+        return self.state["element"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(worlds, rows, columns)."""
+        batch, height, width = self.ids.shape
+        return batch, height, width
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, name: str) -> Tensor:
+        """A field or property by name: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) for vectors.
+
+        Raises:
+            KeyError: for a name that the ruleset does not have.
+        """
+        return self.sim.read(self, name)
+
+    def select(self, worlds: int | slice | Sequence[int] | Tensor) -> World:
+        """Some worlds of the batch, with their random futures unchanged."""
+        keys = [worlds] if isinstance(worlds, int) else worlds
+        chosen = {name: value[keys] for name, value in self.state.items()}
+        return replace(self, state=chosen, seed=self.seed[keys], index=self.index[keys], step=self.step[keys])
+
+    def matrix(self) -> Tensor:
+        """All channels of the ruleset's `matrix:` as float32 [B, C, H, W]: elements one-hot, then fields."""
+        return self.sim.matrix(self)
+
+
+class Simulator:
+    """Runs one ruleset on one backend and device. Made by `powderdsl.compile`."""
+
+    def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device):
+        self.ruleset = ruleset
+        self.backend = backend
+        self.device = torch.device(device)
+        self._slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
+        self._program = make_program(ruleset, backend, self.device)
+        self._known = torch.zeros(256, dtype=torch.bool, device=self.device)
+        self._known[[element.id for element in ruleset.elements]] = True
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names in id order."""
+        return tuple(element.name for element in self.ruleset.elements)
+
+    @property
+    def passes(self) -> tuple[str, ...]:
+        """Names in the order they run."""
+        return tuple(p.name for p in self.ruleset.passes)
+
+    # Making worlds
+
+    def world(self, ids: Any, seed: Any = 0, *, index: Any = None) -> World:
+        """Fresh worlds from element ids.
+
+        Args:
+            ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
+            seed: one whole number for all, or one a world.
+            index: which world of its seed each is; 0, 1, … for one common seed, 0 for seeds of their own.
+
+        Raises:
+            TypeError: ids are no integers. ValueError: wrong shape, or ids that the ruleset does not have.
+        """
+        tensor = self._tensor(ids, "ids")
+        if tensor.dtype.is_floating_point or tensor.dtype.is_complex:
+            raise TypeError(f"ids must be integers, found {tensor.dtype}")
+        if tensor.ndim == 2:
+            tensor = tensor[None]
+        if tensor.ndim != 3 or 0 in tensor.shape:
+            raise ValueError(f"ids must have the shape [worlds, rows, columns], found {list(tensor.shape)}")
+        if tensor.numel() > MAX_CELLS:
+            raise ValueError(f"{tensor.numel():,} cells are more than {MAX_CELLS:,}")
+        self._check_ids(tensor, "ids")
+        element = tensor.to(torch.uint8)
+        batch = len(element)
+        one_seed = not isinstance(seed, Tensor) and not hasattr(seed, "__len__") or getattr(seed, "ndim", 1) == 0
+        if index is None:
+            index = range(batch) if one_seed else [0] * batch
+        world = World(
+            self,
+            {name: self._fresh(slot, element) for name, slot in self._slots.items()},
+            self._numbers(seed, "seed", batch),
+            self._numbers(index, "index", batch),
+            torch.zeros(batch, dtype=torch.int64, device=self.device),
+        )
+        return world
+
+    def _fresh(self, slot: Slot, ids: Tensor) -> Tensor:
+        """A slot's tensor as new cells of these elements have it."""
+        if slot.name == "element":
+            return ids.clone()
+        prop = self.ruleset.property(slot.name)
+        dtype = getattr(torch, slot.dtype)
+        if prop is not None:
+            return self._table(prop.name)[ids.long()].to(dtype)
+        if slot.planes == 2:
+            default = torch.tensor(slot.default, dtype=dtype, device=self.device)
+            return default[None, :, None, None].expand(len(ids), 2, *ids.shape[1:]).clone()
+        return torch.full(ids.shape, slot.default, dtype=dtype, device=self.device)  # type: ignore[arg-type]
+
+    def _table(self, name: str) -> Tensor:
+        """A property's values by id, parameters at their defaults."""
+        prop = self.ruleset.property(name)
+        assert prop is not None
+        defaults = {param.name: param.default for param in self.ruleset.params}
+        values = [float(defaults[v]) if isinstance(v, str) else float(v) for v in prop.values]  # type: ignore[arg-type]
+        values += [0.0] * (256 - len(values))
+        return torch.tensor(values, dtype=torch.float64, device=self.device)
+
+    def _tensor(self, value: Any, name: str) -> Tensor:
+        try:
+            return torch.as_tensor(value, device=self.device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
+
+    def _numbers(self, value: Any, name: str, batch: int) -> Tensor:
+        try:
+            tensor = torch.as_tensor(list(value) if isinstance(value, range) else value, dtype=torch.int64, device=self.device)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise TypeError(f"{name} must be whole numbers below 2⁶³: {' '.join(str(error).split())}") from None
+        if tensor.ndim == 0:
+            tensor = tensor.expand(batch)
+        if tensor.shape != (batch,) or bool((tensor < 0).any()):
+            raise ValueError(f"{name} must be one number of 0 or more, or {batch} of them, found shape {list(tensor.shape)}")
+        return tensor.clone()
+
+    def _check_ids(self, ids: Tensor, name: str) -> None:
+        values = ids.to(torch.int64)
+        inside = (values >= 0) & (values < 256)
+        good = inside & self._known[values.clamp(0, 255)]
+        if not bool(good.all()):
+            place = (~good).nonzero()[0].tolist()
+            bad = int(values[tuple(place)])
+            raise ValueError(f"{name}{place} is {bad}: no element of {self.ruleset.name} has this id")
+
+    # Reading and changing worlds
+
+    def read(self, world: World, name: str) -> Tensor:
+        """What `World.__getitem__` returns."""
+        if name in self._slots:
+            return world.state[name]
+        prop = self.ruleset.property(name)
+        if prop is None:
+            known = [*self._slots, *(p.name for p in self.ruleset.properties)]
+            raise KeyError(f"{self.ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}")
+        table = self._table(name)
+        dtype = torch.float32 if prop.kind.name == "chance" else torch.int16 if prop.kind.name == "int" else torch.uint8
+        return table[world.ids.long()].to(dtype)
+
+    def replace(self, world: World, **fields: Any) -> World:
+        """The world with these fields set. New ids make fresh cells; other fields are set after that.
+
+        Args:
+            fields: by name: [B, H, W] (or [H, W], or one number for all); vectors [B, 2, H, W] as (rows, columns).
+
+        Raises:
+            KeyError: an unknown field. TypeError, ValueError: wrong dtype, shape, range, NaN, or a value where the
+                element cannot hold one.
+        """
+        state = dict(world.state)
+        if "ids" in fields or "element" in fields:
+            ids = self._shaped(fields.pop("ids", None) if "ids" in fields else fields.pop("element"), "ids", world.shape, False)
+            self._check_ids(ids, "ids")
+            element = ids.to(torch.uint8)
+            fresh = self.world(element).state
+            changed = element != state["element"]
+            for name, slot in self._slots.items():
+                if slot.travels:
+                    state[name] = torch.where(changed[:, None] if slot.planes == 2 else changed, fresh[name], state[name])
+        for name, value in fields.items():
+            if name not in self._slots:
+                prop = self.ruleset.property(name)
+                if prop is None:
+                    self.read(world, name)
+                if not torch.equal(self._shaped(value, name, world.shape, False).double(), self._table(name)[state["element"].long()]):
+                    raise ValueError(f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it")
+                continue
+            state[name] = self._checked(self._slots[name], value, state["element"])
+        return replace(world, state=state)
+
+    def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool) -> Tensor:
+        tensor = self._tensor(value, name)
+        target = (shape[0], 2, *shape[1:]) if vector else shape
+        if vector and tensor.ndim == 1 and len(tensor) == 2:
+            tensor = tensor[None, :, None, None]
+        try:
+            return tensor.broadcast_to(target)
+        except RuntimeError:
+            raise ValueError(f"{name} must have the shape {list(target)}, found {list(tensor.shape)}") from None
+
+    def _checked(self, slot: Slot, value: Any, ids: Tensor) -> Tensor:
+        tensor = self._shaped(value, slot.name, tuple(ids.shape), slot.planes == 2)
+        kind = slot.kind
+        if slot.is_real:
+            if not bool(torch.isfinite(tensor).all()):
+                raise ValueError(f"{slot.name} has values that are not finite")
+            real = tensor.to(torch.float32).clamp(kind.lo, kind.hi)
+            return torch.where(real.abs() < SNAP, torch.zeros_like(real), real)
+        if tensor.dtype.is_floating_point and not bool((tensor == tensor.round()).all()):
+            raise TypeError(f"{slot.name} takes whole numbers, found {tensor.dtype}")
+        whole = tensor.to(torch.int64)
+        if kind.name == "element":
+            self._check_ids(whole, slot.name)
+        lo, hi = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(kind.name, (kind.lo, kind.hi))
+        if bool(((whole < lo) | (whole > hi)).any()):
+            raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {int(whole.min())}..{int(whole.max())}")
+        prop = self.ruleset.property(slot.name)
+        limited = prop.stored if prop is not None else slot.of
+        if limited is not None:
+            usual = self._table(slot.name)[ids.long()].long() if prop is not None else torch.full_like(whole, int(slot.default))  # type: ignore[arg-type]
+            holders = torch.isin(ids.long(), torch.tensor(sorted(limited), device=self.device))
+            if bool(((whole != usual) & ~holders).any()):
+                names = ", ".join(e.name for e in self.ruleset.elements if e.id in limited)
+                raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
+        return whole.to(getattr(torch, slot.dtype)).clone()
+
+    def paint(self, world: World, *, where: Any, element: str | None = None, velocity: Any = None, **fields: Any) -> World:
+        """Set cells of a mask: fresh cells of an element, and values of fields.
+
+        Args:
+            where: bool [B, H, W] or [H, W].
+            element: the element's name, plain or qualified.
+            velocity: (rows, columns), for rulesets with such a field; other fields by name.
+
+        Raises:
+            KeyError: an unknown element or field. ValueError: a wrong shape or value.
+        """
+        mask = self._shaped(where, "where", world.shape, False)
+        if mask.dtype != torch.bool:
+            raise TypeError(f"where must be a bool mask, found {mask.dtype}")
+        if element is not None:
+            found = self.ruleset.element(element)
+            if found is None:
+                raise KeyError(f"no element `{element}`; {'; '.join(suggest(element, self.elements, 'elements'))}")
+            fresh = self.world(torch.full_like(world.ids, found.id)).state
+            state = {
+                name: torch.where(mask[:, None] if slot.planes == 2 else mask, fresh[name], world.state[name]) if slot.travels else world.state[name]
+                for name, slot in self._slots.items()
+            }
+            world = replace(world, state=state)
+        if velocity is not None:
+            fields["velocity"] = velocity
+        for name, value in fields.items():
+            if name not in self._slots:
+                self.read(world, name)
+                raise ValueError(f"`{name}` follows from the element: it cannot be painted")
+            slot = self._slots[name]
+            old = world.state[name]
+            new = self._shaped(value, name, world.shape, slot.planes == 2)
+            painted = torch.where(mask[:, None] if slot.planes == 2 else mask, new.to(torch.float64), old.to(torch.float64))
+            world = self.replace(world, **{name: painted})
+        return world
+
+    def matrix(self, world: World) -> Tensor:
+        """What `World.matrix` returns."""
+        channels: list[Tensor] = []
+        zeros = torch.zeros(world.shape, dtype=torch.float32, device=self.device)
+        for name in self.ruleset.matrix:
+            base, _, part = name.partition(".")
+            if name == "elements":
+                ids = torch.arange(self.ruleset.slots, device=self.device, dtype=torch.uint8)
+                channels.extend((world.ids[:, None] == ids[None, :, None, None]).float().unbind(1))
+            elif base not in self._slots and self.ruleset.property(base) is None:
+                channels.append(zeros)
+            else:
+                value = world[base].float()
+                parts = value.unbind(1) if value.ndim == 4 else (value,)
+                channels.extend(parts if not part else (parts[("row", "column").index(part)],))
+        return torch.stack(channels, 1)
+
+    # Running
+
+    def step(
+        self,
+        world: World,
+        steps: int = 1,
+        *,
+        random: Mapping[str, Any] | None = None,
+        passes: Sequence[str] | None = None,
+        params: Mapping[str, Any] | None = None,
+    ) -> World:
+        """The world some steps later; the argument stays as it was.
+
+        Args:
+            steps: how many, 0 or more.
+            random: draws to use instead of our own, by stream: [B, H, W] in [0, 1). A draw r counts as the draw of
+                the stream's resolution that it falls into. The same draws serve every step.
+            passes: run only these passes, in the ruleset's order.
+            params: parameter values for this call, one number each or [B] values, one a world.
+
+        Raises:
+            KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
+        """
+        if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
+            raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
+        if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
+            raise ValueError(f"steps must be a whole number of 0 or more, found {steps!r}")
+        unknown = [name for name in passes or () if name not in self.passes]
+        if unknown:
+            raise KeyError(f"no pass `{unknown[0]}`; {'; '.join(suggest(unknown[0], self.passes, 'passes'))}")
+        draws = self._draws(random or {}, world)
+        chosen = None if passes is None else frozenset(passes)
+        state = self._program.run(
+            world.state, (world.seed, world.index, world.step), steps, self._params(params or {}, len(world)), draws, chosen
+        )
+        return replace(world, sim=self, state=state, step=world.step + steps)
+
+    def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Tensor]:
+        """Draws as whole numbers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
+        bits = {stream.name: stream.bits for stream in self.ruleset.streams}
+        draws = {}
+        for name, value in random.items():
+            if name not in bits:
+                raise KeyError(f"no stream `{name}`; {'; '.join(suggest(name, bits, 'streams'))}")
+            tensor = self._shaped(value, f"random[{name!r}]", world.shape, False).to(torch.float64)
+            if not bool(((tensor >= 0) & (tensor < 1)).all()):
+                raise ValueError(f"random[{name!r}] must lie in [0, 1)")
+            draws[name] = (tensor * float(1 << bits[name])).floor().to(torch.int64)
+        return draws
+
+    def _params(self, params: Mapping[str, Any], batch: int) -> dict[str, Tensor]:
+        """All parameters as float64 [B] tensors."""
+        known = {param.name: param for param in self.ruleset.params}
+        values = {name: torch.full((batch,), float(param.default), dtype=torch.float64, device=self.device) for name, param in known.items()}  # type: ignore[arg-type]
+        for name, value in params.items():
+            if name not in known:
+                raise KeyError(f"no parameter `{name}`; {'; '.join(suggest(name, known, 'parameters'))}")
+            kind = known[name].kind
+            lo, hi = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
+            tensor = self._tensor(value, name).to(torch.float64)
+            if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) != batch):
+                raise ValueError(f"{name} takes one value or {batch}, found shape {list(tensor.shape)}")
+            if not bool(((tensor >= lo) & (tensor <= hi)).all()):
+                raise ValueError(f"{name} takes {lo:g}..{hi:g}")
+            if kind.name in ("int", "flag") and not bool((tensor == tensor.round()).all()):
+                raise ValueError(f"{name} takes whole numbers")
+            values[name] = tensor.expand(batch).clone()
+        return values

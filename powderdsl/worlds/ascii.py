@@ -1,0 +1,140 @@
+"""Worlds as ASCII art: one character a cell, by the elements' glyphs or a legend. Whitespace is free."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.diagnostics import Reporter, Source, Span, suggest
+from powderdsl.draw import to_numpy
+from powderdsl.model.types import Element
+from powderdsl.worlds.files import failure, read_source
+from powderdsl.worlds.raster import MAX_CELLS
+
+MAX_BYTES = 4 * MAX_CELLS
+"""The largest file that is read: the largest world, with room between its cells."""
+
+
+def parse_ascii(
+    art: Span, elements: Sequence[Element], reporter: Reporter, legend: Mapping[str, str] | None = None
+) -> NDArray[np.uint8] | None:
+    """The ids uint8 [H, W] of a drawing that stands in a text, or None after reporting what is wrong with it.
+
+    `legend` gives characters to elements by name and wins over their glyphs. Empty lines are skipped. Raises
+    CompileError (PD604) if the legend names an unknown element, ValueError if one of its keys is not a single
+    visible character.
+    """
+    ids = _characters(elements, legend or {})
+    decode = {ord(character): chr(number) for character, number in ids.items()}
+    rows: list[str] = []
+    offset, good = art.start, True
+    seen: set[str] = set()
+    for line in art.text.splitlines(keepends=True):
+        start, offset = offset, offset + len(line)
+        cells = "".join(line.split())
+        if not cells:
+            continue
+        for character in sorted(set(cells) - ids.keys() - seen):
+            place = start + line.index(character)
+            reporter.error(
+                "PD610",
+                f"unknown character `{character}`",
+                Span(art.source, place, place + 1),
+                "no element has it",
+                helps=["known: " + "  ".join(_legend_line(ids, elements))],
+            )
+        unknown = set(cells) - ids.keys()
+        seen |= unknown
+        if rows and len(cells) != len(rows[0]):
+            begin = start + len(line) - len(line.lstrip())
+            place_of_row = Span(art.source, begin, start + len(line.rstrip()))
+            message = f"a row of {len(cells)} cells in a world of {len(rows[0])} columns"
+            reporter.error("PD611", message, place_of_row, f"the first row has {len(rows[0])} cells")
+            good = False
+        good = good and not unknown
+        rows.append(cells)
+    if not rows or len(rows) * len(rows[0]) > MAX_CELLS:
+        height, width = len(rows), len(rows[0]) if rows else 0
+        place_of_all = Span(art.source, art.start, art.start + 1)
+        reporter.error(
+            "PD607", f"a world of {height}×{width} cells", place_of_all, f"1 to {MAX_CELLS:,} cells"
+        )
+        return None
+    if not good:
+        return None
+    text = "".join(rows).translate(decode)
+    return np.frombuffer(text.encode("latin-1"), dtype=np.uint8).reshape(len(rows), -1).copy()
+
+
+def read_ascii(
+    text: str,
+    elements: Sequence[Element],
+    legend: Mapping[str, str] | None = None,
+    *,
+    name: str = "<drawing>",
+) -> NDArray[np.uint8]:
+    """The ids uint8 [H, W] of a drawing. `name` stands for the text in messages. Raises CompileError."""
+    reporter = Reporter()
+    ids = parse_ascii(Span(Source(name, text), 0, len(text)), elements, reporter, legend)
+    reporter.raise_if_errors()
+    assert ids is not None
+    return ids
+
+
+def load_ascii(
+    path: str | Path, elements: Sequence[Element], legend: Mapping[str, str] | None = None
+) -> NDArray[np.uint8]:
+    """The ids uint8 [H, W] of a text file. Raises CompileError."""
+    reporter = Reporter()
+    source = read_source(Path(path), reporter, limit=MAX_BYTES)
+    reporter.raise_if_errors()
+    assert source is not None
+    return read_ascii(source.text, elements, legend, name=source.name)
+
+
+def write_ascii(
+    ids: Any, elements: Sequence[Element], legend: Mapping[str, str] | None = None, *, spaced: bool = False
+) -> str:
+    """Rows of characters for ids [H, W], each ended by a line break; `spaced` puts a blank between cells.
+
+    What it writes, `read_ascii` reads with the same elements and legend. Raises ValueError for ids that no
+    element has, and for another shape.
+    """
+    world = to_numpy(ids)
+    if world.ndim != 2 or world.dtype.kind not in "iu":
+        raise ValueError(f"ids must be integers [H, W], not {world.dtype} {world.shape}")
+    # The legend's characters come first, so they win over glyphs here too.
+    characters: dict[int, str] = {}
+    for character, number in _characters(elements, legend or {}).items():
+        characters.setdefault(number, character)
+    vacant = sorted(set(np.unique(world).tolist()) - characters.keys())
+    if vacant:
+        raise ValueError(f"no element has the ids {vacant[:8]}")
+    table = np.array([characters.get(number, " ") for number in range(max(characters, default=0) + 1)])
+    separator = " " if spaced else ""
+    return "".join(separator.join(row) + "\n" for row in table[world].tolist())
+
+
+def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[str, int]:
+    """Element ids by character: the legend's, then the glyphs that it does not use."""
+    by_name = {element.qualified: element.id for element in elements} | {e.name: e.id for e in elements}
+    characters: dict[str, int] = {}
+    for character, name in legend.items():
+        if len(character) != 1 or character.isspace():
+            raise ValueError(f"{character!r} in a legend is not a single visible character")
+        if name not in by_name:
+            helps = suggest(name, {element.name for element in elements}, "elements")
+            raise failure("PD604", f"unknown element `{name}` in a legend", helps=helps)
+        characters[character] = by_name[name]
+    for element in elements:
+        characters.setdefault(element.glyph, element.id)
+    return characters
+
+
+def _legend_line(ids: Mapping[str, int], elements: Sequence[Element]) -> list[str]:
+    names = {element.id: element.name for element in elements}
+    return [f"{character} {names[number]}" for character, number in ids.items()]

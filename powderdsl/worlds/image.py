@@ -1,0 +1,135 @@
+"""Worlds as PNG pictures, one pixel a cell, by the elements' exact colours."""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from powderdsl.diagnostics import CompileError, Diagnostic, Label
+from powderdsl.draw import palette, rgb
+from powderdsl.media import write_png
+from powderdsl.model.types import Element
+from powderdsl.worlds.files import failure
+from powderdsl.worlds.raster import MAX_CELLS
+
+MAX_REPORTED = 8
+"""Wrong colours that are named one by one. A smoothed picture has thousands."""
+
+_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
+"""Pixel formats of eight bits or fewer: those with more have colours that no element can have."""
+
+
+def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
+    """The ids uint8 [H, W] of a PNG file. Raises CompileError.
+
+    PD609 names every pixel colour that is no element's (and the nearest element), PD607 a picture of too many
+    pixels, which is not decoded, PD602 a file that is no PNG, PD101 one that cannot be read.
+    """
+    path = Path(path)
+    # Four bytes a pixel as one number: red lowest, opacity highest.
+    packed = _pixels(path).view("<u4")[..., 0]
+    colors, first, index, counts = np.unique(
+        packed, return_index=True, return_inverse=True, return_counts=True
+    )
+    owners: dict[int, list[Element]] = {}
+    for element in elements:
+        owners.setdefault(_pack(element.color), []).append(element)
+    wrong = [place for place, color in enumerate(colors.tolist()) if len(owners.get(color, [])) != 1]
+    if wrong:
+        wrong.sort(key=lambda place: first[place])
+        found = []
+        for place in wrong[:MAX_REPORTED]:
+            pixel = divmod(int(first[place]), packed.shape[1])
+            found.append(_wrong_color(path, int(colors[place]), pixel, int(counts[place]), owners))
+        if len(wrong) > MAX_REPORTED:
+            found.append(_many_colors(path, len(wrong)))
+        raise CompileError(found)
+    ids = np.array([owners[color][0].id for color in colors.tolist()], dtype=np.uint8)
+    return ids[index].reshape(packed.shape)
+
+
+def _pack(color: str) -> int:
+    return int.from_bytes(bytes.fromhex(color[1:]) + b"\xff", "little")
+
+
+def write_image(path: str | Path, ids: Any, elements: Sequence[Element]) -> None:
+    """Write ids [H, W], array or tensor, as a PNG that `read_image` reads. Raises as `draw.rgb` does."""
+    write_png(path, rgb(ids, palette(elements)))
+
+
+def _pixels(path: Path) -> NDArray[np.uint8]:
+    """The picture as uint8 [H, W, 4], red, green, blue, opacity."""
+    try:
+        file = path.open("rb")
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise failure("PD101", f"cannot read {path}", notes=(reason,)) from None
+    with file:
+        try:
+            return _decode(file, path)
+        except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+            raise _too_large(path, "far too many") from None
+        except _BROKEN as error:
+            raise failure("PD602", f"{path} is not a readable PNG", notes=(str(error)[:200],)) from None
+
+
+_BROKEN = (OSError, ValueError, SyntaxError, EOFError, IndexError, OverflowError, MemoryError, zlib.error)
+"""What Pillow raises for broken files, depending on where they are broken."""
+
+
+def _decode(file: BinaryIO, path: Path) -> NDArray[np.uint8]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        image = Image.open(file, formats=["PNG"])  # reads the header alone
+    width, height = image.size
+    if height * width > MAX_CELLS:
+        raise _too_large(path, f"{height}×{width}")
+    if image.mode not in _MODES:
+        note = f"pixel format {image.mode}; save it with 8 bits a channel"
+        raise failure("PD602", f"{path} is not a picture of a world", notes=(note,))
+    return np.array(image.convert("RGBA"))
+
+
+def _too_large(path: Path, size: str) -> CompileError:
+    return failure(
+        "PD607", f"{path}: a world of {size} cells", helps=(f"a world has at most {MAX_CELLS:,} cells",)
+    )
+
+
+def _wrong_color(
+    path: Path, color: int, pixel: tuple[int, int], count: int, owners: dict[int, list[Element]]
+) -> Diagnostic:
+    *components, opacity = color.to_bytes(4, "little")
+    name = "#" + bytes(components).hex().upper()
+    where = f"the pixel at row {pixel[0]}, column {pixel[1]}"
+    if color in owners:
+        names = " and ".join(f"`{element.name}`" for element in owners[color])
+        message, helps = f"{where} is {name}, the colour of {names}", ("give one of them another colour",)
+    elif opacity < 255:
+        message = f"{where} is {name} at {opacity * 100 // 255}% opacity"
+        helps = ("save the picture without transparency",)
+    else:
+        message = f"{where} is {name}, which is no element's colour"
+        candidates = [element for owned in owners.values() for element in owned]
+        nearest = min(candidates, key=lambda element: _distance(element.color, name))
+        helps = (f"the nearest is `{nearest.name}`, {nearest.color}",)
+    notes = (f"{path}: {count:,} such pixels, this is the first",)
+    return Diagnostic("PD609", message, Label(None), notes=notes, helps=helps)
+
+
+def _many_colors(path: Path, count: int) -> Diagnostic:
+    helps = (
+        "draw with a hard brush in the elements' colours, one pixel a cell, and scale without smoothing",
+    )
+    return Diagnostic("PD609", f"{count:,} colours in {path} are no element's", Label(None), helps=helps)
+
+
+def _distance(one: str, other: str) -> int:
+    return sum((a - b) ** 2 for a, b in zip(bytes.fromhex(one[1:]), bytes.fromhex(other[1:]), strict=True))

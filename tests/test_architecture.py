@@ -1,0 +1,477 @@
+"""The architecture, as tests: who may import whom, which words may stand in the code, how long a file may be.
+
+Each rule is a table and a function from source text to faults. Every function is also shown a source that
+breaks its rule, so none of these tests passes because it looks at nothing.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import os
+import re
+import subprocess
+import sys
+import tokenize
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "powderdsl"
+MAX_LINES = 500
+
+_MODEL = ("diagnostics", "syntax", "model")
+_COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
+_SCREEN = (*_COMPILER, "simulator", "worlds", "draw", "media", "terminal")
+_EVERYTHING = (*_SCREEN, "envs", "web", "experiments", "cli")
+
+LAYERS: dict[str, tuple[str, ...]] = {
+    # module or pattern: what it may import besides its own package. The longest row that fits counts.
+    "diagnostics": (),
+    "syntax": ("diagnostics",),
+    "model": ("diagnostics", "syntax"),
+    "reference": _MODEL,  # never ir: an oracle that shares the lowering cannot see a bug in it
+    "ir": ("diagnostics",),
+    "ir.lower*": _MODEL,  # the one door from the model into the IR
+    "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
+    "backends": ("diagnostics", "ir"),
+    "compiler": _COMPILER[:-1],
+    "simulator": _COMPILER,
+    "worlds": _MODEL,
+    "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
+    "draw": _SCREEN[: _SCREEN.index("draw")],
+    "media": _SCREEN[: _SCREEN.index("media")],
+    "terminal": _SCREEN[: _SCREEN.index("terminal")],
+    "envs": _SCREEN,
+    "web": _SCREEN,
+    "experiments": (*_SCREEN, "envs", "web"),
+    "cli": (*_SCREEN, "envs", "web", "experiments"),
+    "__init__": _EVERYTHING,  # the public names, imported when they are asked for
+    "__main__": ("cli",),
+}
+
+
+@dataclass(frozen=True)
+class Home:
+    """Where a third party may be imported, and where that may happen while the module itself is imported."""
+
+    anywhere: tuple[str, ...]
+    at_import: tuple[str, ...]
+
+
+_TEXT = ("syntax", "worlds.scene")
+_TORCH = ("backends.torch_*", "simulator", "envs", "experiments")
+THIRD_PARTIES: dict[str, Home] = {
+    "yaml": Home(_TEXT, _TEXT),
+    "lark": Home(_TEXT, _TEXT),
+    "torch": Home((*_TORCH, "worlds.store", "draw", "media", "terminal", "web", "cli"), _TORCH),
+    "gymnasium": Home(("envs", "experiments"), ("envs", "experiments")),
+    "stable_baselines3": Home(("envs", "experiments"), ("envs", "experiments")),
+    "click": Home(("cli",), ("cli",)),
+}
+
+SLOW_IMPORTS = ("torch", "gymnasium", "stable_baselines3", "matplotlib", "tensorboard")
+"""What the front end, `powderdsl check` and `powderdsl --help` must do without."""
+
+EMPTY_NAMES = ("utils", "util", "common", "helpers", "helper", "base", "misc")
+"""Names that say nothing: such a module has no reason to refuse anything."""
+
+SHARED_NAMES: dict[str, str] = {}
+"""Base names that several modules may have, and why."""
+
+NAME_SECTIONS = ("elements", "passes", "fields", "properties")
+"""Sections of a rule file whose keys Python must not know."""
+
+PYTHON_WORDS = {
+    "empty": "np.empty, torch.empty; a world or a set that is empty",
+    "clone": "Tensor.clone",
+}
+"""Names in the shipped rules that are also words of Python or its libraries: allowed everywhere."""
+
+ENGLISH_WORDS = {
+    "fire": "rules fire, or can never fire",
+    "flow": "data flow, control flow",
+}
+"""Names in the shipped rules that are also plain English: allowed in sentences, never in code."""
+
+
+# --- imports
+
+
+@dataclass(frozen=True)
+class Import:
+    """An import statement: dotted name (``a.b.*`` for a star), line, and whether it runs with the module."""
+
+    name: str
+    line: int
+    at_import: bool
+    relative: bool = False
+
+
+def imports_of(source: str) -> list[Import]:
+    """Every import of a source, also in functions and under TYPE_CHECKING; import_module of a constant."""
+    found: list[Import] = []
+
+    def visit(node: ast.AST, now: bool) -> None:
+        match node:
+            case ast.Import():
+                found.extend(Import(alias.name, node.lineno, now) for alias in node.names)
+            case ast.ImportFrom():
+                stem = f"{node.module}." if node.module else ""
+                found.extend(
+                    Import(stem + alias.name, node.lineno, now, node.level > 0) for alias in node.names
+                )
+            case ast.Call(args=[ast.Constant(value=str(name)), *_]):
+                if ast.unparse(node.func).rpartition(".")[2] in ("import_module", "__import__"):
+                    found.append(Import(name, node.lineno, now))
+            case ast.If() if ast.unparse(node.test).rpartition(".")[2] == "TYPE_CHECKING":
+                for statement in node.body:
+                    visit(statement, False)
+                for statement in node.orelse:
+                    visit(statement, now)
+                return
+        inside_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for child in ast.iter_child_nodes(node):
+            visit(child, now and not inside_function)
+
+    visit(ast.parse(source), True)
+    return found
+
+
+def matches(module: str, patterns: Iterable[str]) -> bool:
+    """Whether a dotted module is, or lies in, one of the patterns."""
+    return any(fnmatchcase(module, pattern) or fnmatchcase(module, f"{pattern}.*") for pattern in patterns)
+
+
+def layer_faults(module: str, source: str) -> Iterator[str]:
+    """Imports inside powderdsl that LAYERS does not allow. `module` is dotted, without ``powderdsl.``."""
+    rows = [row for row in LAYERS if matches(module, [row])]
+    if not rows:
+        yield f"{module} has no row in LAYERS"
+        return
+    allowed = LAYERS[max(rows, key=len)]
+    own = module.partition(".")[0]
+    for found in imports_of(source):
+        package, _, target = found.name.partition(".")
+        if package != "powderdsl" or found.relative:
+            continue
+        top = target.partition(".")[0]
+        if top not in LAYERS:
+            yield f"{module}:{found.line} imports from powderdsl itself: {found.name}"
+        elif top != own and not matches(target, allowed):
+            yield f"{module}:{found.line} may not import {found.name}"
+
+
+def third_party_faults(module: str, source: str) -> Iterator[str]:
+    """Imports of third parties outside the places that THIRD_PARTIES gives them."""
+    for found in imports_of(source):
+        home = THIRD_PARTIES.get(found.name.partition(".")[0])
+        if home is None or found.relative:
+            continue
+        if not matches(module, home.anywhere):
+            yield f"{module}:{found.line} may not import {found.name}"
+        elif found.at_import and not matches(module, home.at_import):
+            yield f"{module}:{found.line} may import {found.name} only inside a function"
+
+
+def import_style_faults(module: str, source: str) -> Iterator[str]:
+    """Relative imports and star imports."""
+    for found in imports_of(source):
+        if found.relative:
+            yield f"{module}:{found.line} has a relative import"
+        if found.name.endswith("*"):
+            yield f"{module}:{found.line} has a star import"
+
+
+# --- sizes and names of modules
+
+
+def size_faults(module: str, source: str) -> Iterator[str]:
+    """A source of more than MAX_LINES lines."""
+    lines = source.count("\n")
+    if lines > MAX_LINES:
+        yield f"{module} has {lines} lines, more than {MAX_LINES}: split it by responsibility"
+
+
+def module_name_faults(modules: Iterable[str], shared: dict[str, str]) -> Iterator[str]:
+    """Modules and packages (dotted) with an empty name, or with the base name of another one."""
+    homes: dict[str, list[str]] = {}
+    for module in modules:
+        base = module.rpartition(".")[2]
+        if base != "__init__":
+            homes.setdefault(base, []).append(module)
+        if base in EMPTY_NAMES:
+            yield f"{module}: a name that says nothing"
+    for base, places in homes.items():
+        if len(places) > 1 and base not in shared:
+            yield f"one base name, several modules: {', '.join(sorted(places))}"
+
+
+# --- paths in the documentation
+
+
+def path_faults(markdown: str, exists: Callable[[str], bool]) -> Iterator[str]:
+    """Paths in inline code and in links that do not exist. Fenced blocks are left out: they show commands."""
+    text = re.sub(r"^```.*?^```", "", markdown, flags=re.MULTILINE | re.DOTALL)
+    named = re.findall(r"`([^`\n]+)`", text) + re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
+    for name in dict.fromkeys(named):
+        like_path = re.fullmatch(r"[\w.*/-]+", name) and (
+            "/" in name or re.search(r"\.(py|md|yaml|lark|toml|txt)$", name)
+        )
+        if like_path and not exists(name):
+            yield f"no such path: {name}"
+
+
+def path_exists(name: str) -> bool:
+    """Whether a path or a glob exists, seen from the repository, the package or docs/."""
+    return any(any(start.glob(name.strip("/"))) for start in (ROOT, PACKAGE, ROOT / "docs"))
+
+
+# --- words of the rules
+
+
+def names_in_rules(text: str) -> set[str]:
+    """The names that a rule file declares in NAME_SECTIONS. Scalars stay text, so `no` is a name."""
+    # The C loader: the pure one refuses a name that ends in `?` within a list in brackets.
+    tree = yaml.load(text, Loader=yaml.CBaseLoader)
+    sections = [tree.get(section) for section in NAME_SECTIONS] if isinstance(tree, dict) else []
+    return {key.strip("?").lower() for section in sections if isinstance(section, dict) for key in section}
+
+
+def words_of(source: str) -> Iterator[tuple[str, int, bool]]:
+    """Words of a source with their lines, and whether they are code: identifiers, strings, comments.
+
+    Identifiers are split at underscores and capitals. A string without white space counts as code: it is a
+    key or a name, not a sentence.
+    """
+    prose = {tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.NAME or token.type in prose:
+            code = token.type != tokenize.COMMENT and not re.search(r"\s", token.string)
+            for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", token.string):
+                yield word.lower(), token.start[0], code
+
+
+def word_faults(module: str, source: str, names: set[str]) -> Iterator[str]:
+    """Names of the shipped rules that stand in a Python source."""
+    names = names - PYTHON_WORDS.keys()
+    single = {name for name in names if name.isalpha()}
+    for word, line, code in words_of(source):
+        if word in single and (code or word not in ENGLISH_WORDS):
+            yield f"{module}:{line} knows `{word}`"
+    for number, text in enumerate(source.splitlines(), 1):
+        for name in names - single:
+            if re.search(rf"\b{re.escape(name)}\b", text):
+                yield f"{module}:{number} knows `{name}`"
+
+
+# --- the sources as they are
+
+
+def dotted(path: Path) -> str:
+    """`powderdsl/ir/ops.py` is `ir.ops`, `powderdsl/ir/__init__.py` is `ir`, the root's is `__init__`."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
+
+
+@pytest.fixture(scope="module")
+def sources() -> dict[str, str]:
+    found = {dotted(path): path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+    assert {"__init__", "diagnostics", "syntax"} <= found.keys(), "the package is not where these tests look"
+    return found
+
+
+@pytest.fixture(scope="module")
+def shipped_names() -> set[str]:
+    texts = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "rules").rglob("*.yaml"))]
+    found = set().union(*map(names_in_rules, texts))
+    assert {"sand", "water", "gravity", "velocity"} <= found, (
+        "these tests no longer read rule files as they are"
+    )
+    return found
+
+
+def expect_none(faults: Iterable[str]) -> None:
+    found = list(faults)
+    assert not found, "\n".join(["", *found])
+
+
+@pytest.mark.parametrize("rule", [layer_faults, third_party_faults, import_style_faults, size_faults])
+def test_every_module_keeps(rule: Callable[[str, str], Iterable[str]], sources: dict[str, str]) -> None:
+    expect_none(fault for module, source in sources.items() for fault in rule(module, source))
+
+
+@pytest.mark.parametrize(
+    ("rule", "module", "source", "fault"),
+    [
+        (layer_faults, "reference", "import powderdsl.ir.ops", "reference:1 may not import powderdsl.ir.ops"),
+        (layer_faults, "reference", "from powderdsl import ir", "reference:1 may not import powderdsl.ir"),
+        (layer_faults, "passes.fuse", "\nfrom powderdsl.model import Rule", "passes.fuse:2 may not import"),
+        (layer_faults, "backends.torch_dense", "from powderdsl.passes import PIPELINE", "may not import"),
+        (layer_faults, "backends.torch_dense", "from powderdsl.syntax.ast import Syntax", "may not import"),
+        (layer_faults, "ir.ops", "from powderdsl.model import Rule", "may not import"),
+        (layer_faults, "worlds.scene", "from powderdsl.simulator import World", "may not import"),
+        (layer_faults, "syntax.parse", "def late():\n    from powderdsl.model import x", "syntax.parse:2"),
+        (layer_faults, "model.read", "if TYPE_CHECKING:\n    import powderdsl.ir", "model.read:2"),
+        (layer_faults, "model.read", "import_module('powderdsl.ir')", "model.read:1"),
+        (layer_faults, "envs.vector", "import powderdsl.web.server", "may not import"),
+        (layer_faults, "model.read", "from powderdsl import load", "imports from powderdsl itself"),
+        (layer_faults, "model.read", "import powderdsl", "imports from powderdsl itself"),
+        (layer_faults, "leftover", "", "leftover has no row in LAYERS"),
+        (third_party_faults, "model.read", "import yaml", "may not import yaml"),
+        (third_party_faults, "worlds.ascii", "from lark import Lark", "may not import lark.Lark"),
+        (third_party_faults, "backends.native", "import torch.nn as nn", "may not import torch.nn"),
+        (third_party_faults, "compiler", "def f():\n    import torch", "compiler:2 may not import torch"),
+        (third_party_faults, "cli.run", "import torch", "cli.run:1 may import torch only inside a function"),
+        (third_party_faults, "draw", "try:\n    import torch\nexcept E: pass", "only inside a function"),
+        (import_style_faults, "draw", "from .ir import ops", "draw:1 has a relative import"),
+        (import_style_faults, "draw", "from . import ir", "draw:1 has a relative import"),
+        (import_style_faults, "draw", "from numpy import *", "draw:1 has a star import"),
+        (size_faults, "draw", "x = 1\n" * 501, "draw has 501 lines"),
+    ],
+)
+def test_each_rule_can_fail(
+    rule: Callable[[str, str], Iterable[str]], module: str, source: str, fault: str
+) -> None:
+    faults = list(rule(module, source))
+    assert len(faults) == 1
+    assert fault in faults[0]
+
+
+@pytest.mark.parametrize(
+    ("rule", "module", "source"),
+    [
+        (layer_faults, "ir.lower_rules", "from powderdsl.model import types"),
+        (layer_faults, "worlds.store", "from powderdsl.simulator import World"),
+        (layer_faults, "__init__", "def f():\n    import powderdsl.simulator"),
+        (layer_faults, "cli.run", "from powderdsl import worlds, compiler"),
+        (third_party_faults, "backends.torch_dense", "import torch"),
+        (third_party_faults, "draw", "if TYPE_CHECKING:\n    import torch"),
+        (third_party_faults, "cli.run", "def f():\n    import torch"),
+        (size_faults, "draw", "x = 1\n" * 500),
+    ],
+)
+def test_each_rule_can_pass(rule: Callable[[str, str], Iterable[str]], module: str, source: str) -> None:
+    assert list(rule(module, source)) == []
+
+
+def test_layers_only_look_left() -> None:
+    rows = list(LAYERS)
+    for row, allowed in LAYERS.items():
+        expect_none(f"{row} imports {other}" for other in allowed if rows.index(other) >= rows.index(row))
+
+
+def test_modules_have_names_of_their_own(sources: dict[str, str]) -> None:
+    expect_none(module_name_faults(sources, SHARED_NAMES))
+    bases = [module.rpartition(".")[2] for module in sources]
+    assert [name for name in SHARED_NAMES if bases.count(name) < 2] == [], "an allowance that nothing needs"
+
+
+def test_module_names_can_fail() -> None:
+    assert list(module_name_faults(["ir.utils"], {})) == ["ir.utils: a name that says nothing"]
+    assert len(list(module_name_faults(["cli.draw", "draw"], {}))) == 1
+    assert list(module_name_faults(["cli.draw", "draw"], {"draw": "reason"})) == []
+
+
+def test_tests_stay_short() -> None:
+    for path in (ROOT / "tests").rglob("*.py"):
+        expect_none(size_faults(path.name, path.read_text(encoding="utf-8")))
+
+
+def test_architecture_names_paths_that_exist() -> None:
+    page = ROOT / "docs" / "architecture.md"
+    assert page.exists(), "docs/architecture.md is missing"
+    text = page.read_text(encoding="utf-8")
+    expect_none(path_faults(text, path_exists))
+    # Seen from nowhere, every one of its paths is missing: so the page does name some.
+    assert len(list(path_faults(text, lambda _: False))) >= 10
+
+
+def test_paths_can_fail() -> None:
+    page = (
+        "`gone/x.py`, `x.md`, [here](gone/y.md#part), `pyproject.toml`, `ir/`, `a -> b`\n```\nno/such\n```\n"
+    )
+    found = [fault.split()[-1] for fault in path_faults(page, path_exists)]
+    assert found == ["gone/x.py", "x.md", "gone/y.md"]
+    assert list(path_faults("`gone/*.py`, `powderdsl/*.py`", path_exists)) == ["no such path: gone/*.py"]
+
+
+def test_python_knows_no_name_of_the_rules(sources: dict[str, str], shipped_names: set[str]) -> None:
+    expect_none(
+        fault for name, source in sources.items() for fault in word_faults(name, source, shipped_names)
+    )
+
+
+def test_allowed_words_are_names_of_the_rules(shipped_names: set[str]) -> None:
+    assert (PYTHON_WORDS.keys() | ENGLISH_WORDS.keys()) - shipped_names == set()
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        'if name == "sand": pass',
+        "sand_mask = 1",
+        "is_sand = 1",
+        "x.sand",
+        "class SandPass: pass",
+        "SAND = 2",
+        'f"{sand}"',
+        'f"the {x} sand"',
+        '"falls like sand"',
+        '"""A docstring about\n\nsand."""',
+        "x = 1  # a sand castle",
+        '"core.sand"',
+        '"sand,water"',
+        'x["fire"]',
+        "fire = 1",
+        "was_hot = 1",
+    ],
+)
+def test_names_of_rules_are_found(source: str) -> None:
+    assert list(word_faults("draw", source, {"sand", "fire", "was_hot", "empty"}))
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["thousand = sandbox = 1", '"a rule can never fire"', "torch.empty(3)", "x = 1  # rules fire in order"],
+)
+def test_other_words_are_not(source: str) -> None:
+    assert list(word_faults("draw", source, {"sand", "fire", "empty"})) == []
+
+
+def test_names_are_read_from_rules() -> None:
+    text = "pack: x\nelements:\n  no: {id: 1}\npasses:\n  fall?: {do: a -> b}\nparams: {p: 1%}\n"
+    assert names_in_rules(text) == {"no", "fall"}
+
+
+# --- what an import costs
+
+
+def slow_imports_after(statement: str, path: Path = ROOT) -> set[str]:
+    """Those of SLOW_IMPORTS that a fresh interpreter has loaded after a statement."""
+    program = f"{statement}\nimport sys\nprint(*(set({SLOW_IMPORTS!r}) & sys.modules.keys()))"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(path), str(ROOT)))}
+    command = [sys.executable, "-c", program]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert run.returncode == 0, run.stderr
+    return set(run.stdout.split())
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["import powderdsl; powderdsl.load('powderworld')", "import powderdsl.cli; powderdsl.cli.main"],
+)
+def test_the_front_end_does_without_torch(statement: str) -> None:
+    assert slow_imports_after(statement) == set()
+
+
+def test_a_slow_import_would_be_seen(tmp_path: Path) -> None:
+    (tmp_path / "torch.py").touch()  # stands in for torch, which takes seconds to import
+    (tmp_path / "front.py").write_text("import powderdsl\ndef load():\n    import torch\n")
+    assert slow_imports_after("import front", tmp_path) == set()
+    assert slow_imports_after("import front; front.load()", tmp_path) == {"torch"}

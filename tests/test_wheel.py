@@ -1,0 +1,79 @@
+"""The installed wheel: what a user gets has the rules and tasks in it, and runs far from the repository."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+pytestmark = pytest.mark.wheel
+
+
+def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command without the caller's PYTHONPATH, which could lead back to the repository."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    return subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def succeed(*command: str | Path, cwd: Path) -> str:
+    """Run a command that must succeed; its stdout."""
+    done = run(*command, cwd=cwd)
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel of the repository as it is now."""
+    folder = tmp_path_factory.mktemp("wheel")
+    succeed(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def scripts(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scripts of a fresh environment with the wheel in it. Third parties come from this environment."""
+    home = tmp_path_factory.mktemp("environment")
+    succeed(sys.executable, "-m", "venv", "--without-pip", home, cwd=home)
+    places = sysconfig.get_paths(scheme="venv", vars={"base": str(home), "platbase": str(home)})
+    # A path in a .pth file is searched last, and .pth files in it, such as an editable one's, are not read.
+    Path(places["purelib"], "outer.pth").write_text(sysconfig.get_paths()["purelib"], encoding="utf-8")
+    python = Path(places["scripts"], "python")
+    pip = (sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel)
+    succeed(*pip, cwd=home)
+    return Path(places["scripts"])
+
+
+def shipped(folder: str) -> dict[str, bytes]:
+    """The files of a folder at the root of the repository, by their paths within the repository."""
+    files = [path for path in (ROOT / folder).rglob("*") if path.is_file()]
+    return {path.relative_to(ROOT).as_posix(): path.read_bytes() for path in files}
+
+
+def test_wheel_holds_what_ships(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        inside = {name: archive.read(name) for name in archive.namelist()}
+    data = {f"powderdsl/data/{name}": text for name, text in (shipped("rules") | shipped("tasks")).items()}
+    package = {name: text for name, text in shipped("powderdsl").items() if "__pycache__" not in name}
+    assert data, "nothing ships"
+    assert {name for name in inside if ".dist-info/" not in name} == data.keys() | package.keys()
+    assert all(inside[name] == text for name, text in (data | package).items())
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in inside)
+
+
+def test_wheel_runs_elsewhere(scripts: Path, tmp_path: Path) -> None:
+    where = succeed(scripts / "python", "-c", "import powderdsl; print(powderdsl.__file__)", cwd=tmp_path)
+    assert Path(where.strip()).is_relative_to(scripts.parent), "the test found another powderdsl"
+    succeed(scripts / "powderdsl", "check", "powderworld", cwd=tmp_path)
+    refused = run(scripts / "powderdsl", "check", "no-such-rules", cwd=tmp_path)
+    assert refused.returncode == 2, "the line above proves nothing if `check` never says no"

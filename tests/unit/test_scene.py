@@ -1,0 +1,466 @@
+"""Drawn worlds: which cells shapes cover, what the statements say, and every way to write them wrongly."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
+from powderdsl.worlds.raster import MAX_COORDINATE, Box, Disk, Frame, Line, mask, paint
+from powderdsl.worlds.scene import find_scene, load_scene, load_scenes, read_scenes, shipped_scenes
+from powderdsl.worlds.statements import STATEMENTS, parse_statement
+from tests.unit.elements import ELEMENTS, ID, RULES, Rules
+
+ROOT = Path(__file__).resolve().parents[2]
+DESIGNED = ROOT / "tasks" / "scenes" / "designed.yaml"
+NAMES = (
+    "sand-on-water",
+    "stone-arches",
+    "ice-and-plants",
+    "burning-vines",
+    "acid-on-wood",
+    "water-flowing",
+    "dust-on-lava",
+    "gas-flowing",
+)
+
+
+def picture(cells: np.ndarray) -> list[str]:
+    return ["".join("x" if cell else "." for cell in row) for row in cells]
+
+
+def errors(text: str) -> tuple:
+    """What is wrong with a scene file: syntax first, then names."""
+    reporter = Reporter()
+    read_scenes(Source("test.yaml", text), reporter)
+    return reporter.diagnostics
+
+
+# The shapes
+
+
+def test_a_disk_has_the_cells_nearer_than_its_radius():
+    assert picture(mask(Disk((2, 2), 2), (5, 5))) == [".....", ".xxx.", ".xxx.", ".xxx.", "....."]
+    assert picture(mask(Disk((2, 2), 1), (5, 5))) == [".....", ".....", "..x..", ".....", "....."]
+
+
+def test_a_disk_is_cut_off_at_the_edge():
+    assert picture(mask(Disk((-1, 3), 3), (3, 4))) == [".xxx", ".xxx", "...."]
+
+
+@pytest.mark.parametrize(("width", "thickness"), [(1, 3), (3, 3), (4, 3), (5, 5), (8, 5), (9, 7)])
+def test_a_level_line_is_as_thick_as_its_width_says(width, thickness):
+    cells = mask(Line((10, 2), (10, 6), width), (21, 9))
+    assert cells.sum(axis=0).tolist() == [0, 0] + [thickness] * 5 + [0, 0]
+    assert np.array_equal(mask(Line((2, 10), (6, 10), width), (9, 21)), cells.T)
+
+
+def test_a_diagonal_line_is_walked_along_its_columns():
+    # Both axes are equally long: the ends are cut off at a column, not at a row.
+    cells = mask(Line((3, 3), (5, 5), 1), (9, 9))
+    assert sorted(set(np.nonzero(cells)[1].tolist())) == [3, 4, 5]
+    assert sorted(set(np.nonzero(cells)[0].tolist())) == [2, 3, 4, 5, 6]
+
+
+def test_a_line_may_be_a_point():
+    assert picture(mask(Line((1, 1), (1, 1), 3), (3, 3))) == [".x.", ".x.", ".x."]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    start=st.tuples(st.integers(-4, 20), st.integers(-4, 20)),
+    end=st.tuples(st.integers(-4, 20), st.integers(-4, 20)),
+    width=st.integers(1, 12),
+)
+def test_lines_agree_with_the_definition_in_exact_fractions(start, end, width):
+    """Cell by cell: |distance| < 1 + width·√(1 + slope²)/4, squared so that no root is taken."""
+    (top, left), (bottom, right_end) = start, end
+    down, right = bottom - top, right_end - left
+    expected = np.zeros((16, 16), dtype=bool)
+    for row in range(16):
+        for column in range(16):
+            if abs(down) > abs(right):
+                inside = min(top, bottom) <= row <= max(top, bottom)
+                slope, distance = Fraction(right, down), column - left - Fraction(right, down) * (row - top)
+            else:
+                inside = min(left, right_end) <= column <= max(left, right_end)
+                slope = Fraction(down, right) if right else Fraction(0)
+                distance = row - top - slope * (column - left)
+            excess = abs(distance) - 1
+            near = excess < 0 or excess**2 < Fraction(width**2, 16) * (1 + slope**2)
+            expected[row, column] = inside and near
+    assert np.array_equal(mask(Line(start, end, width), (16, 16)), expected)
+    assert np.array_equal(mask(Line(end, start, width), (16, 16)), expected)
+
+
+def test_the_largest_numbers_do_not_overflow():
+    far = MAX_COORDINATE
+    diagonal = mask(Line((-far, -far), (far, far), 1), (8, 8))
+    assert picture(diagonal)[0] == "xx......"
+    assert mask(Line((-far, far), (far, -far), far), (8, 8)).all()
+    assert mask(Disk((far, far), far), (8, 8)).sum() == 0
+    assert mask(Disk((0, 0), far), (8, 8)).all()
+
+
+def test_boxes_leave_the_end_out_and_frames_follow_the_size():
+    assert picture(mask(Box((1, 3), (0, 2)), (4, 4))) == ["....", "xx..", "xx..", "...."]
+    assert picture(mask(Box((2, None), (3, None)), (3, 4))) == ["....", "....", "...x"]
+    assert mask(Box(), (2, 3)).all()
+    assert picture(mask(Frame(), (4, 3))) == ["xxx", "x.x", "x.x", "xxx"]
+    assert mask(Frame(), (1, 5)).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    height=st.integers(1, 12),
+    width=st.integers(1, 12),
+    shape=st.one_of(
+        st.builds(Disk, st.tuples(st.integers(-9, 20), st.integers(-9, 20)), st.integers(1, 15)),
+        st.builds(
+            Line,
+            st.tuples(st.integers(-9, 20), st.integers(-9, 20)),
+            st.tuples(st.integers(-9, 20), st.integers(-9, 20)),
+            st.integers(1, 9),
+        ),
+    ),
+)
+def test_a_shape_stays_where_it_is_when_the_world_grows(height, width, shape):
+    large = mask(shape, (30, 30))
+    assert np.array_equal(mask(shape, (height, width)), large[:height, :width])
+
+
+# The statements
+
+
+def statement(text: str):
+    reporter = Reporter()
+    found = parse_statement(Span(Source("line", text), 0, len(text)), reporter)
+    assert reporter.diagnostics == ()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("text", "element", "shape"),
+    [
+        ("line stone from (63, 5) to (32,-5) width 3", "stone", Line((63, 5), (32, -5), 3)),
+        ("disk sand at ( 32 , 32 )radius 10", "sand", Disk((32, 32), 10)),
+        ("box water rows 32:64", "water", Box((32, 64))),
+        ("box water rows 32:end columns :4", "water", Box((32, None), (0, 4))),
+        ("box fire rows 48: columns 48:", "fire", Box((48, None), (48, None))),
+        ("box fire columns 7", "fire", Box(columns=(7, 8))),
+        ("box fire rows :", "fire", Box()),
+        ("box fire", "fire", Box()),
+        ("frame core.wall  # last", "core.wall", Frame()),
+    ],
+)
+def test_statements(text, element, shape):
+    found = statement(text)
+    assert (found.element, found.shape) == (element, shape)
+    assert found.element_span.text == element
+    assert found.span.text == text.partition("  #")[0]
+
+
+def test_every_statement_is_written_as_its_help_says():
+    values = {"ELEMENT": "sand", "ROW": "1", "COLUMN": "2", "NUMBER": "3", "A:B": "4:5", "C:D": "6:7"}
+    for name, usage in STATEMENTS.items():
+        for word, value in values.items():
+            usage = usage.replace(word, value)
+        assert type(statement(usage).shape).__name__.lower() == name
+
+
+# Files
+
+
+def test_the_designed_worlds_are_the_recorded_ones_cell_for_cell():
+    recorded = np.load(ROOT / "tests" / "data" / "population.npz")["start_ids"]
+    scenes = load_scenes(DESIGNED, RULES)
+    assert tuple(scenes) == NAMES
+    for name, expected in zip(NAMES, recorded, strict=True):
+        assert scenes[name].dtype == np.uint8
+        assert np.array_equal(scenes[name], expected), name
+        assert np.array_equal(load_scene(name, RULES), expected), name
+        assert np.array_equal(load_scene(f"{DESIGNED}#{name}", RULES), expected), name
+
+
+def test_the_garden_has_something_of_everything():
+    ids = load_scene("garden", RULES)
+    assert ids.shape == (64, 64)
+    assert set(np.unique(ids)) == set(ID.values()) - {ID["fire"]}
+
+
+def test_shipped_scenes_have_names_of_their_own_and_say_what_they_show():
+    scenes = shipped_scenes()
+    assert len({scene.name for scene in scenes}) == len(scenes) >= 9
+    assert all(scene.about.endswith(".") for scene in scenes)
+
+
+SMALL = """scene: small
+size: [4, 5]
+fill: empty
+draw:
+  - box sand rows 2:
+  - frame wall
+"""
+
+
+def load(tmp_path: Path, text: str, **options) -> np.ndarray:
+    path = tmp_path / "scene.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_scene(path, RULES, **options)
+
+
+def test_draw_may_be_a_block_with_comments(tmp_path):
+    text = """scene: small
+size: [4, 5]
+fill: empty
+draw: |
+  # the ground
+  box sand rows 2: columns 3:
+
+  disk water at (0, 0) radius 1   # a drop
+"""
+    assert load(tmp_path, text).tolist() == [[3, 0, 0, 0, 0], [0] * 5, [0, 0, 0, 2, 2], [0, 0, 0, 2, 2]]
+
+
+def test_later_statements_paint_over_earlier_ones(tmp_path):
+    text = SMALL.replace("rows 2:", "rows 2:4")
+    assert load(tmp_path, text).tolist() == [[1] * 5, [1, 0, 0, 0, 1], [1, 2, 2, 2, 1], [1] * 5]
+
+
+def test_another_size_moves_the_frame_and_open_ends_and_nothing_else(tmp_path):
+    text = SMALL.replace("rows 2:", "rows 2:end")
+    assert load(tmp_path, text, size=(5, 3)).tolist() == [
+        [1, 1, 1],
+        [1, 0, 1],
+        [1, 2, 1],
+        [1, 2, 1],
+        [1, 1, 1],
+    ]
+
+
+def test_a_scene_without_statements_is_its_fill(tmp_path):
+    assert (load(tmp_path, "scene: lake\nsize: [2, 3]\nfill: core.water\n") == ID["water"]).all()
+
+
+def test_windows_line_ends_and_a_byte_order_mark(tmp_path):
+    path = tmp_path / "scene.yml"
+    path.write_bytes(b"\xef\xbb\xbf" + SMALL.replace("rows 2:", "rows 2:4").replace("\n", "\r\n").encode())
+    assert load_scene(str(path), RULES)[2].tolist() == [1, 2, 2, 2, 1]
+
+
+def test_elements_need_only_be_known_where_they_are_drawn():
+    """A ruleset without some element still has the scenes that do not use it."""
+    few = Rules(tuple(element for element in ELEMENTS if element.name in ("empty", "wall", "sand", "water")))
+    assert load_scene(f"{DESIGNED}#sand-on-water", few).shape == (64, 64)
+    with pytest.raises(CompileError) as caught:
+        load_scene(f"{DESIGNED}#stone-arches", few)
+    assert {found.code for found in caught.value.diagnostics} == {"PD604"}
+    assert len(caught.value.diagnostics) == 6
+
+
+def test_spans_play_no_part_in_equality():
+    assert statement("frame wall") == statement("   frame   wall")
+
+
+# What can be wrong. Each row: the file, the code, the text under the caret.
+
+
+def open_ended(text: str) -> str:
+    """The span of a YAML list may end before its bracket, where its last item does."""
+    return text.rstrip("]}")
+
+
+HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "under"),
+    [
+        ("disc sand at (1, 1) radius 2", "PD605", "disc"),
+        ("disk at (1, 1) radius 2", "PD605", "at"),
+        ("disk sand at (1, 1) raduis 2", "PD605", "raduis"),
+        ("disk sand at (1, 1)", "PD605", "\n"),
+        ("disk sand at (1 1) radius 2", "PD605", "1"),
+        ("disk sand at (1, 1, 1) radius 2", "PD605", ","),
+        ("disk sand at [1, 1] radius 2", "PD605", "["),
+        ("disk sand at (1, 1) radius two", "PD605", "two"),
+        ("disk sand at (1, 1) radius 0", "PD606", "0"),
+        ("disk sand at (1, 1) radius -3", "PD606", "-3"),
+        ("disk sand at (1, 1) radius 2.5", "PD606", "2.5"),
+        ("disk sand at (1, 1) radius 5px", "PD606", "5px"),
+        ("disk sand at (1, 1e3) radius 2", "PD606", "1e3"),
+        ("disk sand at (٣, 1) radius 2", "PD606", "٣"),
+        ("disk sand at (1, 99999999999999999999) radius 2", "PD606", "99999999999999999999"),
+        ("disk sand at (20, 20) radius 3", "PD608", "disk sand at (20, 20) radius 3"),
+        ("line wall from (0, 0) to (3, 3)", "PD605", "\n"),
+        ("line wall from (0, 0) to (3, 3) width 0", "PD606", "0"),
+        ("line wall (0, 0) to (3, 3) width 1", "PD605", "("),
+        ("line wall from (-9, 0) to (-9, 5) width 1", "PD608", "line wall from (-9, 0) to (-9, 5) width 1"),
+        ("box water rows 5:3", "PD606", "5:3"),
+        ("box water rows 3:3", "PD606", "3:3"),
+        ("box water rows -2:4", "PD606", "-2"),
+        ("box water columns 9:12", "PD608", "box water columns 9:12"),
+        ("box water rows 1:2:3", "PD605", ":"),
+        ("box water columns 1:2 rows 1:2", "PD605", "rows"),
+        ("box water rows 1:2 rows 1:2", "PD605", "rows"),
+        ("frame", "PD605", "\n"),
+        ("frame wall wall", "PD605", "wall"),
+        ("fill wall", "PD605", "fill"),
+        ("frame a.b.c", "PD605", "."),
+        ("frame wåll", "PD605", "å"),
+        ('"frame \\"wall\\""', "PD605", '"frame \\"wall\\""'),
+        ('""', "PD605", '"'),
+        ("frame " + "x" * 600, "PD605", "f"),
+        ("box water rows 2:", "PD605", "box water rows 2:"),
+        ("[frame, wall]", "PD107", "[frame, wall]"),
+    ],
+)
+def test_a_bad_statement(line, code, under):
+    found = errors(f"{HEAD}  - frame wall\n  - {line}\n")
+    assert [one.code for one in found] == [code]
+    assert open_ended(found[0].primary.span.text) == open_ended(under)
+    assert found[0].primary.span.line == 6
+    assert code in CODES
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "under"),
+    [
+        ("", "PD107", None),
+        ("just words\n", "PD107", "just words"),
+        ("scene: [a]\nsize: [8, 8]\nfill: empty\n", "PD107", "[a]"),
+        ("scene: a b\nsize: [8, 8]\nfill: empty\n", "PD111", "a b"),
+        ("scene: a\nsize: [8, 8]\n", "PD109", "s"),
+        ("scene: a\nfill: empty\n", "PD109", "s"),
+        ("size: [8, 8]\nfill: empty\n", "PD109", "s"),
+        ("scene: a\nsize: 64\nfill: empty\n", "PD607", "64"),
+        ("scene: a\nsize: [8, 8, 8]\nfill: empty\n", "PD607", "[8, 8, 8]"),
+        ("scene: a\nsize: [8, eight]\nfill: empty\n", "PD607", "[8, eight]"),
+        ("scene: a\nsize: [-8, 8]\nfill: empty\n", "PD607", "[-8, 8]"),
+        ("scene: a\nsize: [0, 8]\nfill: empty\n", "PD607", "[0, 8]"),
+        ("scene: a\nsize: [4097, 4096]\nfill: empty\n", "PD607", "[4097, 4096]"),
+        ("scene: a\nsize: [999999999, 999999999]\nfill: empty\n", "PD607", "[999999999, 999999999]"),
+        ("scene: a\nsize: [8, 8]\nfill: empty\nsise: 3\n", "PD108", "sise"),
+        ("scene: a\nsize: [8, 8]\nfill: empty\nfill: wall\n", "PD104", "fill"),
+        ("scene: a\nsize: [8, 8]\nfill: empty\ndraw: frame wall\n", "PD107", "frame wall"),
+        ("scene: a\nsize: [8, 8]\nfill: empty\ndraw: {a: b}\n", "PD107", "{a: b}"),
+        ("scene: a\nsize: [8, 8]\nfill: &x empty\n", "PD105", "&x empty"),
+        ("scenes: a\n", "PD107", "a"),
+        ("scenes:\n  - frame wall\n", "PD107", "frame wall"),
+        ("scenes: []\nscene: a\n", "PD108", "scene"),
+        (
+            "scenes:\n- {scene: a, size: [1, 1], fill: empty}\n- {scene: a, size: [2, 2], fill: empty}\n",
+            "PD302",
+            "a",
+        ),
+        (f"{HEAD}  - box fire rows 4: columns 4:\n", "PD103", ":"),
+    ],
+)
+def test_a_bad_file(text, code, under):
+    found = errors(text)
+    assert [one.code for one in found] == [code]
+    span = found[0].primary.span
+    assert (span and open_ended(span.text)) == (under and open_ended(under))
+
+
+def test_help_says_what_to_write():
+    def helps(line: str) -> tuple[str, ...]:
+        return errors(f"{HEAD}  - {line}\n")[0].helps
+
+    assert helps("disc sand at (1, 1) radius 2") == ("did you mean `disk`?",)
+    assert helps("heap sand") == ("statements: `box`, `disk`, `frame`, `line`",)
+    assert helps("disk sand at (1, 1) raduis 2") == helps("disk sand") == (STATEMENTS["disk"],)
+    assert "48:end" in helps("box water rows 2:")[0]
+
+
+def test_everything_wrong_is_reported_at_once(tmp_path):
+    text = """scene: bad
+size: [8, 8]
+fill: emty
+draw:
+  - disk snad at (3, 3) radius 2
+  - box watr
+"""
+    with pytest.raises(CompileError) as caught:
+        load(tmp_path, text)
+    found = [(one.code, one.primary.span.text, one.helps) for one in caught.value.diagnostics]
+    assert found == [
+        ("PD604", "emty", ("did you mean `empty`?",)),
+        ("PD604", "snad", ("did you mean `sand`?",)),
+        ("PD604", "watr", ("did you mean `water`?",)),
+    ]
+    lines = "  - line wall from (x1, 0) to (3, 3) width 1\n  - line wall from (1.5, 0) to (3, 2px) width 0\n"
+    numbers = errors(HEAD + lines)
+    assert [one.primary.span.text for one in numbers] == ["x1", "1.5", "2px", "0"]
+
+
+def test_the_message_shows_the_line(tmp_path):
+    with pytest.raises(CompileError) as caught:
+        load(tmp_path, SMALL.replace("rows 2:", "rows 2:4").replace("sand", "snad"))
+    assert str(caught.value).splitlines()[0] == "error[PD604]: unknown element `snad`"
+    assert "5 |   - box snad rows 2:4\n  |         ^^^^" in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [(0, 5), (5, -1), (4096, 4097), (1 << 40, 1 << 40)])
+def test_another_size_has_the_same_limits(tmp_path, size):
+    with pytest.raises(CompileError) as caught:
+        load(tmp_path, SMALL.replace("rows 2:", "rows 2:4"), size=size)
+    assert [one.code for one in caught.value.diagnostics] == ["PD607"]
+
+
+def test_a_world_may_have_any_shape_within_the_limit(tmp_path):
+    assert load(tmp_path, "scene: long\nsize: [1, 16777216]\nfill: empty\ndraw: [frame wall]\n").all()
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "hint"),
+    [
+        ("stone-arch", "PD601", "did you mean `stone-arches`?"),
+        ("zzz", "PD601", "sand-on-water"),
+        ("nowhere.yaml", "PD101", ""),
+        (str(DESIGNED), "PD601", f"{DESIGNED}#sand-on-water"),
+        (f"{DESIGNED}#gas", "PD601", ""),
+        ("bad\0name.yaml", "PD101", ""),
+        (str(ROOT / "tests"), "PD601", ""),
+    ],
+)
+def test_scenes_that_are_not_there(name, code, hint):
+    with pytest.raises(CompileError) as caught:
+        find_scene(name)
+    (found,) = caught.value.diagnostics
+    assert found.code == code
+    assert hint in "".join(found.helps)
+
+
+def test_files_that_are_no_text(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_bytes(b"scene: \xff\xfe")
+    with pytest.raises(CompileError) as caught:
+        load_scene(path, RULES)
+    assert caught.value.diagnostics[0].code == "PD101"
+    path.write_bytes(b"a" * (1 << 21))
+    with pytest.raises(CompileError) as caught:
+        load_scene(path, RULES)
+    assert caught.value.diagnostics[0].code == "PD102"
+
+
+def test_painting_writes_nothing_outside_the_window():
+    world = paint((3, 3), 7, [statement("disk sand at (1, 1) radius 1")], {"sand": 2})
+    assert world.tolist() == [[7, 7, 7], [7, 2, 7], [7, 7, 7]]
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.text(alphabet=st.sampled_from(list("diskboxlinefrmw ath(),:0123-.#'\"\t\u00e9[]{}&*!|>")), max_size=60)
+)
+def test_no_statement_ends_in_anything_but_a_diagnostic(text):
+    reporter = Reporter()
+    found = parse_statement(Span(Source("fuzz", text), 0, len(text)), reporter)
+    assert (found is None) == reporter.has_errors
+    str(CompileError(reporter.diagnostics))
+    read_scenes(Source("fuzz", f"{HEAD}  - {text}\n"), Reporter())
