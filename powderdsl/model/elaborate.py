@@ -172,8 +172,10 @@ class Elaborator:
         except Asleep as asleep:
             return Absent(asleep.name)
         value = constant(value) if isinstance(value, Number) else value
-        if value.kind.name == "draw":
-            return value  # draws are fixed for the whole step anyway
+        if value.op == "draw":
+            return value  # a stream's draws are fixed for the whole step
+        if value.kind.name in ("draw", "chance"):
+            value = self.typer.real(value, syntax.span)
         count = self._lets.get(name, 0)
         self._lets[name] = count + 1
         unique = name if count == 0 else f"{name}#{count + 1}"

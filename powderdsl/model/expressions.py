@@ -260,7 +260,7 @@ class Typer(Coercer):
                     [arithmetic.compare(self, "<=", low, value, span), arithmetic.compare(self, "<=", value, high, span)], span
                 )
             case _, Items() if any(isinstance(item, (Number, Place)) for item in right.items):
-                return disjunction([self.holds(left, item, syntax) for item in right.items], span)
+                return disjunction([self.equals(left, item, syntax) for item in right.items], span)
             case _, Number():
                 raise self.fail("PD401", "`is` asks for an element or a direction", span, helps=("compare numbers with `==`",))
             case _, Absent():
@@ -271,6 +271,12 @@ class Typer(Coercer):
         if isinstance(left, SetOf) and left.name is None:
             raise self.wrong(left, "a place or an element before `is`", first.span, "such as `below is …`")
         return member(self.element(left, first.span), ids, span)
+
+    def equals(self, left: Operand, item: Operand, syntax: Syntax) -> Expr:
+        """Whether `left` is one item of a list: numbers are compared, places and elements named."""
+        if isinstance(item, Number) and not isinstance(left, Number):
+            return arithmetic.compare(self, "==", self.value(left, syntax.children[0].span), item, syntax.span)
+        return self.holds(left, item, syntax)
 
     def choose(self, syntax: Syntax, scope: Scope) -> Operand:
         yes, condition, no = syntax.children

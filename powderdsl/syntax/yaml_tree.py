@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import yaml
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span
+from powderdsl.syntax.yaml_problems import report_yaml
 
 MAX_CHARACTERS = 1 << 20
 MAX_DEPTH = 32
@@ -69,24 +70,14 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
     builder = _Builder(source, reporter)
     try:
         # Events are counted before anything recursive runs: the C loader's composer can be crashed by depth.
-        return builder.build(yaml.parse(text, Loader=_Loader))
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        start = min(mark.index if mark else 0, max(len(text) - 1, 0))
-        problem = " ".join(str(error.problem or error.context or "not readable").split())
-        helps = ["text with `: ` or ` #` in it needs quotes or a `|` block"] if ":" in problem or "map" in problem else []
-        if "\\t" in problem or "'\\t'" in str(error):
-            helps = ["indent with spaces, not tabs"]
-        reporter.error("PD103", "invalid YAML", Span(source, start, start + 1), problem, helps=helps)
+        root = builder.build(yaml.parse(text, Loader=_Loader))
     except yaml.YAMLError as error:
-        position = getattr(error, "position", 0) or 0
-        start = min(position if isinstance(position, int) else 0, max(len(text) - 1, 0))
-        reporter.error(
-            "PD103", "invalid YAML", Span(source, start, start + 1), "a character that YAML does not allow here"
-        )
+        report_yaml(error, source, reporter)
+        return None
     except _Abort:
-        pass
-    return None
+        return None
+    # What a broken tree would mean is not worth a second message.
+    return None if builder.failed else root
 
 
 class _Abort(Exception):
@@ -100,6 +91,7 @@ class _Builder:
         self.source = source
         self.reporter = reporter
         self.nodes = 0
+        self.failed = False
 
     def build(self, events) -> Node | None:  # type: ignore[no-untyped-def]
         root: Node | None = None
@@ -121,8 +113,15 @@ class _Builder:
         span = self._span(event)
         first_line_end = self.source.text.find("\n", span.start)
         end = min(span.end, first_line_end if first_line_end >= 0 else span.end)
-        self.reporter.error("PD105", f"{what} is not allowed", Span(self.source, span.start, max(end, span.start + 1)), helps=[cure])
+        place = Span(self.source, span.start, max(end, span.start + 1))
+        self.reporter.error("PD105", f"{what} is not allowed", place, "not allowed", helps=[cure])
         raise _Abort
+
+    def _fail(
+        self, code: str, message: str, span: Span, label: str, cure: str, secondary: tuple[Label, ...] = ()
+    ) -> None:
+        self.failed = True
+        self.reporter.error(code, message, span, label, secondary=secondary, helps=[cure])
 
     def _node(self, event, events, depth: int) -> Node:  # type: ignore[no-untyped-def]
         self.nodes += 1
@@ -170,17 +169,20 @@ class _Builder:
             key = self._node(event, events, depth + 1)
             value = self._node(next(events), events, depth + 1)
             if not isinstance(key, Scalar):
-                self.reporter.error("PD107", "a key must be a word", key.span, helps=["a list or a mapping cannot be a key"])
-            elif key.text == "<<":
-                self.reporter.error("PD105", "the merge key `<<` is not allowed", key.span, helps=["write the entries out"])
+                self._fail("PD107", "a key must be a word", key.span, "a list or a mapping", "write a name before the `:`")
+            elif key.text == "<<" and key.style == "plain":
+                self._fail("PD105", "the merge key `<<` is not allowed", key.span, "not allowed", "write the entries out")
+            elif start.flow_style and isinstance(value, Scalar) and value.style == "plain" and not value.text:
+                # Nothing in a rule file has a key without a value: a comma has cut something in two.
+                self._fail(
+                    "PD107", f"`{key.text}` has no value", key.span, "a comma before it ended the value",
+                    "inside `{…}` YAML ends a value at a comma: put quotes around it, or give it a line of its own",
+                )
             elif key.text in seen:
-                self.reporter.error(
-                    "PD104",
-                    f"key `{key.text}` stands twice in one mapping",
-                    key.span,
-                    "second time here",
-                    secondary=[Label(seen[key.text], "first time here")],
-                    helps=["keep one of them, or join them"],
+                other = (Label(seen[key.text], "first time here"),)
+                self._fail(
+                    "PD104", f"key `{key.text}` stands twice in one mapping", key.span, "second time here",
+                    "keep one of them, or join them", other,
                 )
             else:
                 seen[key.text] = key.span

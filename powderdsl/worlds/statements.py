@@ -109,19 +109,18 @@ class _Reading:
         start = self.number(tokens[0], "the start of a range", 0) if colon == 1 else 0
         stop = self.number(tokens[-1], "the end of a range", 0) if colon + 1 < len(tokens) else None
         if stop is not None and stop <= start and not self.failed:
-            self._refuse(
-                _token_span(self.source, tree.meta), f"no {axis}", f"{axis} a to b−1: b must be above a"
-            )
+            label = "the end must be above the start: a:b leaves b out"
+            self._refuse(_token_span(self.source, tree.meta), f"a range without {axis}", label)
         return start, stop
 
     def number(self, token: Token, what: str, lowest: int) -> int:
         """A whole number from `lowest` to MAX_COORDINATE."""
         value = int(token) if re.fullmatch(r"[-+]?[0-9]{1,9}", token) else None
+        span = _token_span(self.source, token)
         if value is None:
-            self._refuse(_token_span(self.source, token), f"{what} is a whole number", "not a whole number")
+            self._refuse(span, f"{what} must be a whole number", "not a whole number")
         elif not lowest <= value <= MAX_COORDINATE:
-            label = f"at least {lowest}" if value < lowest else f"at most {MAX_COORDINATE}"
-            self._refuse(_token_span(self.source, token), f"{what} of {value}", label)
+            self._refuse(span, f"{what} must lie in {lowest}..{MAX_COORDINATE}", "out of range")
         return value if value is not None else max(lowest, 0)
 
     def _refuse(self, span: Span, message: str, label: str) -> None:

@@ -1,0 +1,186 @@
+"""IR -> the Python source of one pass for the dense torch backend."""
+
+from __future__ import annotations
+
+import re
+
+from powderdsl.ir.ops import Node, PassGraph, nodes_of
+
+_INFIX = {"and": "&", "or": "|", "xor": "^", "eq": "==", "lt": "<", "le": "<=", "add": "+", "sub": "-", "mul": "*"}
+
+
+class _Writer:
+    """Collects lines and constants; shifted planes are computed once."""
+
+    def __init__(self, significant: dict[str, int]):
+        self.lines: list[str] = []
+        self.constants: dict[str, object] = {}
+        self.names: dict[int, str] = {}
+        self.shifted: dict[tuple[str, int, int], str] = {}
+        self.significant = significant
+
+    def constant(self, value: object) -> str:
+        name = f"c{len(self.constants)}"
+        for known, other in self.constants.items():
+            if type(other) is type(value) and other == value:
+                return known
+        self.constants[name] = value
+        return name
+
+    def roll(self, name: str, dy: int, dx: int) -> str:
+        key = (name, dy, dx)
+        if key not in self.shifted:
+            self.shifted[key] = f"s{len(self.shifted)}"
+            self.lines.append(f"{self.shifted[key]} = k.roll({name}, {dy}, {dx})")
+        return self.shifted[key]
+
+    def node(self, node: Node) -> None:
+        args = [self.names[id(arg)] for arg in node.args]
+        if node.op == "const":
+            self.names[id(node)] = self.constant(node.attr)
+            return
+        if node.op == "shift" and node.attr[2]:  # type: ignore[index]
+            dy, dx, _ = node.attr  # type: ignore[misc]
+            self.names[id(node)] = self.roll(args[0], dy, dx)
+            return
+        expression = self.expression(node, args)
+        name = f"n{len(self.names)}"
+        self.names[id(node)] = name
+        self.lines.append(f"{name} = {expression}")
+
+    def expression(self, node: Node, args: list[str]) -> str:
+        attr = node.attr
+        if node.op in _INFIX:
+            return f"{args[0]} {_INFIX[node.op]} {args[1]}"
+        match node.op:
+            case "input":
+                return f"state[{attr!r}]"
+            case "param":
+                name, view = attr  # type: ignore[misc]
+                return f"k.param({name!r}, {(node.type.name if view == 'value' else view)!r})"
+            case "coordinate":
+                return f"k.coordinate({attr[0]!r}, {attr[1]})"  # type: ignore[index]
+            case "inside":
+                return f"k.inside({attr[0]}, {attr[1]})"  # type: ignore[index]
+            case "below":
+                return self.below(node, args[0])
+            case "draw":
+                return f"k.draw_real({attr[0]!r})"  # type: ignore[index]
+            case "shift":
+                return f"k.reach({args[0]}, {attr[0]}, {attr[1]})"  # type: ignore[index]
+            case "count":
+                return f"k.count({args[0]}, {attr[0]}, {attr[1]})"  # type: ignore[index]
+            case "not":
+                return f"~{args[0]}"
+            case "in_set":
+                return self.in_set(node, args[0])
+            case "table":
+                return f"{self.constant(attr)}[{args[0]}.long()]"
+            case "div":
+                return f"k.divide({args[0]}, {args[1]})"
+            case "neg":
+                return f"-{args[0]}"
+            case "abs":
+                return f"{args[0]}.abs()"
+            case "min" | "max":
+                return f"torch.{node.op}imum({args[0]}, {args[1]})"
+            case "mod":
+                return f"torch.remainder({args[0]}, {attr})"
+            case "sqrt":
+                return f"torch.sqrt({args[0]})"
+            case "to_real":
+                return f"{args[0]}.float()"
+            case "settle":
+                return f"k.settle({args[0]}, {attr[0]!r}, {attr[1]!r})"  # type: ignore[index]
+            case "select":
+                return f"torch.where({args[0]}, {args[1]}, {args[2]})"
+            case "swap":
+                dy, dx = attr  # type: ignore[misc]
+                there, back = self.roll(args[0], dy, dx), self.roll(args[0], -dy, -dx)
+                return f"torch.where({args[1]}, {there}, torch.where({self.roll(args[1], -dy, -dx)}, {back}, {args[2]}))"
+            case "arrive":
+                dy, dx = attr  # type: ignore[misc]
+                return f"torch.where({self.roll(args[1], -dy, -dx)}, {self.roll(args[0], -dy, -dx)}, {args[2]})"
+        raise AssertionError(f"no dense kernel for {node.op}")
+
+    def below(self, node: Node, limit: str) -> str:
+        """A draw below a limit. Constant limits need only the bits down to their last one."""
+        stream, bits = node.attr  # type: ignore[misc]
+        significant = self.significant[stream]
+        argument = node.args[0]
+        if argument.op == "const":
+            return f"k.draw({stream!r}, {significant}) < {int(argument.attr) >> (bits - significant)}"  # type: ignore[call-overload]
+        return f"k.draw({stream!r}, {bits}) < {limit}"
+
+    def in_set(self, node: Node, value: str) -> str:
+        members = sorted(node.attr)  # type: ignore[call-overload]
+        lo, hi = node.args[0].type.lo, node.args[0].type.hi
+        rest = [i for i in range(lo, hi + 1) if i not in members]
+        if len(members) == 1:
+            return f"{value} == {members[0]}"
+        if len(rest) == 1:
+            return f"{value} != {rest[0]}"
+        if members[-1] - members[0] == len(members) - 1:
+            if members[0] == lo:
+                return f"{value} <= {members[-1]}"
+            if members[-1] == hi:
+                return f"{value} >= {members[0]}"
+        if lo >= 0 and hi < 31:
+            bits = sum(1 << i for i in members)
+            return f"(({self.constant(bits)} >> {value}) & 1) != 0"
+        table = tuple(int(i in members) for i in range(lo, hi + 1))
+        return f"{self.constant(table)}[({value} - {lo}).long()] != 0"
+
+
+def _significant_bits(pass_: PassGraph) -> dict[str, int]:
+    """How many bits of each stream the pass needs: all of them, unless every limit is a constant."""
+    needed: dict[str, int] = {}
+    for node in nodes_of(pass_):
+        if node.op not in ("below", "draw"):
+            continue
+        stream, bits = node.attr  # type: ignore[misc]
+        limit = int(node.args[0].attr) if node.op == "below" and node.args[0].op == "const" else None  # type: ignore[call-overload]
+        trailing = (limit & -limit).bit_length() - 1 if limit else 0
+        own = bits - min(trailing, bits - 1) if limit is not None else bits
+        needed[stream] = max(needed.get(stream, 1), own)
+    return needed
+
+
+def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, object]]:
+    """Source, function name and constants of a pass. `number` makes the name unique."""
+    writer = _Writer(_significant_bits(pass_))
+    place = ""
+    nodes = nodes_of(pass_, moments=False)
+    for node in nodes:
+        if node.places and node.places[0] != place:
+            place = node.places[0]
+            writer.lines.append(f"# {_comment(place)}")
+        writer.node(node)
+    name = f"pass_{number}"
+    returned = ", ".join(f"{slot!r}: k.full({writer.names[id(node)]})" for slot, node in pass_.outputs)
+    lines = _with_deletions(writer.lines, returned)
+    body = [f"def {name}(k, state):", *(f"    {line}" for line in lines), f"    return {{{returned}}}"]
+    header = [f"# {_comment(pass_.name)}"] + [f"# {key} = {value}" for key, value in writer.constants.items()]
+    return "\n".join(header + body) + "\n", name, writer.constants
+
+
+def _with_deletions(lines: list[str], returned: str) -> list[str]:
+    """The lines with `del` after the last use of each plane: a large world needs few planes at once, not all."""
+    live = set(_PLANE.findall(returned))
+    result: list[str] = []
+    for line in reversed(lines):
+        used = [] if line.startswith("#") else _PLANE.findall(line)
+        dead = sorted(set(used[1:]) - live)
+        if dead:
+            result.append(f"del {', '.join(dead)}")
+        live |= set(used)
+        result.append(line)
+    return result[::-1]
+
+
+_PLANE = re.compile(r"\b[ns][0-9]+\b")
+
+
+def _comment(text: str) -> str:
+    """File names come from outside: nothing in them may end the comment."""
+    return "".join(char if char.isprintable() and ord(char) < 128 else "?" for char in text)

@@ -1,0 +1,84 @@
+"""The group of commands. Names and summaries stand in one table, so that `--help` imports nothing else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any, NoReturn
+
+import click
+
+from powderdsl import __version__
+from powderdsl.cli.exits import report_failure
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    # name: (module in powderdsl.cli, summary)
+    "run": ("run_command", "Run rules on a world: watch it, or write a picture, an animation, a saved world."),
+    "check": ("check_command", "Find the mistakes in rule files, all at once."),
+    "compile": ("compile_command", "Print what a stage of the compiler makes of rules."),
+    "show": ("show_command", "List elements, reactions, passes and parameters."),
+    "test": ("test_command", "Run the tests that stand in packs."),
+    "new": ("new_command", "Write a first pack: an element, a rule and a test."),
+    "render": ("render_command", "Draw a world as a picture, without running it."),
+    "explain": ("explain_command", "Say what a diagnostic code means, and how to mend it."),
+}
+
+
+class CommandGroup(click.Group):
+    """Imports commands late, suggests one for an unknown name, and turns every failure into an exit code."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = import_module(f"powderdsl.cli.{COMMANDS[cmd_name][0]}").command
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            from powderdsl.diagnostics import suggest
+
+            ctx.fail("; ".join([f"no command `{args[0]}`", *suggest(args[0], COMMANDS, "commands")]))
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+
+    def main(
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **options: Any
+    ) -> NoReturn:
+        """Run a command and exit: 0 done, 1 something failed, 2 bad input, 70 our own mistake, 130 interrupted."""
+        # A terminal that lacks a character shows a `?` in its place.
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="replace")
+        options["standalone_mode"] = False
+        try:
+            status = super().main(args, prog_name or "powderdsl", *rest, **options)
+        except (Exception, KeyboardInterrupt) as error:
+            status = report_failure(error)
+        sys.exit(status or 0)
+
+
+@click.group(
+    cls=CommandGroup,
+    name="powderdsl",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(__version__, prog_name="powderdsl", message="%(prog)s %(version)s")
+def main() -> None:
+    """Physics as data, compiled to tensor kernels.
+
+    RULES names rules everywhere: a shipped ruleset or pack, a rule file, or several of them joined by `+`;
+    what stands behind a `-` is left out.
+
+    \b
+        powderdsl run RULES --watch
+        powderdsl new NAME && powderdsl check core+NAME.yaml
+    """

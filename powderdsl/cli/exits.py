@@ -1,0 +1,111 @@
+"""How commands end: exit codes, and what people read when something went wrong. Never a traceback for bad input."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import IO, TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from powderdsl.diagnostics import Diagnostic
+
+OK = 0
+FAILED = 1
+"""A command did its work and the answer is no: a test failed, a warning counts as an error."""
+BAD_INPUT = 2
+INTERNAL = 70
+"""Our own mistake (EX_SOFTWARE of sysexits.h)."""
+INTERRUPTED = 130
+
+
+class BadInput(click.ClickException):
+    """Something that a user gave cannot be used; one line says what."""
+
+    exit_code = BAD_INPUT
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        click.echo(f"error: {self.format_message()}", file=file, err=file is None)
+
+
+@contextmanager
+def user_values() -> Iterator[None]:
+    """What the Python API says about bad values, as one line: for calls that hand on what a user gave."""
+    try:
+        yield
+    except (ValueError, TypeError, KeyError) as error:
+        # str() of a KeyError is the repr of its message.
+        words = error.args[0] if isinstance(error, KeyError) and error.args else error
+        raise BadInput(" ".join(str(words).split())) from error
+
+
+def colour_wanted(stream: IO[Any]) -> bool:
+    """Colour only on a terminal that has it, and without NO_COLOR (https://no-color.org)."""
+    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> None:
+    """Full texts with carets, an empty line between two."""
+    from powderdsl.diagnostics.render import render_text
+
+    colour = colour_wanted(stream)
+    stream.write("\n\n".join(render_text(one, colour=colour) for one in diagnostics) + "\n")
+
+
+def counted(number: int, thing: str) -> str:
+    """`no errors`, `1 error`, `2 errors`."""
+    return f"{number or 'no'} {thing}{'' if number == 1 else 's'}"
+
+
+def report_failure(error: BaseException) -> int:
+    """Say on stderr what ended a command; the exit code."""
+    from powderdsl.diagnostics import CompileError
+
+    match error:
+        case click.Abort() | KeyboardInterrupt():
+            return INTERRUPTED
+        case click.ClickException():
+            error.show()
+            return BAD_INPUT
+        case CompileError():
+            write_diagnostics(error.diagnostics, sys.stderr)
+            if len(error.diagnostics) > 1:
+                click.echo(f"\n{counted(len(error.diagnostics), 'error')}", err=True)
+            return BAD_INPUT
+        case OSError():
+            file = f"{error.filename}: " if error.filename else ""
+            click.echo(f"error: {file}{error.strerror or error}", err=True)
+            return BAD_INPUT
+    if isinstance(error, MemoryError) or "memory" in str(error) and isinstance(error, RuntimeError):
+        click.echo("error: not enough memory for so many cells: fewer worlds or smaller ones may fit", err=True)
+        return BAD_INPUT
+    _report_internal(error)
+    return INTERNAL
+
+
+def _report_internal(error: BaseException) -> None:
+    import platform
+
+    from powderdsl import __version__
+    from powderdsl.diagnostics import Diagnostic, Label
+
+    if os.environ.get("POWDERDSL_DEBUG") == "1":
+        import traceback
+
+        traceback.print_exception(error)
+    words = " ".join(str(error).split())[:300]
+    system = f"powderdsl {__version__}, Python {platform.python_version()}, {platform.system()}"
+    diagnostic = Diagnostic(
+        "PD901",
+        f"a mistake in powderdsl itself: {type(error).__name__}{': ' if words else ''}{words}",
+        Label(None),
+        notes=(system,),
+        helps=(
+            "please report it, with the command and the files it was given",
+            "POWDERDSL_DEBUG=1 shows where it happened",
+        ),
+    )
+    write_diagnostics([diagnostic], sys.stderr)

@@ -1,0 +1,40 @@
+"""`powderdsl explain`: the page of a diagnostic code, or the list of all codes."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from powderdsl.cli.exits import BadInput, colour_wanted
+from powderdsl.diagnostics.codes import CODES
+from powderdsl.diagnostics.explain import find_code, page, similar
+
+PAGE_WIDTH = 100
+
+
+@click.command("explain")
+@click.argument("code", required=False)
+def command(code: str | None) -> None:
+    """Say what a diagnostic code means, and how to mend it.
+
+    CODE is a code such as PD301, or its name such as unknown-name. Without one, all codes are listed.
+    """
+    if code is None:
+        for row in CODES.values():
+            click.echo(f"{row.code}  {row.severity.value:<7}  {row.slug}")
+        return
+    found = find_code(code)
+    if found is None:
+        close = similar(code)
+        cure = f"did you mean {', '.join(close)}?" if close else "`powderdsl explain` lists all codes"
+        raise BadInput(f"no code `{code}`; {cure}")
+    text = page(found)
+    if not colour_wanted(sys.stdout):
+        click.echo(text.rstrip("\n"))
+        return
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    console = Console()
+    console.print(Markdown(text), width=min(console.width, PAGE_WIDTH))

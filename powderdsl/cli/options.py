@@ -1,0 +1,97 @@
+"""Arguments and options that several commands share, and what their values mean."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from powderdsl.cli.exits import counted
+from powderdsl.compiler import BACKENDS, load_with_diagnostics
+from powderdsl.diagnostics import Severity
+
+if TYPE_CHECKING:
+    from powderdsl.model.types import Ruleset
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+
+MAX_SIDE = 1 << 24
+"""Rows or columns of a world; how many cells it may have is the worlds' business."""
+
+
+class SizeType(click.ParamType):
+    """`48x64`: rows and columns; `64`: as many of both."""
+
+    name = "HxW"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"([0-9]{1,8})(?:[xX×]([0-9]{1,8}))?", str(value))
+        if match is None:
+            self.fail(f"`{value}` is no size: write ROWSxCOLUMNS, such as 48x64", param, ctx)
+        rows, columns = int(match[1]), int(match[2] or match[1])
+        if not (1 <= rows <= MAX_SIDE and 1 <= columns <= MAX_SIDE):
+            self.fail(f"`{value}`: a world has at least one row and one column", param, ctx)
+        return rows, columns
+
+
+def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    """`pack.param=VALUE` options as a mapping; the checked model knows which names and values are right."""
+    found = {}
+    for value in values:
+        name, equals, text = value.partition("=")
+        if not equals or not name.strip() or not text.strip():
+            raise click.BadParameter(f"`{value}`: write pack.param=VALUE", ctx, param)
+        found[name.strip()] = text.strip()
+    return found
+
+
+def rules_argument(function: Decorated) -> Decorated:
+    """RULES: what `powderdsl.load` takes."""
+    return click.argument("rules", metavar="RULES")(function)
+
+
+def set_option(function: Decorated) -> Decorated:
+    return click.option(
+        "--set",
+        "settings",
+        multiple=True,
+        metavar="PACK.PARAM=VALUE",
+        callback=_settings,
+        help="Another value for a parameter of the rules, such as 5%. May be repeated.",
+    )(function)
+
+
+def backend_option(default: str) -> Callable[[Decorated], Decorated]:
+    return click.option(
+        "--backend", type=click.Choice(BACKENDS), default=default, show_default=True, help="What runs the rules."
+    )
+
+
+def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
+    """The checked model of RULES with `--set` values; how many warnings there are goes to stderr."""
+    ruleset, remarks = load_with_diagnostics(rules, params=settings)
+    warnings = sum(one.severity is Severity.WARNING for one in remarks)
+    if warnings:
+        click.echo(f"{counted(warnings, 'warning')}: powderdsl check {rules}", err=True)
+    return ruleset
+
+
+def check_writable(path: Path) -> None:
+    """Fail before long work if a file cannot be written. Raises CompileError (PD613)."""
+    from powderdsl.worlds.files import failure
+
+    folder = path.parent
+    if path.is_dir():
+        raise failure("PD613", f"cannot write {path}", notes=("it is a folder",))
+    if not folder.is_dir():
+        raise failure("PD613", f"cannot write {path}", notes=(f"there is no folder {folder}",))
+    if not os.access(folder, os.W_OK):
+        raise failure("PD613", f"cannot write {path}", notes=(f"the folder {folder} is not writable",))

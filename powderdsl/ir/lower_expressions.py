@@ -1,0 +1,401 @@
+"""Typed expressions -> IR nodes. Draws become comparisons of whole numbers with exact thresholds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from math import ceil, floor
+
+from powderdsl.ir.build import Builder
+from powderdsl.ir.ops import FLAG, REAL, Node, whole
+from powderdsl.model.state import Slot
+from powderdsl.model.types import Expr, Kernel, Property, Ruleset
+
+Pair = tuple[Node, Node]
+"""A vector: its row and column planes."""
+
+NEAR, FAR = 0.92387953251128674, 0.38268343236508977
+"""cos(π/8) and cos(3π/8), where octants end."""
+
+
+@dataclass
+class Planes:
+    """What expressions read: the current node of each slot, and lets."""
+
+    ruleset: Ruleset
+    build: Builder
+    state: dict[str, Node]
+    lets: dict[str, Node | Pair]
+    slots: dict[str, Slot]
+
+    def property_of(self, prop: Property, element: Node) -> Node:
+        """A property of given elements; values that are parameters are chosen one by one."""
+        build = self.build
+        if any(isinstance(v, str) for v in prop.values):
+            view = "value"
+            numbers: list[Node] = []
+            for value in prop.values:
+                if isinstance(value, str):
+                    numbers.append(param_node(self, value, view))
+                elif prop.kind.name == "flag":
+                    numbers.append(build.flag(bool(value)))
+                else:
+                    numbers.append(build.whole(int(value)))  # type: ignore[arg-type]
+            return self.by_element(element, numbers)
+        if prop.kind.name == "flag":
+            return build.in_set(element, frozenset(i for i, v in enumerate(prop.values) if v))
+        return build.table(element, tuple(int(v) for v in prop.values))  # type: ignore[arg-type]
+
+    def by_element(self, element: Node, values: list[Node]) -> Node:
+        """The value that belongs to the element: one select a distinct value."""
+        groups: dict[int, tuple[Node, set[int]]] = {}
+        for identity, value in enumerate(values):
+            groups.setdefault(value.index, (value, set()))[1].add(identity)
+        ordered = sorted(groups.values(), key=lambda group: -len(group[1]))
+        result = ordered[0][0]
+        for value, ids in ordered[1:]:
+            result = self.build.select(self.build.in_set(element, frozenset(ids)), value, result)
+        return result
+
+
+def lower_expression(expr: Expr, at: Planes) -> Node | Pair:
+    """The node of a checked expression; a pair for vectors."""
+    return _LOWER[expr.op](expr, at)
+
+
+def node(expr: Expr, at: Planes) -> Node:
+    lowered = lower_expression(expr, at)
+    assert isinstance(lowered, Node)
+    return lowered
+
+
+def pair(expr: Expr, at: Planes) -> Pair:
+    lowered = lower_expression(expr, at)
+    assert not isinstance(lowered, Node)
+    return lowered
+
+
+def param_node(at: Planes, name: str, view: str) -> Node:
+    param = next(p for p in at.ruleset.params if p.name == name)
+    if view.startswith(("lt", "le")):
+        return at.build.make("param", whole(0, 1 << int(view[2:])), attr=(name, view))
+    type = {"flag": FLAG, "int": whole(int(param.kind.lo), int(param.kind.hi))}.get(param.kind.name, REAL)
+    return at.build.make("param", type, attr=(name, view))
+
+
+def _const(expr: Expr, at: Planes) -> Node:
+    build = at.build
+    match expr.kind.name:
+        case "flag":
+            return build.flag(bool(expr.value))
+        case "real" | "chance" | "number":
+            return build.real(_float32(expr.value))
+    return build.whole(int(expr.value))  # type: ignore[call-overload,no-any-return]
+
+
+def _float32(value: object) -> float:
+    """A constant as the float32 it is rounded to, going through float64 as the reference does."""
+    from struct import pack, unpack
+
+    rounded: float = unpack("f", pack("f", float(value)))[0]  # type: ignore[arg-type]
+    return rounded
+
+
+def _property(expr: Expr, at: Planes) -> Node:
+    prop = at.ruleset.property(str(expr.value))
+    assert prop is not None
+    if prop.stored:
+        return at.state[prop.name]
+    if prop.kind.name == "chance":
+        return _chance_real(expr, at)
+    return at.property_of(prop, at.state["element"])
+
+
+def _slot(name: str, at: Planes) -> Node | Pair:
+    if at.slots[name].planes == 2:
+        return at.state[f"{name}.row"], at.state[f"{name}.column"]
+    return at.state[name]
+
+
+def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
+    """Apply to numbers, or to both parts of vectors; numbers beside vectors serve both parts."""
+    if all(isinstance(value, Node) for value in values):
+        return function(*values)
+    rows = [value if isinstance(value, Node) else value[0] for value in values]
+    columns = [value if isinstance(value, Node) else value[1] for value in values]
+    return function(*rows), function(*columns)
+
+
+def _look(expr: Expr, at: Planes) -> Node | Pair:
+    offset = expr.value
+    return _each(lambda a: at.build.shift(a, offset), lower_expression(expr.args[0], at))  # type: ignore[arg-type]
+
+
+def _arithmetic(expr: Expr, at: Planes) -> Node | Pair:
+    args = [lower_expression(arg, at) for arg in expr.args]
+    return _each(lambda a, b: at.build.arithmetic(expr.op, a, b), *args)
+
+
+def _divide(expr: Expr, at: Planes) -> Node | Pair:
+    args = [lower_expression(arg, at) for arg in expr.args]
+    return _each(lambda a, b: at.build.make("div", REAL, a, b), *args)
+
+
+def _member(expr: Expr, at: Planes) -> Node:
+    return at.build.in_set(node(expr.args[0], at), expr.value)  # type: ignore[arg-type]
+
+
+def _logic(expr: Expr, at: Planes) -> Node:
+    return at.build.make(expr.op, FLAG, *(node(arg, at) for arg in expr.args))
+
+
+def _to_real(expr: Expr, at: Planes) -> Node:
+    argument = expr.args[0]
+    if argument.kind.name == "draw":
+        return _draw_real(argument, at)
+    if argument.kind.name == "chance":
+        return _chance_real(argument, at)
+    return at.build.to_real(node(argument, at))
+
+
+def _draw_real(expr: Expr, at: Planes) -> Node:
+    """A draw as float32. Sums with whole numbers are rounded after each addition."""
+    if expr.op == "draw":
+        return at.build.make("draw", REAL, attr=_stream(expr, at))
+    parts = [_draw_real(a, at) if a.kind.name == "draw" else at.build.to_real(node(a, at)) for a in expr.args]
+    if expr.op == "look":
+        return at.build.shift(parts[0], expr.value)  # type: ignore[arg-type]
+    return at.build.arithmetic(expr.op, parts[0], parts[1])
+
+
+def _chance_real(expr: Expr, at: Planes) -> Node:
+    """A chance as float32."""
+    build = at.build
+    match expr.op:
+        case "const":
+            return build.real(_float32(expr.value))
+        case "param":
+            return param_node(at, str(expr.value), "value")
+        case "look":
+            return build.shift(_chance_real(expr.args[0], at), expr.value)  # type: ignore[arg-type]
+        case "choose":
+            return build.select(node(expr.args[0], at), _chance_real(expr.args[1], at), _chance_real(expr.args[2], at))
+        case "let":
+            value = at.lets[str(expr.value)]
+            assert isinstance(value, Node)
+            return value
+    prop = at.ruleset.property(str(expr.value))
+    assert prop is not None
+    values = [param_node(at, v, "value") if isinstance(v, str) else build.real(_float32(v)) for v in prop.values]
+    return at.by_element(at.state["element"], values)
+
+
+# Draws
+
+
+def _stream(expr: Expr, at: Planes) -> tuple[str, int]:
+    stream = next(s for s in at.ruleset.streams if s.name == expr.value)
+    return stream.name, stream.bits
+
+
+def _split_draw(expr: Expr, at: Planes) -> tuple[Expr, tuple[int, int], Node | None]:
+    """A draw expression as (draw, where it is read, whole number added to it)."""
+    if expr.op == "draw":
+        return expr, (0, 0), None
+    if expr.op == "look":
+        draw, (dy, dx), extra = _split_draw(expr.args[0], at)
+        oy, ox = expr.value  # type: ignore[misc]
+        return draw, (dy + oy, dx + ox), at.build.shift(extra, (oy, ox)) if extra else None
+    left, right = expr.args
+    if left.kind.name == "draw":
+        draw, offset, extra = _split_draw(left, at)
+        other = node(right, at)
+        other = at.build.neg(other) if expr.op == "sub" else other
+    else:
+        draw, offset, extra = _split_draw(right, at)
+        other = node(left, at)
+    return draw, offset, at.build.arithmetic("add", extra, other) if extra else other
+
+
+def threshold(chance: Fraction | float, bits: int, mode: str) -> int:
+    """How many of the 2^bits draws lie below a chance (`lt`), or not above it (`le`)."""
+    scaled = Fraction(float(chance)) * (1 << bits) - Fraction(1, 2)
+    count = ceil(scaled) if mode == "lt" else floor(scaled) + 1
+    return min(max(count, 0), 1 << bits)
+
+
+def _threshold_node(chance: Expr, bits: int, mode: str, at: Planes) -> Node:
+    build = at.build
+    match chance.op:
+        case "const":
+            return build.whole(threshold(chance.value, bits, mode))  # type: ignore[arg-type]
+        case "param":
+            return param_node(at, str(chance.value), f"{mode}{bits}")
+        case "look":
+            return build.shift(_threshold_node(chance.args[0], bits, mode, at), chance.value)  # type: ignore[arg-type]
+        case "choose":
+            yes, no = (_threshold_node(arg, bits, mode, at) for arg in chance.args[1:])
+            return build.select(node(chance.args[0], at), yes, no)
+    prop = at.ruleset.property(str(chance.value))
+    assert prop is not None and chance.op == "property"
+    values = [
+        param_node(at, v, f"{mode}{bits}") if isinstance(v, str) else build.whole(threshold(v, bits, mode))  # type: ignore[arg-type]
+        for v in prop.values
+    ]
+    return at.by_element(at.state["element"], values)
+
+
+def _lt(expr: Expr, at: Planes) -> Node:
+    left, right = expr.args
+    if "draw" not in (left.kind.name, right.kind.name):
+        return _compare(expr, at)
+    # draw + extra < other, or other < draw + extra, which is the opposite of draw + extra <= other
+    build = at.build
+    flipped = right.kind.name == "draw"
+    mode = "le" if flipped else "lt"
+    draw, offset, extra = _split_draw(right if flipped else left, at)
+    other = left if flipped else right
+
+    def below(limit: Node) -> Node:
+        found = build.make("below", FLAG, build.shift(limit, (-offset[0], -offset[1])), attr=_stream(draw, at))
+        return build.shift(found, offset)
+
+    bits = _stream(draw, at)[1]
+    if other.kind.name == "int":
+        whole_part = node(other, at)
+        extra = extra or build.whole(0)
+        result = build.compare("lt", extra, whole_part)
+    elif isinstance(other.value, (int, Fraction)) and other.op == "const":
+        base = floor(other.value)
+        part = below(build.whole(threshold(Fraction(other.value) - base, bits, mode)))
+        if extra is None:
+            result = part if base == 0 else build.flag(base > 0)
+        else:
+            at_base = build.compare("eq", extra, build.whole(base))
+            result = build.or_(build.compare("lt", extra, build.whole(base)), build.and_(at_base, part))
+    else:
+        part = below(_threshold_node(other, bits, mode, at))
+        if extra is None:
+            result = part
+        else:
+            zero = build.whole(0)
+            result = build.or_(build.compare("lt", extra, zero), build.and_(build.compare("eq", extra, zero), part))
+    return build.not_(result) if flipped else result
+
+
+def _compare(expr: Expr, at: Planes) -> Node:
+    a, b = (node(arg, at) for arg in expr.args)
+    if a.type == FLAG:
+        return at.build.not_(at.build.make("xor", FLAG, a, b))
+    return at.build.compare(expr.op, a, b)
+
+
+# Neighbourhoods and vectors
+
+
+def _count(expr: Expr, at: Planes) -> Node:
+    kernel = expr.value
+    assert isinstance(kernel, Kernel)
+    type = whole(int(expr.kind.lo), int(expr.kind.hi))
+    return at.build.make("count", type, node(expr.args[0], at), attr=(kernel.weights, kernel.wrap))
+
+
+def _sum(expr: Expr, at: Planes) -> Node | Pair:
+    kernel = expr.value
+    assert isinstance(kernel, Kernel)
+    return _each(lambda a: _neighbourhood(a, kernel, at.build), lower_expression(expr.args[0], at))
+
+
+def _neighbourhood(value: Node, kernel: Kernel, build: Builder) -> Node:
+    """The weighted sum, each row from the left, then the rows from the top. Equal rows are summed once and shifted."""
+    rows: dict[int, list[tuple[int, int]]] = {}
+    for dy, dx, weight in kernel.weights:
+        rows.setdefault(dy, []).append((dx, weight))
+    total: Node | None = None
+    for dy, cells in rows.items():
+        row: Node | None = None
+        for dx, weight in cells:
+            term = build.shift(value, (0, dx), kernel.wrap)
+            if weight != 1:
+                factor = build.real(float(weight)) if value.type == REAL else build.whole(weight)
+                term = build.arithmetic("mul", term, factor)
+            row = term if row is None else build.arithmetic("add", row, term)
+        assert row is not None
+        row = build.shift(row, (dy, 0), kernel.wrap)
+        total = row if total is None else build.arithmetic("add", total, row)
+    return total if total is not None else build.const(0, value.type)
+
+
+def _length(vector: Pair, build: Builder) -> Node:
+    y, x = vector
+    squares = build.arithmetic("add", build.arithmetic("mul", y, y), build.arithmetic("mul", x, x))
+    return build.make("sqrt", REAL, squares)
+
+
+def _octant(expr: Expr, at: Planes) -> Node:
+    """The octant, by comparing x with the borders of the octants at this length."""
+    build = at.build
+    y, x = pair(expr.args[0], at)
+    reach = build.arithmetic("add", _length((y, x), build), build.real(_float32(0.001)))
+    near = build.arithmetic("mul", build.real(_float32(NEAR)), reach)
+    far = build.arithmetic("mul", build.real(_float32(FAR)), reach)
+    up = build.compare("lt", y, build.real(0.0))
+    result: Node = build.whole(4)
+    borders = (near, far, build.neg(far), build.neg(near))
+    for octant in (3, 2, 1, 0):
+        mirrored = build.select(up, build.whole((8 - octant) % 8), build.whole(octant))
+        result = build.select(build.compare("lt", borders[octant], x), mirrored, result)
+    return result
+
+
+def _vector(expr: Expr, at: Planes) -> Pair:
+    return node(expr.args[0], at), node(expr.args[1], at)
+
+
+def _choose(expr: Expr, at: Planes) -> Node | Pair:
+    if expr.kind.name == "chance":
+        return _chance_real(expr, at)
+    condition = node(expr.args[0], at)
+    values = [lower_expression(arg, at) for arg in expr.args[1:]]
+    return _each(lambda a, b: at.build.select(condition, a, b), *values)
+
+
+_LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
+    "const": _const,
+    "param": lambda e, at: param_node(at, str(e.value), "value"),
+    "element": lambda e, at: at.state["element"],
+    "property": _property,
+    "field": lambda e, at: _slot(str(e.value), at),
+    "let": lambda e, at: at.lets[str(e.value)],
+    "draw": _draw_real,
+    "coordinate": lambda e, at: at.build.make("coordinate", whole(int(e.kind.lo), int(e.kind.hi)), attr=e.value),  # type: ignore[arg-type]
+    "inside": lambda e, at: at.build.make("inside", FLAG, attr=e.value),  # type: ignore[arg-type]
+    "look": _look,
+    "member": _member,
+    "not": _logic,
+    "and": _logic,
+    "or": _logic,
+    "eq": _compare,
+    "lt": _lt,
+    "le": _compare,
+    "add": _arithmetic,
+    "sub": _arithmetic,
+    "mul": _arithmetic,
+    "min": _arithmetic,
+    "max": _arithmetic,
+    "div": _divide,
+    "neg": lambda e, at: _each(at.build.neg, lower_expression(e.args[0], at)),
+    "abs": lambda e, at: at.build.abs(node(e.args[0], at)),
+    "mod": lambda e, at: at.build.mod(node(e.args[0], at), e.value),  # type: ignore[arg-type]
+    "to_real": _to_real,
+    "count": _count,
+    "sum": _sum,
+    "choose": _choose,
+    "octant": _octant,
+    "length": lambda e, at: _length(pair(e.args[0], at), at.build),
+    "row_part": lambda e, at: pair(e.args[0], at)[0],
+    "column_part": lambda e, at: pair(e.args[0], at)[1],
+    "vector": _vector,
+}
+"""One lowering for every operation of the model."""

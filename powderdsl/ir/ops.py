@@ -1,0 +1,196 @@
+"""The IR: one immutable, interned node; one table of operations; programs made of moments.
+
+Values are planes over the grid, one a world: flags, whole numbers with a declared range, or float32. There is no
+control flow inside a step. Equal nodes of one graph are the same object, so common sub-expressions are free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass, field
+
+Offset = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Type:
+    """``flag``, ``int`` (lo..hi, inclusive) or ``real`` (float32)."""
+
+    name: str
+    lo: int = 0
+    hi: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.lo}..{self.hi}" if self.name == "int" else self.name
+
+
+FLAG, REAL = Type("flag", 0, 1), Type("real")
+
+
+def whole(lo: int, hi: int) -> Type:
+    return Type("int", lo, hi)
+
+
+@dataclass(frozen=True)
+class Op:
+    """A row of the table: argument types (`?` any, `=` all alike), result, what `attr` is."""
+
+    name: str
+    args: tuple[str, ...]
+    result: str
+    attr: str = ""
+    about: str = ""
+
+
+OPS: dict[str, Op] = {
+    op.name: op
+    for op in (
+        # where values come from
+        Op("input", (), "?", "slot", "what the pass finds in a slot"),
+        Op("const", (), "?", "value", "the same everywhere"),
+        Op("param", (), "?", "(name, view)", "one number a world; view: `value`, or a chance as a threshold for draws"),
+        Op("coordinate", (), "int", "(row | column | step, modulus)"),
+        Op("inside", (), "flag", "offset", "whether that neighbour lies inside the grid"),
+        Op("below", ("int",), "flag", "(stream, bits)", "whether the stream's draw k is less than the argument"),
+        Op("draw", (), "real", "(stream, bits)", "(k + ½) / 2^bits, rounded to float32"),
+        # neighbours
+        Op("shift", ("?",), "=", "(rows, columns, wraps)", "the value at a neighbour; zero outside unless it wraps"),
+        Op("count", ("flag",), "int", "((rows, columns, weight)…, wraps)", "weighted number of neighbours that hold"),
+        # flags
+        Op("not", ("flag",), "flag"),
+        Op("and", ("flag", "flag"), "flag"),
+        Op("or", ("flag", "flag"), "flag"),
+        Op("xor", ("flag", "flag"), "flag"),
+        # whole numbers and reals
+        Op("in_set", ("int",), "flag", "frozen set", "whether the value is one of these"),
+        Op("table", ("int",), "int", "values by index, from 0"),
+        Op("eq", ("=", "="), "flag"),
+        Op("lt", ("=", "="), "flag"),
+        Op("le", ("=", "="), "flag"),
+        Op("add", ("=", "="), "="),
+        Op("sub", ("=", "="), "="),
+        Op("mul", ("=", "="), "="),
+        Op("div", ("real", "real"), "real", about="x / 0 is 0"),
+        Op("neg", ("?",), "="),
+        Op("abs", ("?",), "="),
+        Op("min", ("=", "="), "="),
+        Op("max", ("=", "="), "="),
+        Op("mod", ("int",), "int", "modulus"),
+        Op("sqrt", ("real",), "real"),
+        Op("to_real", ("?",), "real"),
+        Op("settle", ("real",), "real", "(low, high)", "not a number → 0, cut off at the bounds, smaller than SNAP → 0"),
+        # choices and movements
+        Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),
+        Op("swap", ("=", "flag", "="), "=", "offset", "(content, movers, rest): movers and their targets exchanged"),
+        Op("arrive", ("=", "flag", "="), "=", "offset", "(content, movers, rest): targets get the movers' content"),
+    )
+}
+"""Every operation of the IR."""
+
+COMMUTATIVE = frozenset({"and", "or", "xor", "eq", "add", "mul", "min", "max"})
+LEAVES = frozenset({"input", "const", "param", "coordinate", "inside", "draw"})
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """An operation on nodes. Made by `Graph.node` only; identity is equality within a graph."""
+
+    op: str
+    type: Type
+    args: tuple[Node, ...]
+    attr: Hashable
+    index: int
+    places: tuple[str, ...] = field(default=(), repr=False)
+    """Where it was written: ``rules/sand.yaml:12``. Takes no part in interning."""
+
+
+class Graph:
+    """Makes and interns nodes. Reals commute only where rounding allows: their order is kept."""
+
+    def __init__(self) -> None:
+        self._nodes: dict[Hashable, Node] = {}
+
+    def node(self, op: str, type: Type, args: tuple[Node, ...] = (), attr: Hashable = None, places: tuple[str, ...] = ()) -> Node:
+        if op in COMMUTATIVE and args[0].type != REAL and args[0].index > args[1].index:
+            args = (args[1], args[0])
+        # A const's type keeps 1 and 1.0 and True apart; -0.0 never arises as a constant.
+        key = (op, type.name, tuple(arg.index for arg in args), attr)
+        found = self._nodes.get(key)
+        if found is None:
+            found = Node(op, type, args, attr, len(self._nodes), places)
+            self._nodes[key] = found
+        return found
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one moment writes: the new node of each slot, and the flags without which nothing changes."""
+
+    label: str
+    place: str
+    writes: tuple[tuple[str, Node], ...]
+    guards: tuple[Node, ...]
+
+
+@dataclass(frozen=True)
+class PassGraph:
+    """A pass: moments in order. Nodes read slots through `input`, or the nodes that earlier moments wrote."""
+
+    name: str
+    pack: str
+    moments: tuple[Step, ...]
+    outputs: tuple[tuple[str, Node], ...]
+    """The last node of every slot that the pass changes."""
+
+
+@dataclass(frozen=True)
+class SlotType:
+    """A slot of the state: vectors are two slots, ``name.row`` and ``name.column``."""
+
+    name: str
+    type: Type
+    default: int | float
+    resets: bool
+
+
+@dataclass(frozen=True)
+class Program:
+    """A ruleset in IR."""
+
+    name: str
+    slots: tuple[SlotType, ...]
+    params: tuple[tuple[str, str], ...]
+    """Qualified name and kind."""
+    streams: tuple[tuple[str, int, int], ...]
+    """Name, number in the hash, bits."""
+    passes: tuple[PassGraph, ...]
+
+
+def nodes_of(pass_: PassGraph, *, moments: bool = True) -> list[Node]:
+    """All nodes that a pass needs, arguments before their users, in a stable order."""
+    seen: dict[int, Node] = {}
+    roots = [node for _, node in pass_.outputs]
+    if moments:
+        roots = [node for step in pass_.moments for _, node in step.writes] + roots
+    for root in roots:
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if ready:
+                seen.setdefault(id(node), node)
+            elif id(node) not in seen:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(node.args))
+    return list(seen.values())
+
+
+def walk(node: Node) -> Iterator[Node]:
+    """A node and everything below it, each once."""
+    seen: set[int] = set()
+    stack = [node]
+    while stack:
+        top = stack.pop()
+        if id(top) not in seen:
+            seen.add(id(top))
+            yield top
+            stack.extend(top.args)

@@ -1,0 +1,125 @@
+"""Questions about properties become questions about elements: densities vanish, sets of ids remain."""
+
+from __future__ import annotations
+
+from powderdsl.ir.build import Builder
+from powderdsl.ir.ops import Node, PassGraph, walk
+from powderdsl.ir.rewrite import Rewrite, rebuild, rewrite_pass
+
+MAX_VALUES = 16
+
+
+def _table_compare(node: Node, build: Builder) -> Node | None:
+    """table(x) < c = x in {i : table[i] < c}; between two tables, one such pair for each value of the first."""
+    if node.op not in ("eq", "lt", "le") or node.args[0].type.name != "int":
+        return None
+    a, b = node.args
+    holds = {"eq": lambda p, q: p == q, "lt": lambda p, q: p < q, "le": lambda p, q: p <= q}[node.op]
+    if a.op == "table" and b.op == "const":
+        return _where(a, lambda v: holds(v, b.attr), build)
+    if b.op == "table" and a.op == "const":
+        return _where(b, lambda v: holds(a.attr, v), build)
+    if a.op == "table" and b.op == "table":
+        values = sorted(set(_values(a)))
+        if len(values) <= MAX_VALUES:
+            parts = [
+                build.and_(_where(a, lambda v, x=x: v == x, build), _where(b, lambda v, x=x: holds(x, v), build))  # type: ignore[misc]
+                for x in values
+            ]
+            return build.any(parts)
+    small = a if b.op == "const" else b if a.op == "const" else None
+    if small is not None and small.type.lo >= 0 and small.type.hi < 64 and _is_identity(small):
+        # element == 3 = element in {3}
+        ids = range(small.type.lo, small.type.hi + 1)
+        if b.op == "const":
+            return build.in_set(small, frozenset(i for i in ids if holds(i, b.attr)))
+        return build.in_set(small, frozenset(i for i in ids if holds(a.attr, i)))
+    return None
+
+
+def _is_identity(node: Node) -> bool:
+    """Whether a node is an element id as stored somewhere, which sets of ids suit best."""
+    while node.op == "shift":
+        node = node.args[0]
+    return node.op == "input" and node.attr == "element"
+
+
+def _values(table: Node) -> tuple[int, ...]:
+    index = table.args[0]
+    values = table.attr
+    assert isinstance(values, tuple)
+    return values[max(index.type.lo, 0) : index.type.hi + 1]
+
+
+def _where(table: Node, holds, build: Builder) -> Node:  # type: ignore[no-untyped-def]
+    values = table.attr
+    assert isinstance(values, tuple)
+    return build.in_set(table.args[0], frozenset(i for i, v in enumerate(values) if holds(v)))
+
+
+def _table_of_constant(node: Node, build: Builder) -> Node | None:
+    if node.op == "table" and node.args[0].op == "const":
+        return build.whole(node.attr[node.args[0].attr])  # type: ignore[index]
+    if node.op == "in_set" and node.args[0].op == "table":  # table(x) in S = x in {i : table[i] in S}
+        members = node.attr
+        assert isinstance(members, frozenset)
+        return _where(node.args[0], lambda v: v in members, build)
+    return None
+
+
+def _shift_of_table(node: Node, build: Builder) -> Node | None:
+    """shift(table(x)) = table(shift(x)), so that comparisons see the table."""
+    if node.op == "shift" and node.args[0].op == "table" and node.attr[2]:  # type: ignore[index]
+        dy, dx, _ = node.attr  # type: ignore[misc]
+        table = node.args[0]
+        return build.table(build.shift(table.args[0], (dy, dx)), table.attr)  # type: ignore[arg-type]
+    return None
+
+
+RESOLVE: tuple[Rewrite, ...] = (_shift_of_table, _table_of_constant, _table_compare)
+
+
+def specialise(pass_: PassGraph) -> PassGraph:
+    """In `x in {3} and P(table(x))`, the table has one value: P becomes simpler. Rules of loops look like this."""
+    return rewrite_pass(pass_, (_specialise,))
+
+
+def _specialise(node: Node, build: Builder) -> Node | None:
+    if node.op != "and":
+        return None
+    parts = _conjuncts(node)
+    known = {id(p.args[0]): p.attr for p in parts if p.op == "in_set"}
+    if not known:
+        return None
+    changed = False
+    result = []
+    for part in parts:
+        new = _substitute(part, known, build) if part.op != "in_set" else part
+        changed = changed or new is not part
+        result.append(new)
+    if not changed:
+        return None
+    joined = result[0]
+    for part in result[1:]:
+        joined = build.and_(joined, part)
+    return joined
+
+
+def _conjuncts(node: Node) -> list[Node]:
+    if node.op != "and":
+        return [node]
+    return [part for arg in node.args for part in _conjuncts(arg)]
+
+
+def _substitute(node: Node, known: dict[int, object], build: Builder) -> Node:
+    """The condition with tables of known elements replaced; only looks through logic and comparisons."""
+    if node.op == "table" and id(node.args[0]) in known:
+        members = known[id(node.args[0])]
+        assert isinstance(members, frozenset) and isinstance(node.attr, tuple)
+        values = {node.attr[i] for i in members if i < len(node.attr)}
+        return build.whole(values.pop()) if len(values) == 1 else node
+    # Not through shifts: what is known of this cell says nothing of its neighbours.
+    if node.op not in ("and", "or", "not", "eq", "lt", "le") or not any(n.op == "table" for n in walk(node)):
+        return node
+    args = tuple(_substitute(arg, known, build) for arg in node.args)
+    return rebuild(node, args, build) if any(a is not b for a, b in zip(args, node.args, strict=True)) else node

@@ -1,0 +1,52 @@
+"""Where random rulesets and worlds take their decisions from: a seed, or Hypothesis, which can shrink them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from random import Random
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+class Choices:
+    """Decisions, all made of one: `below(n)`, a whole number of 0..n-1. Plain options stand first, at 0."""
+
+    def __init__(self, below: Callable[[int], int]):
+        self.below = below
+
+    @classmethod
+    def seeded(cls, seed: int) -> Choices:
+        """The same decisions for the same seed, on every machine."""
+        return cls(Random(seed).randrange)
+
+    def pick(self, options: Sequence[T]) -> T:
+        return options[self.below(len(options))]
+
+    def whole(self, lo: int, hi: int) -> int:
+        """A whole number of lo..hi."""
+        return lo + self.below(hi - lo + 1)
+
+    def maybe(self, percent: int) -> bool:
+        """True in so many cases of a hundred; False is the plain one."""
+        return self.below(100) >= 100 - percent
+
+    def some(self, options: Sequence[T], least: int, most: int) -> list[T]:
+        """So many different ones, in the order of the options."""
+        most = min(most, len(options))
+        wanted = self.whole(min(least, most), most)
+        kept: list[T] = []
+        for i, option in enumerate(options):
+            left = len(options) - i
+            if self.below(left) < wanted - len(kept):
+                kept.append(option)
+        return kept
+
+    def weighted(self, rows: Sequence[tuple[int, T]]) -> T:
+        """One of the options, each as likely as its weight says."""
+        number = self.below(sum(weight for weight, _ in rows))
+        for weight, option in rows:
+            if number < weight:
+                return option
+            number -= weight
+        raise AssertionError("weights must not be negative")

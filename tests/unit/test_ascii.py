@@ -1,0 +1,116 @@
+"""ASCII art and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from powderdsl.diagnostics import CompileError, Reporter, Source, Span
+from powderdsl.worlds import ascii as ascii_art
+from powderdsl.worlds.ascii import load_ascii, parse_ascii, read_ascii, write_ascii
+from tests.unit.elements import ELEMENTS
+
+WORLDS = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 13))
+
+
+def problems(text: str, **options) -> list[tuple[str, str]]:
+    with pytest.raises(CompileError) as caught:
+        read_ascii(text, ELEMENTS, **options)
+    return [(one.code, one.primary.span.text) for one in caught.value.diagnostics]
+
+
+def test_glyphs_are_cells_and_whitespace_is_nothing():
+    expected = [[1, 1, 1], [1, 2, 3]]
+    for text in ("###\n#s~\n", "###\n#s~", "# # #\n# s ~", "\n\n  ###  \r\n\t#s ~\r\n\n"):
+        ids = read_ascii(text, ELEMENTS)
+        assert ids.dtype == np.uint8
+        assert ids.tolist() == expected
+
+
+@given(WORLDS, st.booleans())
+def test_what_is_written_is_read_back(ids, spaced):
+    assert np.array_equal(read_ascii(write_ascii(ids, ELEMENTS, spaced=spaced), ELEMENTS), ids)
+
+
+@given(WORLDS)
+def test_a_legend_is_written_and_read_back_and_wins_over_glyphs(ids):
+    # `s` is sand's glyph: with this legend it means water, and sand is written as `□`.
+    legend = {"s": "water", "□": "core.sand"}
+    text = write_ascii(ids, ELEMENTS, legend)
+    assert ("s" in text) == (3 in ids)
+    assert ("□" in text) == (2 in ids)
+    assert "~" not in text
+    assert np.array_equal(read_ascii(text, ELEMENTS, legend), ids)
+
+
+def test_exact_text():
+    ids = np.array([[0, 1], [2, 13]])
+    assert write_ascii(ids, ELEMENTS) == ".#\ns%\n"
+    assert write_ascii(torch.tensor(ids), ELEMENTS, spaced=True) == ". #\ns %\n"
+
+
+def test_unknown_characters_are_named_once_each_where_they_first_stand():
+    assert problems("..X\n.YX\nY..\n") == [("PD610", "X"), ("PD610", "Y")]
+
+
+def test_the_help_says_what_is_known():
+    with pytest.raises(CompileError, match=r"known: \.\s+empty\s+#\s+wall"):
+        read_ascii("?", ELEMENTS)
+
+
+def test_uneven_rows_are_shown_without_the_space_around_them():
+    assert problems("....\n  . . .  \n\n....\n.....\n") == [("PD611", ". . ."), ("PD611", ".....")]
+
+
+def test_both_kinds_of_mistakes_come_together():
+    assert problems("....\nX..\n") == [("PD610", "X"), ("PD611", "X..")]
+
+
+@pytest.mark.parametrize("text", ["", " \n\t\n"])
+def test_nothing_is_no_world(text):
+    assert problems(text) == [("PD607", text[:1])]
+
+
+def test_a_drawing_larger_than_any_world(monkeypatch):
+    monkeypatch.setattr(ascii_art, "MAX_CELLS", 5)
+    assert problems("...\n...\n") == [("PD607", ".")]
+    assert read_ascii(".....", ELEMENTS).shape == (1, 5)
+
+
+def test_spans_point_into_the_text_around_the_drawing():
+    text = "given: |\n  ..\n  .X\nafter: 1 step\n"
+    start, end = text.index("  .."), text.index("after")
+    reporter = Reporter()
+    assert parse_ascii(Span(Source("pack.yaml", text), start, end), ELEMENTS, reporter) is None
+    assert [one.primary.span.place for one in reporter.diagnostics] == ["pack.yaml:3:4"]
+
+
+def test_a_bad_legend():
+    with pytest.raises(CompileError, match=r"PD604.*`watr`[\s\S]*did you mean `water`"):
+        read_ascii(".", ELEMENTS, {"w": "watr"})
+    for key in ("", "ab", " "):
+        with pytest.raises(ValueError, match="single visible character"):
+            read_ascii(".", ELEMENTS, {key: "water"})
+
+
+def test_ids_that_cannot_be_written():
+    with pytest.raises(ValueError, match=r"\[14, 200\]"):
+        write_ascii(np.array([[0, 200, 14]]), ELEMENTS)
+    for ids in (np.zeros(3, dtype=int), np.zeros((1, 2, 2), dtype=int), np.zeros((2, 2))):
+        with pytest.raises(ValueError, match=r"integers \[H, W\]"):
+            write_ascii(ids, ELEMENTS)
+
+
+def test_files(tmp_path):
+    path = tmp_path / "world.txt"
+    path.write_bytes(b"\xef\xbb\xbf##\r\n#s\r\n")
+    assert load_ascii(path, ELEMENTS).tolist() == [[1, 1], [1, 2]]
+    path.write_text("##\n#X\n")
+    with pytest.raises(CompileError, match=r"world\.txt:2:2"):
+        load_ascii(path, ELEMENTS)
+    with pytest.raises(CompileError, match="PD101"):
+        load_ascii(tmp_path / "nowhere.txt", ELEMENTS)

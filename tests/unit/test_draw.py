@@ -1,0 +1,162 @@
+"""Worlds as pictures: exact colours, the tint of velocity, scaling, contact sheets."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from powderdsl.draw import contact_sheet, palette, rgb, scale, to_numpy
+from tests.unit.elements import ELEMENTS, ID
+
+COLORS = palette(ELEMENTS)
+SAND = (0xF3, 0xC2, 0x3A)
+
+
+def test_the_palette_is_by_id():
+    assert COLORS.shape == (14, 3)
+    assert COLORS.dtype == np.uint8
+    assert tuple(COLORS[ID["sand"]]) == SAND
+    gapped = palette([replace(ELEMENTS[2], id=5)])
+    assert gapped.tolist() == [[0, 0, 0]] * 5 + [list(SAND)]
+    assert palette([]).shape == (0, 3)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64])
+def test_every_cell_has_its_elements_colour(dtype):
+    ids = np.arange(14, dtype=dtype).reshape(2, 7)
+    image = rgb(ids, COLORS)
+    assert image.shape == (2, 7, 3)
+    assert image.dtype == np.uint8
+    assert tuple(image[0, 2]) == SAND
+    assert np.array_equal(image.reshape(14, 3), COLORS)
+    assert np.array_equal(rgb(ids, [element.color for element in ELEMENTS]), image)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "tint"),
+    [
+        ((0, 0), 0),
+        ((0.5, 0), 0.25),
+        ((0.3, -0.4), 0.25),
+        ((0, -1), 0.5),
+        ((20, 20), 0.5),
+        ((float("inf"), 0), 0.5),
+        ((float("nan"), 0), 0),
+    ],
+)
+def test_velocity_tints_by_half_the_speed_up_to_a_half(velocity, tint):
+    field = np.array(velocity, dtype=np.float32).reshape(2, 1, 1)
+    expected = [round(a + (b - a) * tint + 1e-6) for a, b in zip(SAND, (200, 100, 100), strict=True)]
+    assert rgb(np.array([[ID["sand"]]]), COLORS, field)[0, 0].tolist() == expected
+    assert rgb(torch.tensor([[ID["sand"]]]), COLORS, torch.tensor(field))[0, 0].tolist() == expected
+
+
+def test_the_components_of_velocity_are_not_mixed_up_with_the_batch():
+    """Two worlds, and a tint in exactly one cell of the second."""
+    velocity = np.zeros((2, 2, 3, 4), dtype=np.float32)
+    velocity[1, 0, 2, 1] = 1
+    image = rgb(np.zeros((2, 3, 4), dtype=np.uint8), COLORS, velocity)
+    changed = (image != COLORS[0]).any(axis=-1)
+    assert np.argwhere(changed).tolist() == [[1, 2, 1]]
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    ids=arrays(np.uint8, (2, 3, 4), elements=st.integers(0, 13)),
+    velocity=arrays(np.float32, (2, 2, 3, 4), elements=st.floats(-8, 8, width=32)),
+)
+def test_torch_draws_what_numpy_draws(ids, velocity):
+    image = rgb(torch.tensor(ids), COLORS, torch.tensor(velocity))
+    assert isinstance(image, torch.Tensor)
+    assert image.dtype == torch.uint8
+    # A square root may be rounded differently in the last place, and a component with it.
+    assert np.abs(image.numpy().astype(int) - rgb(ids, COLORS, velocity)).max() <= 1
+    assert np.array_equal(rgb(torch.tensor(ids), COLORS).numpy(), rgb(ids, COLORS))
+    assert np.array_equal(scale(image, 3).numpy(), scale(image.numpy(), 3))
+
+
+def test_worlds_without_worlds():
+    assert rgb(np.zeros((0, 3, 4), dtype=np.uint8), COLORS).shape == (0, 3, 4, 3)
+    assert rgb(torch.zeros((0, 3, 4), dtype=torch.uint8), COLORS).shape == (0, 3, 4, 3)
+
+
+@pytest.mark.parametrize("make", [np.array, torch.tensor])
+def test_what_cannot_be_drawn(make):
+    for ids in ([[14]], [[-1]]):
+        with pytest.raises(ValueError, match="14 colours"):
+            rgb(make(ids), COLORS)
+    for ids in ([[1.0]], [[True]], [[1j]]):
+        with pytest.raises(TypeError, match="must be integers"):
+            rgb(make(ids), COLORS)
+    with pytest.raises(ValueError, match=r"\[\.\.\., H, W\]"):
+        rgb(make([1]), COLORS)
+    with pytest.raises(ValueError, match=r"shape \(2, 1, 1\), not \(1, 1\)"):
+        rgb(make([[1]]), COLORS, make([[1.0]]))
+
+
+def test_colours_that_are_none():
+    with pytest.raises(ValueError, match="'#12345' is not a colour"):
+        rgb(np.zeros((1, 1), dtype=int), ["#12345"])
+    with pytest.raises(ValueError, match=r"uint8 \[n, 3\]"):
+        rgb(np.zeros((1, 1), dtype=int), np.zeros((1, 4), dtype=np.uint8))
+
+
+def test_scaling_makes_squares():
+    image = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    large = scale(image, 3)
+    assert large.shape == (6, 6, 3)
+    for row in range(6):
+        for column in range(6):
+            assert np.array_equal(large[row, column], image[row // 3, column // 3])
+    assert np.array_equal(scale(image, 1), image)
+    assert scale(image[None], 2).shape == (1, 4, 4, 3)
+    with pytest.raises(ValueError, match="from 1"):
+        scale(image, 0)
+
+
+def test_a_contact_sheet_puts_pictures_row_by_row():
+    images = np.stack([np.full((2, 3, 3), value, dtype=np.uint8) for value in (10, 20, 30)])
+    sheet = contact_sheet(images, columns=2, gap=1, background=(0, 0, 7))
+    assert sheet.shape == (7, 9, 3)
+    assert sheet[:, :, 0].tolist() == [
+        [0] * 9,
+        [0, 10, 10, 10, 0, 20, 20, 20, 0],
+        [0, 10, 10, 10, 0, 20, 20, 20, 0],
+        [0] * 9,
+        [0, 30, 30, 30, 0, 0, 0, 0, 0],
+        [0, 30, 30, 30, 0, 0, 0, 0, 0],
+        [0] * 9,
+    ]
+    assert sheet[0, 0].tolist() == [0, 0, 7]
+    assert np.array_equal(contact_sheet(torch.tensor(images), columns=2, gap=1, background=(0, 0, 7)), sheet)
+    assert contact_sheet(images, gap=0).shape == (4, 6, 3)
+    assert contact_sheet(images, columns=9, gap=0).shape == (2, 9, 3)
+
+
+def test_a_contact_sheet_of_nothing_or_of_unequal_pictures():
+    with pytest.raises(ValueError, match="at least one"):
+        contact_sheet([])
+    with pytest.raises(ValueError, match="different shapes"):
+        contact_sheet([np.zeros((2, 2, 3), dtype=np.uint8), np.zeros((2, 3, 3), dtype=np.uint8)])
+    with pytest.raises(ValueError, match="columns=0"):
+        contact_sheet(np.zeros((1, 2, 2, 3), dtype=np.uint8), columns=0)
+
+
+def test_to_numpy_takes_tensors_that_know_their_gradient():
+    assert to_numpy(torch.ones(2, requires_grad=True)).tolist() == [1, 1]
+
+
+def test_drawing_arrays_does_not_import_torch():
+    code = (
+        "import sys, numpy; from powderdsl.draw import rgb; import powderdsl.terminal, powderdsl.media;"
+        "rgb(numpy.zeros((1, 1), int), ['#000000']); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,185 @@
+"""Worlds as PNG pictures: exact there and back, and every picture that is no world refused."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.worlds.image import MAX_REPORTED, read_image, write_image
+from tests.unit.elements import ELEMENTS
+
+IDS = np.arange(14, dtype=np.uint8).reshape(2, 7)
+
+
+def refused(path, elements=ELEMENTS) -> tuple:
+    with pytest.raises(CompileError) as caught:
+        read_image(path, elements)
+    str(caught.value)
+    return caught.value.diagnostics
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    path = tmp_path / "world.png"
+    for ids in (IDS, torch.tensor(IDS), IDS.astype(np.int64)):
+        write_image(path, ids, ELEMENTS)
+        found = read_image(path, ELEMENTS)
+        assert found.dtype == np.uint8
+        assert np.array_equal(found, IDS)
+    with Image.open(path) as image:
+        assert image.size == (7, 2)
+        assert image.getpixel((2, 0)) == (0xF3, 0xC2, 0x3A)  # sand, in the published colour
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P"])
+def test_other_pixel_formats_of_the_same_colours(tmp_path, mode):
+    path = tmp_path / "world.png"
+    write_image(path, IDS, ELEMENTS)
+    with Image.open(path) as image:
+        converted = image.quantize(256) if mode == "P" else image.convert(mode)
+    converted.save(path)
+    assert np.array_equal(read_image(path, ELEMENTS), IDS)
+
+
+def test_black_and_white_and_grey(tmp_path):
+    grey = (replace(ELEMENTS[0], color="#000000"), replace(ELEMENTS[1], color="#FFFFFF"))
+    pixels = np.array([[0, 255, 255], [255, 0, 0]], dtype=np.uint8)
+    for mode in ("L", "1", "LA"):
+        path = tmp_path / f"{mode}.png"
+        Image.fromarray(pixels).convert(mode).save(path)
+        assert np.array_equal(read_image(path, grey), pixels // 255)
+
+
+def test_a_wrong_colour_names_the_pixel_the_colour_and_the_nearest_element(tmp_path):
+    path = tmp_path / "world.png"
+    write_image(path, IDS, ELEMENTS)
+    pixels = np.array(Image.open(path))
+    pixels[1, 3] = (0xF4, 0xC2, 0x3B)
+    pixels[1, 5] = (0xF4, 0xC2, 0x3B)
+    pixels[0, 6] = (0, 0, 0)
+    Image.fromarray(pixels).save(path)
+    black, sand = refused(path)
+    assert (black.code, sand.code) == ("PD609", "PD609")
+    assert sand.message == "the pixel at row 1, column 3 is #F4C23B, which is no element's colour"
+    assert sand.helps == ("the nearest is `sand`, #F3C23A",)
+    assert sand.notes == (f"{path}: 2 such pixels, this is the first",)
+    assert "row 0, column 6" in black.message
+    assert "`stone`" in black.helps[0]
+
+
+def test_a_smoothed_picture_is_summed_up(tmp_path):
+    path = tmp_path / "world.png"
+    write_image(path, np.random.default_rng(0).integers(0, 14, (16, 16)), ELEMENTS)
+    with Image.open(path) as image:
+        image.resize((64, 64), Image.Resampling.BICUBIC).save(path)
+    found = refused(path)
+    assert len(found) == MAX_REPORTED + 1
+    assert "without smoothing" in found[-1].helps[0]
+
+
+def test_transparent_pixels_are_not_guessed(tmp_path):
+    path = tmp_path / "world.png"
+    pixels = np.full((2, 2, 4), (0xEC, 0xF0, 0xF1, 255), dtype=np.uint8)
+    pixels[1, 0, 3] = 128
+    Image.fromarray(pixels).save(path)
+    (found,) = refused(path)
+    assert found.message == "the pixel at row 1, column 0 is #ECF0F1 at 50% opacity"
+
+
+def test_a_colour_of_two_elements_is_refused_where_it_is_used(tmp_path):
+    twins = (*ELEMENTS[:13], replace(ELEMENTS[13], color=ELEMENTS[2].color))
+    path = tmp_path / "world.png"
+    write_image(path, np.array([[0, 1]]), ELEMENTS)
+    assert read_image(path, twins).tolist() == [[0, 1]]
+    write_image(path, np.array([[0, 2]]), ELEMENTS)
+    (found,) = refused(path, twins)
+    assert "`sand` and `cloner`" in found.message
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(width: int, height: int, *chunks: bytes, depth: int = 8, color: int = 2) -> bytes:
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + b"".join(chunks) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("side", [4097, 12_000, 60_000, 2**31 - 1])
+def test_a_picture_of_too_many_pixels_is_not_decoded(tmp_path, side):
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png(side, side, chunk(b"IDAT", zlib.compress(bytes(1 << 20)))))
+    tracemalloc.start()
+    try:
+        found = refused(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert [one.code for one in found] == ["PD607"]
+    assert peak < 4 << 20
+
+
+def test_a_text_that_unpacks_to_gigabytes(tmp_path):
+    path = tmp_path / "bomb.png"
+    packed = zlib.compress(bytes(100 << 20))
+    path.write_bytes(png(1, 1, chunk(b"zTXt", b"note\0\0" + packed), chunk(b"IDAT", zlib.compress(bytes(4)))))
+    assert [one.code for one in refused(path)] == ["PD602"]
+
+
+def test_sixteen_bit_pictures_are_refused(tmp_path):
+    path = tmp_path / "deep.png"
+    Image.fromarray(np.full((2, 2), 60000, dtype=np.uint16)).save(path)
+    (found,) = refused(path)
+    assert found.code == "PD602"
+    assert "8 bits" in found.notes[0]
+
+
+@pytest.mark.parametrize("data", [b"", b"GIF89a", b"\x89PNG\r\n\x1a\n", b"scene: a\n", png(0, 0), png(3, 3)])
+def test_files_that_are_no_png(tmp_path, data):
+    path = tmp_path / "world.png"
+    path.write_bytes(data)
+    assert [one.code for one in refused(path)] == ["PD602"]
+
+
+def test_another_format_under_the_name_of_a_png(tmp_path):
+    path = tmp_path / "world.png"
+    Image.new("RGB", (4, 4), "#ECF0F1").save(path, format="BMP")
+    assert [one.code for one in refused(path)] == ["PD602"]
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    for path in (tmp_path / "nowhere.png", tmp_path, "bad\0name.png"):
+        assert [one.code for one in refused(path)] == ["PD101"]
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_damaged_file_gives_a_world_or_a_diagnostic(tmp_path, data):
+    path = tmp_path / "world.png"
+    write_image(path, IDS, ELEMENTS)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
+    codes = set()
+    try:
+        read_image(path, ELEMENTS)
+    except CompileError as error:
+        codes = {one.code for one in error.diagnostics}
+    assert codes <= {"PD602", "PD607", "PD609"}
+
+
+def test_nothing_is_written_for_ids_without_a_colour(tmp_path):
+    path = tmp_path / "world.png"
+    with pytest.raises(ValueError, match="14 colours"):
+        write_image(path, np.array([[14]]), ELEMENTS)
+    assert list(tmp_path.iterdir()) == []

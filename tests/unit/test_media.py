@@ -1,0 +1,202 @@
+"""PNG, GIF and MP4 files: what is in them, and that they appear whole or not at all."""
+
+from __future__ import annotations
+
+import builtins
+import os
+import stat
+import subprocess
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from powderdsl import media
+from powderdsl.diagnostics import CompileError
+from powderdsl.draw import palette, rgb, scale
+from powderdsl.media import write_gif, write_mp4, write_png
+from powderdsl.worlds.files import replacing
+from tests.unit.elements import ELEMENTS
+
+COLORS = palette(ELEMENTS)
+
+
+def world(seed: int, height: int = 8, width: int = 10) -> np.ndarray:
+    return rgb(np.random.default_rng(seed).integers(0, 14, (height, width)), COLORS)
+
+
+def gif_frames(path) -> list[np.ndarray]:
+    with Image.open(path) as image:
+        frames = []
+        for number in range(image.n_frames):
+            image.seek(number)
+            frames.append(np.array(image.convert("RGB")))
+        return frames
+
+
+def mp4_frames(path, width: int, height: int) -> np.ndarray:
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path)]
+    output = subprocess.run(
+        [*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
+    )
+    return np.frombuffer(output.stdout, dtype=np.uint8).reshape(-1, height, width, 3)
+
+
+def test_png(tmp_path):
+    image = world(0)
+    for given in (image, torch.tensor(image), image[:, ::-1]):
+        write_png(tmp_path / "x.png", given)
+        with Image.open(tmp_path / "x.png") as found:
+            assert found.format == "PNG"
+            assert np.array_equal(np.array(found), np.asarray(given))
+
+
+def test_gif_keeps_every_colour_of_worlds(tmp_path):
+    frames = [world(seed) for seed in range(5)]
+    write_gif(tmp_path / "x.gif", iter(frames), fps=20)
+    found = gif_frames(tmp_path / "x.gif")
+    assert len(found) == 5
+    for expected, frame in zip(frames, found, strict=True):
+        assert np.array_equal(frame, expected)
+    with Image.open(tmp_path / "x.gif") as image:
+        assert image.info["duration"] == 50
+        assert image.info["loop"] == 0
+
+
+def test_gif_keeps_exactly_256_colours_and_comes_close_with_more(tmp_path):
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    frame = np.stack([levels, 255 - levels, levels // 2], axis=-1)
+    write_gif(tmp_path / "x.gif", [frame])
+    assert np.array_equal(gif_frames(tmp_path / "x.gif")[0], frame)
+    ids = np.random.default_rng(0).integers(0, 14, (32, 32))
+    tinted = rgb(ids, COLORS, np.random.default_rng(1).uniform(-1, 1, (2, 32, 32)))
+    assert len(np.unique(tinted.reshape(-1, 3), axis=0)) > 256
+    write_gif(tmp_path / "y.gif", [tinted])
+    assert np.abs(gif_frames(tmp_path / "y.gif")[0].astype(int) - tinted).mean() < 6
+
+
+def test_gif_is_no_faster_than_browsers_play_it(tmp_path):
+    write_gif(tmp_path / "x.gif", [world(0), world(1)], fps=1000, loop=False)
+    with Image.open(tmp_path / "x.gif") as image:
+        assert image.info["duration"] == 20
+        assert "loop" not in image.info
+
+
+def test_a_still_animation_lasts_as_long(tmp_path):
+    write_gif(tmp_path / "x.gif", [world(0)] * 10 + [world(1)], fps=10)
+    with Image.open(tmp_path / "x.gif") as image:
+        total = 0
+        for number in range(image.n_frames):
+            image.seek(number)
+            total += image.info["duration"]
+    assert total == 1100
+
+
+def test_mp4(tmp_path):
+    frames = [scale(world(seed), 8) for seed in range(12)]
+    write_mp4(tmp_path / "x.mp4", iter(frames), fps=12)
+    found = mp4_frames(tmp_path / "x.mp4", 80, 64)
+    assert len(found) == 12
+    for expected, frame in zip(frames, found, strict=True):
+        # Lossy, but the middle of every cell has its colour, in its place.
+        assert np.abs(frame[4::8, 4::8].astype(int) - expected[4::8, 4::8]).max() < 24
+    assert (tmp_path / "x.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_mp4_of_odd_size_repeats_the_border(tmp_path):
+    image = np.zeros((5, 7, 3), dtype=np.uint8)
+    image[-1] = 255
+    write_mp4(tmp_path / "x.mp4", [image] * 3)
+    found = mp4_frames(tmp_path / "x.mp4", 8, 6)
+    assert len(found) == 3
+    assert found[0][4:].min() > 200
+    assert found[0][:3].max() < 60
+
+
+def test_mp4_needs_its_encoder(tmp_path, monkeypatch):
+    original = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name == "imageio_ffmpeg":
+            raise ImportError(name)
+        return original(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(CompileError, match=r"PD612[\s\S]*powderdsl\[video\]"):
+        write_mp4(tmp_path / "x.mp4", [world(0)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_that_fails_is_heard(tmp_path, monkeypatch):
+    monkeypatch.setattr(media, "_ENCODING", ("-vcodec", "no-such-codec", "-f", "mp4"))
+    with pytest.raises(OSError, match=r"encoder failed \(status \d+\): .*no-such-codec"):
+        write_mp4(tmp_path / "x.mp4", [world(seed, 200, 200) for seed in range(20)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def interrupted(error):
+    yield world(0)
+    yield world(1)
+    raise error
+
+
+@pytest.mark.parametrize("write", [write_gif, write_mp4])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("the simulation failed")])
+def test_an_interrupted_animation_leaves_the_older_file(tmp_path, write, error):
+    path = tmp_path / ("x.gif" if write is write_gif else "x.mp4")
+    path.write_bytes(b"older")
+    with pytest.raises(type(error)):
+        write(path, interrupted(error))
+    assert path.read_bytes() == b"older"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("write", [write_gif, write_mp4])
+def test_frames_that_do_not_fit(tmp_path, write):
+    path = tmp_path / ("x.gif" if write is write_gif else "x.mp4")
+    with pytest.raises(ValueError, match="at least one frame"):
+        write(path, [])
+    with pytest.raises(ValueError, match=r"frame 1 has shape \(4, 4, 3\)"):
+        write(path, [world(0), world(0, 4, 4)])
+    for bad in (world(0).astype(float), world(0)[..., 0], world(0)[None], world(0)[:0]):
+        with pytest.raises(ValueError, match=r"uint8 \[H, W, 3\]"):
+            write(path, [bad])
+    for fps in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="fps"):
+            write(path, [world(0)], fps=fps)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    for path in (tmp_path / "nowhere" / "x.png", file / "x.png", "bad\0name.png"):
+        with pytest.raises(CompileError, match="PD613"):
+            write_png(path, world(0))
+    (tmp_path / "x.png").mkdir()
+    with pytest.raises(CompileError, match="PD613"):
+        write_png(tmp_path / "x.png", world(0))
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "x.png"]
+
+
+def test_a_written_file_has_the_permissions_of_any_new_file(tmp_path):
+    old = os.umask(0o027)
+    try:
+        write_png(tmp_path / "x.png", world(0))
+    finally:
+        assert os.umask(old) == 0o027
+    assert stat.S_IMODE((tmp_path / "x.png").stat().st_mode) == 0o640
+
+
+def test_replacing_shows_nothing_before_it_is_complete(tmp_path):
+    path = tmp_path / "x.txt"
+    path.write_text("older")
+    with replacing(path) as temporary:
+        temporary.write_text("new")
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".txt"
+        assert path.read_text() == "older"
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
