@@ -77,6 +77,11 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device) -> Runnab
     if backend == "reference":
         return ReferenceProgram(ruleset)
     from powderdsl.backends.torch_dense import DenseProgram
+    from powderdsl.backends.torch_planes import PlanesProgram
     from powderdsl.compiler import lower
+    from powderdsl.ir.bits import lower_bits
 
-    return DenseProgram(lower(ruleset), device)
+    program = lower(ruleset)
+    if backend == "dense":
+        return DenseProgram(program, device)
+    return PlanesProgram(program, lower_bits(program), device)

@@ -300,8 +300,14 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
         _assign(write, values[id(write)], mask, state, table)
     for name, slot in table.items():
         if slot.of is not None:
-            state[name] = np.where(np.isin(state["element"], sorted(slot.of)), state[name], slot.default)  # type: ignore[arg-type]
+            state[name] = _where(np.isin(state["element"], sorted(slot.of)), state[name], _default(slot, state[name]))
     return state
+
+
+def _default(slot: Slot, like: Array) -> Array:
+    """A slot's default in every cell, in the shape and dtype of its array."""
+    default = np.asarray(slot.default, like.dtype)
+    return np.broadcast_to(default[:, None, None] if slot.planes == 2 else default, like.shape)
 
 
 def _where(mask: Array, yes: Array, no: Array) -> Array:
@@ -321,10 +327,8 @@ def _become(target: Array, mask: Array, state: State, at: Context, table: Mappin
                 one = at.params[value][:, None, None] if isinstance(value, str) else value
                 fresh = np.where(target == identity, one, fresh)
             fresh = fresh.astype(state[name].dtype)
-        elif slot.planes == 2:
-            fresh = np.broadcast_to(np.asarray(slot.default, np.float32)[None, :, None, None], state[name].shape)
         else:
-            fresh = np.broadcast_to(np.asarray(slot.default, state[name].dtype), at.shape)
+            fresh = _default(slot, state[name])
         state[name] = _where(mask, fresh, state[name])
 
 
@@ -397,10 +401,9 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
 
 def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
     batch, height, width = shape
-    if slot.planes == 2:
-        return np.zeros((batch, 2, height, width), np.float32)
-    dtype = {"flag": np.bool_, "real": np.float32}.get(slot.kind.name, np.int64)
-    return np.full(shape, slot.default, dtype)  # type: ignore[arg-type]
+    dtype = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}.get(slot.kind.name, np.int64)
+    whole = (batch, 2, height, width) if slot.planes == 2 else shape
+    return _default(slot, np.empty(whole, dtype)).copy()
 
 
 def step(

@@ -89,6 +89,11 @@ class Simulator:
         """Names in the order they run."""
         return tuple(p.name for p in self.ruleset.passes)
 
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        """What a world's state holds."""
+        return tuple(self._slots.values())
+
     # Making worlds
 
     def world(self, ids: Any, seed: Any = 0, *, index: Any = None) -> World:

@@ -154,17 +154,17 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
     for node in nodes:
         if node.places and node.places[0] != place:
             place = node.places[0]
-            writer.lines.append(f"# {_comment(place)}")
+            writer.lines.append(f"# {comment(place)}")
         writer.node(node)
     name = f"pass_{number}"
     returned = ", ".join(f"{slot!r}: k.full({writer.names[id(node)]})" for slot, node in pass_.outputs)
-    lines = _with_deletions(writer.lines, returned)
+    lines = with_deletions(writer.lines, returned)
     body = [f"def {name}(k, state):", *(f"    {line}" for line in lines), f"    return {{{returned}}}"]
-    header = [f"# {_comment(pass_.name)}"] + [f"# {key} = {value}" for key, value in writer.constants.items()]
+    header = [f"# {comment(pass_.name)}"] + [f"# {key} = {value}" for key, value in writer.constants.items()]
     return "\n".join(header + body) + "\n", name, writer.constants
 
 
-def _with_deletions(lines: list[str], returned: str) -> list[str]:
+def with_deletions(lines: list[str], returned: str) -> list[str]:
     """The lines with `del` after the last use of each plane: a large world needs few planes at once, not all."""
     live = set(_PLANE.findall(returned))
     result: list[str] = []
@@ -181,6 +181,6 @@ def _with_deletions(lines: list[str], returned: str) -> list[str]:
 _PLANE = re.compile(r"\b[ns][0-9]+\b")
 
 
-def _comment(text: str) -> str:
+def comment(text: str) -> str:
     """File names come from outside: nothing in them may end the comment."""
     return "".join(char if char.isprintable() and ord(char) < 128 else "?" for char in text)

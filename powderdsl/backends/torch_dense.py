@@ -38,6 +38,8 @@ class Kernels:
     base: Tensor
     idents: Tensor
     step: Tensor
+    flags: frozenset[str] = frozenset()
+    """Parameters that are flags."""
     keys: Tensor = field(init=False)
     _draws: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     _masks: dict[tuple[int, int], Tensor] = field(default_factory=dict)
@@ -164,7 +166,7 @@ class DenseProgram:
         self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
         self._idents = torch.tensor([ident for _, ident, _ in program.streams], dtype=torch.int64, device=device)
         self._functions: list[tuple[str, PassFunction]] = [
-            (p.name, _function(*pass_source(p, i), device)) for i, p in enumerate(program.passes)
+            (p.name, compiled(*pass_source(p, i), device)) for i, p in enumerate(program.passes)
         ]
 
     def run(
@@ -218,7 +220,7 @@ class DenseProgram:
         return packed
 
 
-def _function(source: str, name: str, constants: dict[str, object], device: torch.device) -> PassFunction:
+def compiled(source: str, name: str, constants: Mapping[str, object], device: torch.device) -> PassFunction:
     """Compile generated source. It holds only names that `pass_source` made up, and constants passed beside it."""
     filename = f"<powderdsl {name} {abs(hash(source)):x}>"
     linecache.cache[filename] = (len(source), None, source.splitlines(True), filename)

@@ -14,7 +14,7 @@ from powderdsl.cli.exits import report_failure
 
 COMMANDS: dict[str, tuple[str, str]] = {
     # name: (module in powderdsl.cli, summary)
-    "run": ("run_command", "Run rules on a world: watch it, or write a picture, an animation, a saved world."),
+    "run": ("run_command", "Run rules on a world: watch it, or write a picture or an animation."),
     "check": ("check_command", "Find the mistakes in rule files, all at once."),
     "compile": ("compile_command", "Print what a stage of the compiler makes of rules."),
     "show": ("show_command", "List elements, reactions, passes and parameters."),
@@ -53,7 +53,7 @@ class CommandGroup(click.Group):
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **options: Any
     ) -> NoReturn:
-        """Run a command and exit: 0 done, 1 something failed, 2 bad input, 70 our own mistake, 130 interrupted."""
+        """Run a command and exit with one of the codes of `exits`."""
         # A terminal that lacks a character shows a `?` in its place.
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):

@@ -1,4 +1,4 @@
-"""How commands end: exit codes, and what people read when something went wrong. Never a traceback for bad input."""
+"""How commands end: exit codes, and what people read when something went wrong."""
 
 from __future__ import annotations
 
@@ -79,8 +79,9 @@ def report_failure(error: BaseException) -> int:
             file = f"{error.filename}: " if error.filename else ""
             click.echo(f"error: {file}{error.strerror or error}", err=True)
             return BAD_INPUT
-    if isinstance(error, MemoryError) or "memory" in str(error) and isinstance(error, RuntimeError):
-        click.echo("error: not enough memory for so many cells: fewer worlds or smaller ones may fit", err=True)
+    # torch says it with a RuntimeError of its own on every device.
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error)):
+        click.echo("error: not enough memory: fewer or smaller worlds may fit", err=True)
         return BAD_INPUT
     _report_internal(error)
     return INTERNAL

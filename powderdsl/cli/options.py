@@ -71,7 +71,11 @@ def set_option(function: Decorated) -> Decorated:
 
 def backend_option(default: str) -> Callable[[Decorated], Decorated]:
     return click.option(
-        "--backend", type=click.Choice(BACKENDS), default=default, show_default=True, help="What runs the rules."
+        "--backend",
+        type=click.Choice(BACKENDS),
+        default=default,
+        show_default=True,
+        help="What runs the rules.",
     )
 
 

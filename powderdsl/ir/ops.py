@@ -33,7 +33,7 @@ def whole(lo: int, hi: int) -> Type:
 
 @dataclass(frozen=True)
 class Op:
-    """A row of the table: argument types (`?` any, `=` all alike), result, what `attr` is."""
+    """A row of the table: argument types (`?` any, `=` all alike, `*` any number of them), result, what `attr` is."""
 
     name: str
     args: tuple[str, ...]
@@ -48,11 +48,14 @@ OPS: dict[str, Op] = {
         # where values come from
         Op("input", (), "?", "slot", "what the pass finds in a slot"),
         Op("const", (), "?", "value", "the same everywhere"),
-        Op("param", (), "?", "(name, view)", "one number a world; view: `value`, or a chance as a threshold for draws"),
-        Op("coordinate", (), "int", "(row | column | step, modulus)"),
+        Op("param", (), "?", "(name, view[, bit])", "one number a world; view: `value`, or a chance as a threshold for draws"),
+        Op("coordinate", (), "?", "(row | column | step, modulus[, bit])"),
         Op("inside", (), "flag", "offset", "whether that neighbour lies inside the grid"),
         Op("below", ("int",), "flag", "(stream, bits)", "whether the stream's draw k is less than the argument"),
         Op("draw", (), "real", "(stream, bits)", "(k + ½) / 2^bits, rounded to float32"),
+        # the same on bit planes
+        Op("chance", (), "flag", "(stream, bits, limit)", "whether the stream's draw k is less than a constant"),
+        Op("below_planes", ("*flag",), "flag", "(stream, bits)", "`below`, the limit's planes given highest first"),
         # neighbours
         Op("shift", ("?",), "=", "(rows, columns, wraps)", "the value at a neighbour; zero outside unless it wraps"),
         Op("count", ("flag",), "int", "((rows, columns, weight)…, wraps)", "weighted number of neighbours that hold"),

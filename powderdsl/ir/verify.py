@@ -48,10 +48,13 @@ def _verify_node(node: Node) -> None:
     op = OPS.get(node.op)
     if op is None:
         raise InvalidIR(f"unknown operation {node.op}")
-    _demand(len(node.args) == len(op.args), f"{node.op} has {len(node.args)} arguments")
+    wanted_args = op.args
+    if wanted_args and wanted_args[0].startswith("*"):
+        wanted_args = (wanted_args[0][1:],) * len(node.args)
+    _demand(len(node.args) == len(wanted_args), f"{node.op} has {len(node.args)} arguments")
     _demand(bool(op.attr) == (node.attr is not None), f"{node.op} has the attribute {node.attr!r}")
     alike: set[str] = set()
-    for wanted, arg in zip(op.args, node.args, strict=True):
+    for wanted, arg in zip(wanted_args, node.args, strict=True):
         if wanted == "=":
             alike.add(arg.type.name)
         elif wanted != "?":

@@ -24,35 +24,49 @@ Value = Expr | Number
 _FLIP = {"<": ">", ">": "<", "<=": ">=", ">=": "<=", "==": "==", "!=": "!="}
 
 
-def compare(typer: Typer, operator: str, left: Value, right: Value, span: Span) -> Expr:
-    """A comparison as `eq`, `lt` or `le`, maybe negated."""
+def compare(
+    typer: Typer, operator: str, left: Value, right: Value, span: Span, places: tuple[Span, Span] | None = None
+) -> Expr:
+    """A comparison as `eq`, `lt` or `le`, maybe negated. `places` are where the two sides stand, for messages."""
+    places = places or (span, span)
     if operator == "!=":
-        return negation(compare(typer, "==", left, right, span), span)
+        return negation(compare(typer, "==", left, right, span, places), span)
     if operator in (">", ">="):
-        return compare(typer, _FLIP[operator], right, left, span)
+        return compare(typer, _FLIP[operator], right, left, span, (places[1], places[0]))
     if isinstance(left, Number) and isinstance(right, Number):
         holds = {"==": left.value == right.value, "<": left.value < right.value, "<=": left.value <= right.value}[operator]
         return TRUE if holds else FALSE
     op = {"==": "eq", "<": "lt", "<=": "le"}[operator]
     kinds = {operand.kind.name for operand in (left, right) if isinstance(operand, Expr)}
     if "draw" in kinds:
-        return _compare_draw(typer, op, left, right, span)
+        return _compare_draw(typer, op, left, right, span, places)
     if kinds & {"element", "direction", "flag", "vec2"}:
-        return _compare_discrete(typer, op, left, right, span)
+        return _compare_discrete(typer, op, left, right, span, places)
     if kinds == {"int"}:
         return _compare_whole(typer, op, left, right, span)
     return Expr(op, FLAG, (typer.real(left, span), typer.real(right, span)), span=span)
 
 
-def _compare_discrete(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
-    for value, other in ((left, right), (right, left)):
-        if isinstance(value, Expr) and value.kind in (FLAG, ELEMENT, DIRECTION):
+_COMPARABLE = {
+    FLAG: ("a condition", "a condition holds or not: write it, or `not` and it"),
+    ELEMENT: ("an element", "ask for an element, or one of a set, with `is`"),
+    DIRECTION: ("a direction", "such as `left`, or `at(-1, 1)`"),
+}
+"""Kinds that are compared with their own kind only: in words, and what to write instead."""
+
+
+def _compare_discrete(
+    typer: Typer, op: str, left: Value, right: Value, span: Span, places: tuple[Span, Span]
+) -> Expr:
+    for value, other, place in ((left, right, places[1]), (right, left, places[0])):
+        if isinstance(value, Expr) and value.kind in _COMPARABLE:
+            words, cure = _COMPARABLE[value.kind]
             if not isinstance(other, Expr) or other.kind != value.kind:
-                raise typer.wrong(other, f"{value.kind} to compare with {value.kind}", span)
+                raise typer.wrong(other, f"{words} to compare with {words}", place, cure)
             if op != "eq":
-                raise typer.fail("PD401", f"a {value.kind} is not more or less than another", span, "use `==` or `!=`")
+                raise typer.fail("PD401", f"{words} is not more or less than another", span, "has no order", ("use `==` or `!=`",))
             return Expr(op, FLAG, (left, right), span=span)  # type: ignore[arg-type]
-    raise typer.fail("PD401", "vectors are not compared", span, helps=("compare `length(…)`, or `.row` and `.column`",))
+    raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", helps=("compare `length(…)`, or `.row` and `.column`",))
 
 
 def _compare_whole(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
@@ -69,28 +83,32 @@ def _compare_whole(typer: Typer, op: str, left: Value, right: Value, span: Span)
     return Expr(op, FLAG, (a, b), span=span)
 
 
-def _compare_draw(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
+def _compare_draw(
+    typer: Typer, op: str, left: Value, right: Value, span: Span, places: tuple[Span, Span]
+) -> Expr:
     if op == "eq":
-        raise typer.fail("PD401", "a draw never equals anything exactly", span, "compare with `<` or `>`")
-    draw, other = (left, right) if isinstance(left, Expr) and left.kind.name == "draw" else (right, left)
+        raise typer.fail("PD401", "a draw never equals anything exactly", span, "always false", ("compare with `<` or `>`",))
+    on_left = isinstance(left, Expr) and left.kind.name == "draw"
+    draw, other, place = (left, right, places[1]) if on_left else (right, left, places[0])
     assert isinstance(draw, Expr)
     if isinstance(other, Expr) and other.kind.name == "draw":
         raise typer.fail("PD401", "two draws are not compared", span, "one side must be a number")
     if isinstance(other, Number):
         if not draw.kind.lo <= other.value <= draw.kind.hi:
             if (draw.kind.lo, draw.kind.hi) == (0, 1):
+                shown = f"{float(other.value):g}"
+                cure = f"`{shown}%`" if 0 <= other.value <= 100 else "a chance such as `20%`"
                 raise typer.fail(
-                    "PD403", f"a chance of {float(other.value * 100):g}%", span, "draws lie between 0 and 1",
-                    ("write a chance as `20%` or `0.2`",),
+                    "PD403", f"a draw compared with {shown}", place, "draws lie between 0 and 1", (f"did you mean {cure}?",)
                 )
             return TRUE if (other.value > draw.kind.hi) == (draw is left) else FALSE
         kind = CHANCE if 0 <= other.value <= 1 else Kind("number")
         other = Expr("const", kind, value=other.value, span=span)
-        _check_resolution(typer, draw, other, span)
+        _check_resolution(typer, draw, other, place)
     if other.kind.name == "real":
         draw = Expr("to_real", REAL, (draw,), span=span)
     elif other.kind.name not in ("chance", "number", "int"):
-        raise typer.wrong(other, "a chance to compare the draw with", span)
+        raise typer.wrong(other, "a chance to compare the draw with", place, "such as `5%`, a parameter or a property")
     # A draw lies strictly between two multiples of its resolution's half step: `<` and `<=` mean the same.
     pair = (draw, other) if isinstance(left, Expr) and left.kind.name == "draw" else (other, draw)
     return Expr("lt", FLAG, pair, span=span)
@@ -105,7 +123,8 @@ def _check_resolution(typer: Typer, draw: Expr, other: Expr, span: Span) -> None
     nearest = Fraction(max(0, ceil(p * steps - Fraction(1, 2))), steps)
     if abs(nearest - p) > p / 20:
         typer.reporter.report(
-            "PD404", f"a chance of {float(p):.3g} is drawn as {float(nearest):.3g}", span, f"steps of 1/{steps}",
+            "PD404", f"a chance of {float(100 * p):.3g}% is drawn as {float(100 * nearest):.3g}%", span,
+            f"this stream draws in steps of 1/{steps}",
             helps=["declare the stream with `bits: 32`, or say `with chance`"],
         )
 
@@ -116,7 +135,7 @@ def binary(typer: Typer, kind: str, left: Value, right: Value, syntax: Syntax) -
     span = syntax.span
     if isinstance(left, Number) and isinstance(right, Number):
         if op == "div" and right.value == 0:
-            raise typer.fail("PD402", "division by zero", span)
+            raise typer.fail("PD402", "division by zero", syntax.children[1].span, "this is 0")
         value = {"add": left.value + right.value, "sub": left.value - right.value, "mul": left.value * right.value,
                  "div": left.value / (right.value or 1)}[op]  # fmt: skip
         if abs(value) > 10**6 or value.denominator > 10**18:
@@ -125,11 +144,11 @@ def binary(typer: Typer, kind: str, left: Value, right: Value, syntax: Syntax) -
     kinds = {operand.kind.name for operand in (left, right) if isinstance(operand, Expr)}
     if kinds & {"flag", "element", "direction"}:
         bad = next(o for o in (left, right) if isinstance(o, Expr) and o.kind.name in ("flag", "element", "direction"))
-        raise typer.wrong(bad, "a number", span)
+        raise typer.wrong(bad, "a number", syntax.children[0 if bad is left else 1].span)
     if "vec2" in kinds:
         return _vector_arithmetic(typer, op, left, right, span)
     if isinstance(right, Number) and right.value == 0 and op == "div":
-        raise typer.fail("PD402", "division by zero", span)
+        raise typer.fail("PD402", "division by zero", syntax.children[1].span, "this is 0")
     whole = all((o.value.denominator == 1) if isinstance(o, Number) else o.kind.name == "int" for o in (left, right))
     if whole and op != "div":
         a, b = typer.whole(left, span), typer.whole(right, span)
@@ -159,11 +178,11 @@ def _bounds(op: str, a: Kind, b: Kind) -> Kind:
 def _vector_arithmetic(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
     left_is, right_is = (isinstance(o, Expr) and o.kind.name == "vec2" for o in (left, right))
     if op in ("add", "sub") and not (left_is and right_is):
-        raise typer.fail("PD401", "a vector adds up with vectors only", span, helps=("write `vector(rows, columns)`",))
+        raise typer.fail("PD401", "a vector adds up with vectors only", span, "one side is no vector", ("write `vector(rows, columns)`",))
     if (op == "mul" and left_is and right_is) or (op == "div" and right_is):
-        raise typer.fail("PD401", "a vector is multiplied or divided by a number", span)
+        raise typer.fail("PD401", "a vector is multiplied or divided by a number", span, "the other way round, or two vectors")
     if op == "div" and isinstance(right, Number) and right.value == 0:
-        raise typer.fail("PD402", "division by zero", span)
+        raise typer.fail("PD402", "division by zero", span, "the divisor is 0")
     a = left if left_is else typer.real(left, span)
     b = right if right_is else typer.real(right, span)
     return Expr(op, VEC2, (a, b), span=span)  # type: ignore[arg-type]

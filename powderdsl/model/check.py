@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,8 +11,8 @@ from powderdsl.model.compose import Composition, compose
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_examples
 from powderdsl.model.expressions import Scope, Typer
-from powderdsl.model.logic import check_logic, overridden_ids, produced_ids
-from powderdsl.model.operands import Asleep, Broken, Poisoned
+from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
+from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
 from powderdsl.model.packs import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.satisfy import Facts
 from powderdsl.model.symbols import (
@@ -30,6 +31,7 @@ from powderdsl.syntax.ast import Syntax
 def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Ruleset:
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter."""
     composition = compose(packs, ruleset, reporter)
+    reporter.raise_if_errors()  # with names that clash or packs that lack, rules would only be misread
     symbols = base_symbols(composition)
     typer = Typer(symbols, reporter)
     typer.set_definitions = {name: (named.pack, named.decl[1]) for name, named in composition.sets.items()}
@@ -41,6 +43,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     _sets(typer)
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
+    typer.report_unknown()
     reporter.raise_if_errors()
 
     elements = tuple(_tagged(element, composition) for element in composition.elements.values())
@@ -63,7 +66,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
         fields=tuple(symbols.fields.values()),
         streams=_streams(symbols, elaborated, reporter),
         params=tuple(symbols.params.values()),
-        passes=passes,
+        passes=without_dead_overrides(passes, frozenset(name for name, ids in stored.items() if not ids)),
         matrix=matrix,
         tests=examples,
     )
@@ -108,9 +111,17 @@ def _kind_of_literal(decl: TypedDecl, typer: Typer) -> Kind:
     if decl.default.kind in ("yes", "no"):
         return FLAG
     raise typer.fail(
-        "PD401", f"the parameter `{decl.name.text}` does not say its kind", decl.default.span, "not a percentage",
-        (f"write `{decl.name.text}: {{type: 0..9, default: {decl.default.span.text}}}`",),
+        "PD401", f"the parameter `{decl.name.text}` does not say its kind", decl.default.span, "neither a percentage nor `yes` or `no`",
+        (_kind_help(decl.name.text, decl.default.span.text),),
     )
+
+
+def _kind_help(name: str, value: str) -> str:
+    chance = f"`{100 * float(value):g}%`, or " if re.fullmatch(r"0?\.[0-9]+", value) else ""
+    if re.fullmatch(r"[0-9]{1,2}", value):
+        chance = f"`{value}%`, or "
+    bounds = "real(0..1)" if "." in value else "0..9"
+    return f"write {chance}`{name}: {{type: {bounds}, default: {value}}}`"
 
 
 def _constant(syntax: Syntax, kind: Kind, scope: Scope, typer: Typer) -> Value:
@@ -216,8 +227,10 @@ def _sets(typer: Typer) -> None:
         try:
             if name not in typer.symbols.constants:
                 typer.resolve_set(name, syntax.span)
-        except (Poisoned, Asleep):
+        except Poisoned:
             typer.symbols.constants.setdefault(name, Broken())
+        except Asleep:
+            typer.symbols.constants.setdefault(name, SetOf(()))
     typer.used.clear()
 
 
@@ -242,15 +255,20 @@ def _check_use(composition: Composition, typer: Typer, produced: frozenset[int],
     for name, named_set in composition.sets.items():
         if name not in typer.used:
             reporter.report("PD507", f"the set `{name}` is never used", named_set.decl[0].span, "no rule reads it", helps=["remove it"])
+        elif not typer.set_of(typer.symbols.constants[name], named_set.decl[0].span).ids:
+            reporter.report(
+                "PD505", f"the set `{name}` is empty", named_set.decl[1].span, "no element of the loaded packs is in it",
+                helps=["load a pack with such elements, or widen the set"],
+            )  # fmt: skip
     for name, kernel in composition.kernels.items():
         if name not in typer.used:
             reporter.report("PD507", f"the kernel `{name}` is never used", kernel.decl.name.span, "no rule reads it", helps=["remove it"])
     for name, ids in composition.tags.items():
         if not ids and name in typer.used:
-            reporter.report("PD505", f"nothing has the tag `{name}`", composition.tag_spans[name], "rules that ask for it stay quiet", helps=["load a pack whose elements have it"])
+            reporter.report("PD505", f"nothing has the tag `{name}`", composition.tag_spans[name], "rules that ask for it stay quiet", helps=["load a pack whose elements have it, or give it to an element"])
     for element in composition.elements.values():
         if element.id not in produced:
-            reporter.report("PD504", f"no rule produces `{element.name}`", element.span, "it must be in the start world, or painted")
+            reporter.report("PD504", f"no rule produces `{element.name}`", element.span, "it only comes from the start world, or by painting")
 
 
 def _matrix(composition: Composition, symbols: Symbols, reporter: Reporter) -> tuple[str, ...]:
@@ -260,6 +278,8 @@ def _matrix(composition: Composition, symbols: Symbols, reporter: Reporter) -> t
         return ("elements", *holds)
     known = ["elements", *symbols.properties, *symbols.fields]
     for scalar in composition.ruleset.matrix:
-        if scalar.text.removesuffix("?") not in known and not scalar.text.endswith("?"):
-            reporter.error("PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property", helps=[*suggest(scalar.text, known, "channels"), f"if its pack may be absent, write `{scalar.text}?`"])
+        name, _, part = scalar.text.removesuffix("?").partition(".")
+        if (name not in known or part not in ("", "row", "column")) and not scalar.text.endswith("?"):
+            helps = [*suggest(name, known, "channels"), f"if its pack may be absent, write `{scalar.text}?`"]
+            reporter.error("PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property", helps=helps)
     return tuple(s.text.removesuffix("?") for s in composition.ruleset.matrix)

@@ -62,11 +62,13 @@ def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Re
     names = _Names(reporter)
     elements, element_decls = _elements(packs, names, reporter)
     slots = max([ruleset.slots or 0 if ruleset else 0, *(e.id + 1 for e in elements.values()), 1])
-    if ruleset and ruleset.slots and slots > ruleset.slots:
-        top = max(elements.values(), key=lambda element: element.id)
+    # The ruleset's own packs must fit its slots; packs loaded on top of them add slots.
+    own = {scalar.text for scalar in ruleset.packs} if ruleset and ruleset.slots else set()
+    top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
+    if top and ruleset and ruleset.slots and top.id >= ruleset.slots:
         reporter.error(
             "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {ruleset.slots} slots", top.span,
-            helps=[f"say `slots: {slots}` in {ruleset.source.name}"],
+            helps=[f"say `slots: {top.id + 1}` in {ruleset.source.name}"],
         )
     tag_spans: dict[str, Span] = {}
     for pack in packs:
@@ -101,6 +103,11 @@ def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Re
     )
 
 
+def a(noun: str) -> str:
+    """The noun with its article."""
+    return f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
+
+
 class _Names:
     """One namespace for everything that rules can name."""
 
@@ -112,8 +119,8 @@ class _Names:
     def check_word(self, scalar: Scalar, kind: str) -> bool:
         if scalar.text in self.reserved:
             self.reporter.error(
-                "PD311", f"`{scalar.text}` is a word of the language", scalar.span, f"cannot name a {kind}",
-                helps=[f"write `{scalar.text}_` or another name"],
+                "PD311", f"`{scalar.text}` is a word of the language", scalar.span, f"cannot name {a(kind)}",
+                helps=[f"write `{scalar.text}_`, or choose another name"],
             )
             return False
         return True
@@ -125,8 +132,8 @@ class _Names:
         known = self.defined.get(scalar.text)
         if known is not None:
             self.reporter.error(
-                "PD302", f"`{scalar.text}` is defined twice", scalar.span, f"a {kind} of {pack}",
-                secondary=[Label(known[1].span, f"a {known[0]} of {known[2]}")],
+                "PD302", f"`{scalar.text}` is defined twice", scalar.span, f"{a(kind)} of {pack}",
+                secondary=[Label(known[1].span, f"{a(known[0])} of {known[2]}")],
                 helps=["rename one of them" + ("; to replace an element say `override: yes`" if kind == "element" else "")],
             )
             return False
@@ -140,15 +147,20 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
         for need in pack.needs:
             if need.text not in loaded:
                 reporter.error(
-                    "PD305", f"pack `{pack.name.text}` needs `{need.text}`, which is not loaded", need.span,
-                    helps=[f"load it too: `{'+'.join([need.text, *loaded])}`"],
+                    "PD305", f"pack `{pack.name.text}` needs `{need.text}`, which is not loaded", need.span, "not loaded",
+                    helps=[_need_help(need.text, pack.name.text, loaded)],
                 )
         for other in pack.conflicts:
             if other.text in loaded:
                 reporter.error(
-                    "PD306", f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together", other.span,
+                    "PD306", f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together", other.span, "says so",
                     secondary=[Label(loaded[other.text].name.span, "loaded too")], helps=["leave one of them out"],
                 )
+
+
+def _need_help(need: str, pack: str, loaded: Iterable[str]) -> str:
+    close = suggest(need, set(loaded) - {pack})
+    return close[0] if close and close[0].startswith("did") else f"load it too, as in `{need}+{pack}`"
 
 
 def _elements(
@@ -177,23 +189,36 @@ def _elements(
         if decl.id is None:
             continue
         if decl.id in by_id:
-            free = next(i for i in range(257) if i not in used)
+            free = next((i for i in range(256) if i not in used), None)
             reporter.error(
                 "PD303", f"elements `{by_id[decl.id].name.text}` and `{name}` have the same id {decl.id}",
                 decl.id_scalar.span if decl.id_scalar else decl.name.span, "already taken",
-                secondary=[Label(by_id[decl.id].name.span, "by this one")], helps=[f"id {free} is free"],
+                secondary=[Label(by_id[decl.id].name.span, "by this one")], helps=[] if free is None else [f"id {free} is free"],
             )
-            continue
         by_id[decl.id] = decl
         glyph = decl.glyph or next(
             (c for c in [*name, *name.upper(), *"0123456789@$&*+=<>"] if c.isalnum() | (c in "@$&*+=<>") and c not in glyphs), "?"
         )
         glyphs.add(glyph)
         elements[name] = Element(name, named.pack, decl.id, decl.color, glyph, decl.about, frozenset(), decl.name.span)
+    _check_glyphs(chosen, reporter)
     if not chosen:
         reporter.error("PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements", helps=["define `elements:`, or load `core` too"])
     ordered = dict(sorted(elements.items(), key=lambda item: item[1].id))
     return ordered, {name: chosen[name] for name in ordered}
+
+
+def _check_glyphs(chosen: dict[str, Named[ElementDecl]], reporter: Reporter) -> None:
+    """One character cannot stand for two elements."""
+    owners: dict[str, ElementDecl] = {}
+    for named in chosen.values():
+        decl = named.decl
+        first = owners.setdefault(decl.glyph, decl)
+        if decl.glyph and first is not decl:
+            reporter.error(
+                "PD302", f"elements `{first.name.text}` and `{decl.name.text}` have the same glyph `{decl.glyph}`",
+                decl.name.span, "this one", secondary=[Label(first.name.span, "and this one")], helps=["give one of them another glyph"],
+            )  # fmt: skip
 
 
 def _tags(
@@ -278,5 +303,5 @@ def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], repor
     ]
     reporter.error(
         "PD307", "passes wait for each other: " + " after ".join(f"`{name}`" for name in cycle),
-        labels[0].span, labels[0].text, secondary=labels[1:], helps=["remove one of these lines"],
+        labels[0].span, labels[0].text, secondary=labels[1:], helps=["take one of these names out of its `after` or `before`"],
     )

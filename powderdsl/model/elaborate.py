@@ -17,6 +17,7 @@ from powderdsl.model.operands import (
     Operand,
     Place,
     Poisoned,
+    SetOf,
     conjunction,
     constant,
 )
@@ -126,7 +127,7 @@ class Elaborator:
         """A new local name may not hide another."""
         if name in scope.locals or self.typer.find(name, span, Scope(scope.pack, {})) is not None:
             self.typer.reporter.error(
-                "PD308", f"`{name}` already means something here", span, "the same word", helps=["choose another name"]
+                "PD308", f"`{name}` already means something here", span, "hides the other meaning", helps=["choose another name"]
             )
 
     def _block(self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None) -> None:
@@ -289,17 +290,21 @@ class Elaborator:
         operand: Operand
         offset = (0, 0)
         if syntax.kind == "attribute":
-            base = self.typer.place(self.typer.evaluate(syntax.children[0], scope), syntax.children[0].span)
+            base = self._owner(syntax, scope)
             offset = self.typer.offset(base.offset, syntax.span)
-            operand = self.typer.lookup(syntax.text, syntax.span, scope)
+            word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
+            operand = self.typer.lookup(syntax.text, word, scope, after_dot=True)
         else:
             operand = self.typer.evaluate(syntax, scope)
         if isinstance(operand, Absent):
             raise Asleep(operand.name)
         if not isinstance(operand, Expr) or operand.op not in ("field", "property"):
             fields = [*self.typer.symbols.fields, *self.typer.symbols.properties, *(n.split(".")[1] for n in self._scratch)]
+            helps = suggest(syntax.text, fields, "fields")
+            if isinstance(operand, (SetOf, Place)):
+                helps = ("one element becomes another with `->`: `SET -> ELEMENT if …`",)
             raise self.typer.fail(
-                "PD407", f"`{syntax.span.text}` cannot be assigned", syntax.span, "not a field or property", suggest(syntax.text, fields, "fields")
+                "PD407", f"`{syntax.span.text}` cannot be assigned", syntax.span, "not a field or property", helps
             )
         name = str(operand.value)
         if operand.op == "property":
@@ -307,6 +312,18 @@ class Elaborator:
                 raise self.typer.fail("PD407", f"the chance `{name}` cannot be assigned", syntax.span, "chances belong to elements", ("declare it as a whole number",))
             self.result.overridden.add(name)
         return name, operand.kind, offset
+
+    def _owner(self, syntax: Syntax, scope: Scope) -> Place:
+        """The neighbour before the dot of an assigned field."""
+        before = syntax.children[0]
+        operand = self.typer.evaluate(before, scope)
+        if isinstance(operand, SetOf):
+            cure = f"write `{syntax.text} := … where {before.span.text}`"
+            raise self.typer.wrong(operand, "a neighbour before the dot", before.span, cure)
+        if isinstance(operand, Expr) and operand.kind == VEC2:
+            cure = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
+            raise self.typer.fail("PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", (cure,))
+        return self.typer.place(operand, before.span)
 
     def _push(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         target, amount, source = syntax.children[:3]

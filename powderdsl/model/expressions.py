@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
 
-from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model import arithmetic
 from powderdsl.model.builtins import COORDINATES, FUNCTIONS
 from powderdsl.model.calls import CALLS
@@ -33,7 +33,7 @@ from powderdsl.model.operands import (
     negation,
 )
 from powderdsl.model.symbols import Symbols
-from powderdsl.model.types import CHANCE, DIRECTION, DRAW, FLAG, Expr, Kernel, Offset
+from powderdsl.model.types import CHANCE, DIRECTION, DRAW, ELEMENT, FLAG, Expr, Kernel, Offset
 from powderdsl.syntax.ast import Syntax
 
 Matrix = tuple[tuple[int, int], tuple[int, int]]
@@ -62,6 +62,8 @@ class Typer(Coercer):
         self.absent: set[str] = set()
         self.set_definitions: dict[str, tuple[str, Syntax]] = {}
         self.resolving: list[str] = []
+        self._unknown: dict[tuple[str, bool], dict[Span, None]] = {}
+        self._cures: dict[tuple[str, bool], tuple[str, ...]] = {}
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """What the syntax stands for. Raises Poisoned after reporting, Asleep if it hangs on an absent name."""
@@ -72,15 +74,41 @@ class Typer(Coercer):
 
     # Names
 
-    def lookup(self, name: str, span: Span, scope: Scope) -> Operand:
+    def lookup(self, name: str, span: Span, scope: Scope, *, after_dot: bool = False) -> Operand:
+        """The operand of a name. An unknown one is reported once, with all its places, by `report_unknown`."""
         found = self.find(name, span, scope)
         if found is not None:
             return found
-        known = [*scope.locals, *self.symbols.names()]
-        packs = "+".join(pack.name.text for pack in self.symbols.composition.packs)
-        label = f"nothing of this name in {packs}"
-        helps = suggest(name, known) or ("is its pack loaded? if it may be absent, write `" + name + "?`",)
-        raise self.fail("PD301", f"unknown name `{name}`", span, label, helps)
+        if self.symbols.is_declared(name, scope.pack):
+            raise Poisoned  # what is wrong with its declaration has been reported
+        known = self.symbols.names(after_dot=after_dot)
+        if not after_dot:
+            known += [*scope.locals, *FUNCTIONS]
+        key = (name, after_dot)
+        self._unknown.setdefault(key, {})[span] = None
+        self._cures[key] = self._cure(name, known)
+        raise Poisoned
+
+    def _cure(self, name: str, known: list[str]) -> tuple[str, ...]:
+        elsewhere = [qualified for qualified in self.symbols.params if qualified.endswith(f".{name}")]
+        if elsewhere:
+            return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)
+        close = suggest(name, known)
+        if close and close[0].startswith("did"):
+            return close
+        return (f"load the pack that defines it, or write `{name}?` if that may be absent",)
+
+    def report_unknown(self) -> None:
+        """Report every unknown name that came up: one diagnostic a name, however often it is used."""
+        for key, places in self._unknown.items():
+            first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
+            labels = [Label(span, "and here") for span in others[:4]]
+            notes = [f"and in {len(others) - 4} more places"] if len(others) > 4 else []
+            label = "no loaded pack has such a field or property" if key[1] else "no loaded pack defines it"
+            self.reporter.error(
+                "PD301", f"unknown name `{key[0]}`", first, label, secondary=labels, notes=notes, helps=self._cures[key]
+            )
+        self._unknown.clear()
 
     def find(self, name: str, span: Span, scope: Scope) -> Operand | None:
         """The operand of a name, or None if there is none."""
@@ -93,6 +121,8 @@ class Typer(Coercer):
         if name in self.set_definitions and name not in symbols.constants:
             return self.resolve_set(name, span)
         if name in symbols.constants:
+            if isinstance(symbols.constants[name], Broken):
+                raise Poisoned
             return self.turn(symbols.constants[name], scope)
         if name in symbols.properties:
             return Expr("property", symbols.properties[name].kind, value=name, span=span)
@@ -108,7 +138,8 @@ class Typer(Coercer):
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
-            raise self.fail("PD307", f"the set `{name}` is defined by itself", span)
+            path = " -> ".join(f"`{other}`" for other in [*self.resolving[self.resolving.index(name) :], name])
+            raise self.fail("PD307", f"the set `{name}` is defined by itself", span, path, ("list elements or tags",))
         pack, syntax = self.set_definitions[name]
         self.resolving.append(name)
         try:
@@ -136,10 +167,10 @@ class Typer(Coercer):
     def name(self, syntax: Syntax, scope: Scope) -> Operand:
         if syntax.text in COORDINATES:
             raise self.fail(
-                "PD406", f"`{syntax.text}` stands with `mod`", syntax.span, helps=(f"write `{syntax.text} mod 2`",)
+                "PD406", f"`{syntax.text}` stands without `mod`", syntax.span, "endless by itself", (f"write `{syntax.text} mod 2`",)
             )
         if syntax.text in FUNCTIONS:
-            raise self.fail("PD406", f"`{syntax.text}` is a function", syntax.span, helps=(f"write `{FUNCTIONS[syntax.text].signature}`",))
+            raise self.fail("PD406", f"`{syntax.text}` is a function", syntax.span, "its values are missing", helps=(f"write `{FUNCTIONS[syntax.text].signature}`",))
         return self.lookup(syntax.text, syntax.span, scope)
 
     def optional_name(self, syntax: Syntax, scope: Scope) -> Operand:
@@ -164,10 +195,10 @@ class Typer(Coercer):
         if isinstance(base, Expr) and base.kind.name == "vec2":
             if syntax.text in ("row", "column"):
                 return arithmetic.part(base, syntax.text, syntax.span)
-            raise self.fail("PD301", f"a vector has no `{syntax.text}`", word, helps=("parts of a vector: `.row`, `.column`",))
+            raise self.fail("PD301", f"a vector has no `{syntax.text}`", word, "not a part of it", helps=("parts of a vector: `.row`, `.column`",))
         if not isinstance(base, Place):
             raise self.wrong(base, "a neighbour before the dot", base_syntax.span, "such as `below.density`")
-        value = self.lookup(syntax.text, word, scope)
+        value = self.lookup(syntax.text, word, scope, after_dot=True)
         match value:
             case Place():
                 offset = (base.offset[0] + value.offset[0], base.offset[1] + value.offset[1])
@@ -176,7 +207,7 @@ class Typer(Coercer):
                 return look(value, self.offset(base.offset, syntax.span), syntax.span)
             case SetOf():
                 text = f"{base_syntax.span.text} is {syntax.text}"
-                raise self.fail("PD401", f"`{syntax.text}` is {'an element' if value.name else 'a set'}", word, helps=(f"write `{text}`",))
+                raise self.fail("PD401", f"`{syntax.text}` is no field or property", word, f"this is {'an element' if value.name else 'a set of elements'}", helps=(f"write `{text}`",))
         raise self.wrong(value, "a field, property or neighbour after the dot", word)
 
     # Literals and lists
@@ -219,6 +250,7 @@ class Typer(Coercer):
 
     def compare(self, syntax: Syntax, scope: Scope) -> Operand:
         operands = [self.evaluate(child, scope) for child in syntax.children]
+        self._no_sets(operands, syntax)
         headings = any(isinstance(operand, Expr) and operand.kind == DIRECTION for operand in operands)
         values = [
             self.direction(operand, child.span) if headings and isinstance(operand, Place) else self.value(operand, child.span)
@@ -227,8 +259,17 @@ class Typer(Coercer):
         parts = []
         for i, operator in enumerate(syntax.text.split()):
             span = syntax.children[i].span.to(syntax.children[i + 1].span)
-            parts.append(arithmetic.compare(self, operator, values[i], values[i + 1], span))
+            places = (syntax.children[i].span, syntax.children[i + 1].span)
+            parts.append(arithmetic.compare(self, operator, values[i], values[i + 1], span, places))
         return conjunction(parts, syntax.span)
+
+    def _no_sets(self, operands: list[Operand], syntax: Syntax) -> None:
+        """`below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`."""
+        places = any(isinstance(operand, Place) or isinstance(operand, Expr) and operand.kind == ELEMENT for operand in operands)
+        for operand, child in zip(operands, syntax.children, strict=True):
+            if places and isinstance(operand, (SetOf, Items)) and getattr(operand, "name", None) is None:
+                cure = "write `is` or `is not` instead of `==` or `!=`"
+                raise self.wrong(operand, "one element to compare with", child.span, cure)
 
     def is_(self, syntax: Syntax, scope: Scope) -> Operand:
         positive = syntax.kind in ("is_", "in_")
@@ -262,7 +303,7 @@ class Typer(Coercer):
             case _, Items() if any(isinstance(item, (Number, Place)) for item in right.items):
                 return disjunction([self.equals(left, item, syntax) for item in right.items], span)
             case _, Number():
-                raise self.fail("PD401", "`is` asks for an element or a direction", span, helps=("compare numbers with `==`",))
+                raise self._not_a_set(syntax)
             case _, Absent():
                 return FALSE
             case Absent(), _:
@@ -277,6 +318,16 @@ class Typer(Coercer):
         if isinstance(item, Number) and not isinstance(left, Number):
             return arithmetic.compare(self, "==", self.value(left, syntax.children[0].span), item, syntax.span)
         return self.holds(left, item, syntax)
+
+    def _not_a_set(self, syntax: Syntax) -> Poisoned:
+        second = syntax.children[1]
+        if syntax.kind in ("is_", "is_not"):
+            return self.fail(
+                "PD401", "`is` asks for an element or a direction", second.span, "this is a number",
+                ("compare numbers with `==`",),
+            )  # fmt: skip
+        cure = "a range is written `LOW..HIGH`" if second.kind == "subtract" else "compare numbers with `==`"
+        return self.fail("PD401", "`in` asks for a range or a set", second.span, "this is a number", (cure,))
 
     def choose(self, syntax: Syntax, scope: Scope) -> Operand:
         yes, condition, no = syntax.children
@@ -297,7 +348,7 @@ class Typer(Coercer):
         for binding in bindings:
             variable, domain = binding.children
             if self.find(variable.text, variable.span, scope) is not None or any(d and d[0][0] == variable.text for d in domains):
-                raise self.fail("PD308", f"`{variable.text}` already means something here", variable.span, "choose another name")
+                raise self.fail("PD308", f"`{variable.text}` already means something here", variable.span, "hides the other meaning", ("choose another name",))
             self.used.add(variable.text)
             domains.append([(variable.text, value) for value in self.domain(domain, scope)])
         return [scope.bind(**dict(choice)) for choice in product(*domains)]
@@ -325,7 +376,7 @@ class Typer(Coercer):
             raise self.fail("PD301", f"unknown function `{syntax.text}`", name_span, "not a function", suggest(syntax.text, FUNCTIONS, "functions"))
         lo, hi = function.arity
         if not lo <= len(syntax.children) <= hi:
-            raise self.fail("PD406", f"`{syntax.text}` takes {lo if lo == hi else f'{lo} to {hi}'} values, found {len(syntax.children)}", syntax.span, helps=(f"write `{function.signature}`",))
+            raise self.fail("PD406", f"`{syntax.text}` takes {lo if lo == hi else f'{lo} to {hi}'} values, found {len(syntax.children)}", syntax.span, "too few" if len(syntax.children) < lo else "too many", helps=(f"write `{function.signature}`",))
         return CALLS[syntax.text](self, syntax, scope)
 
     def binary(self, syntax: Syntax, scope: Scope) -> Operand:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.operands import ELEMENT_HERE, negation
@@ -23,10 +25,42 @@ from powderdsl.model.types import (
 HERE: Offset = (0, 0)
 
 
+@dataclass(frozen=True)
+class Conflict:
+    """Two rules (or two copies of one) that may claim one cell. Rounds of a loop repeat it, so it is a value."""
+
+    code: str
+    message: str
+    first: Span
+    second: Span
+    notes: tuple[str, ...]
+    helps: tuple[str, ...]
+
+    def report(self, labels: list[str], reporter: Reporter) -> None:
+        """Report it once, whatever the number of rounds that have it."""
+        where = f" ({labels[0]})" if labels[0] else ""
+        notes = list(self.notes)
+        if len(labels) > 1:
+            more = "copy" if len(labels) == 2 else "copies"
+            notes.append(f"the same in {len(labels) - 1} more {more} of the rule that its loop or symmetry makes")
+        one = self.first == self.second
+        reporter.error(
+            self.code, self.message + where, head(self.second), "claims two cells" if one else "claims it too",
+            secondary=[] if one else [Label(head(self.first), "claims a cell")], notes=notes, helps=self.helps,
+        )  # fmt: skip
+
+
+def head(span: Span) -> Span:
+    """What a rule does, without its condition: the part of its text to underline."""
+    rest = re.search(r",?\s+(if|where|with|then)\b", span.text)
+    return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
+
+
 def check_logic(passes: tuple[Pass, ...], facts: Facts, sleeping: dict[Span, str], reporter: Reporter) -> None:
     """Report conflicts (errors) and rules that never fire or do nothing (warnings)."""
     alive: dict[Span, bool] = {}
     useful: dict[Span, bool] = {}
+    conflicts: dict[Conflict, list[str]] = {}
     for pass_ in passes:
         for moment in pass_.moments:
             lets = {let.name: let.value for let in moment.lets}
@@ -38,17 +72,23 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, sleeping: dict[Span, str
                 if fires:
                     live.append(rule)
             if moment.policy == "prove":
-                _check_moment(pass_, moment, live, facts, lets, reporter)
+                for conflict in _check_moment(live, facts, lets):
+                    conflicts.setdefault(conflict, []).append(moment.label)
+    for conflict, labels in conflicts.items():
+        conflict.report(labels, reporter)
     for span, fires in alive.items():
         if not fires and span in sleeping:
             reporter.report("PD506", f"this rule is asleep: {sleeping[span]}", span, "cannot fire with these packs")
         elif not fires:
             reporter.report(
-                "PD503", "this rule can never fire", span, "its condition contradicts itself",
-                helps=["check which elements have the properties it asks for: `powderdsl show`"],
+                "PD503", "this rule can never fire", span, "no cell can fulfil all of it",
+                helps=["look for conditions that exclude each other, or that no element's properties meet"],
             )
         elif not useful[span]:
-            reporter.report("PD509", "this rule changes nothing", span, "the cell already is what it becomes")
+            reporter.report(
+                "PD509", "this rule changes nothing", span, "the cell already is what it becomes",
+                helps=["remove it, or name another element after `->`"],
+            )  # fmt: skip
 
 
 def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
@@ -58,16 +98,13 @@ def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
     return True
 
 
-def _check_moment(
-    pass_: Pass, moment: Moment, rules: list[Rule], facts: Facts, lets: dict[str, Expr], reporter: Reporter
-) -> None:
-    where = f" ({moment.label})" if moment.label else ""
+def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Iterator[Conflict]:
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
     for i, first in enumerate(movers):
         for second in movers[i:]:
             for shift in _claims(first, second):
                 if satisfiable(facts, [(first.mask, HERE), (second.mask, shift)], lets):
-                    _report_conflict(pass_, first, second, where, reporter)
+                    yield _conflict(first, second)
                     break
     assigns = [rule for rule in rules if isinstance(rule, Assign) and rule.op == ":="]
     for i, a in enumerate(assigns):
@@ -77,11 +114,8 @@ def _check_moment(
             shift = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
             assert a.mask is not None and b.mask is not None
             if satisfiable(facts, [(a.mask, HERE), (b.mask, shift)], lets):
-                reporter.error(
-                    "PD502", f"two rules may assign `{a.field}` of one cell in the same moment{where}", b.span,
-                    "this one, and", secondary=[Label(a.span, "this one")],
-                    helps=["make their conditions exclude each other, or put one under `then:`"],
-                )
+                message = f"two rules may assign `{a.field}` of one cell in the same moment"
+                yield Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
 
 
 def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
@@ -109,27 +143,21 @@ def _footprint(rule: Rule) -> tuple[Offset, ...]:
     return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)
 
 
-def _report_conflict(pass_: Pass, first: Rule, second: Rule, where: str, reporter: Reporter) -> None:
+_EXCLUDE = "make their conditions exclude each other, or put one under `then:`"
+
+
+def _conflict(first: Rule, second: Rule) -> Conflict:
     if first is second or first.span == second.span:
-        reporter.error(
-            "PD501", f"a cell may be both mover and target{where}", first.span, "two of these swaps can meet in one cell",
-            notes=["swaps of one moment happen at once: no cell may take part in two of them"],
-            helps=[
-                "add a condition that a target cannot fulfil, such as a comparison of densities",
-                "or choose what happens then: `conflicts: drop_both`",
-            ],
+        note = "the moves of one moment happen at once: no cell may take part in two of them"
+        helps = (
+            "add a condition that a target cannot fulfil, such as a comparison of densities",
+            "or choose what happens then: `conflicts: drop_both`",
         )
-        return
+        return Conflict("PD501", "a cell may be both mover and target", first.span, first.span, (note,), helps)
     movement = isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move))
-    reporter.error(
-        "PD501" if movement else "PD502",
-        f"two rules may claim one cell in the same moment{where}", second.span, "this one, and",
-        secondary=[Label(first.span, "this one")],
-        helps=[
-            "make their conditions exclude each other, or put one under `then:`",
-            "or choose what happens then: `conflicts: first_wins` or `conflicts: drop_both`",
-        ],
-    )
+    message = "two rules may claim one cell in the same moment"
+    choice = "or choose what happens then: `conflicts: first_wins` or `conflicts: drop_both`"
+    return Conflict("PD501" if movement else "PD502", message, first.span, second.span, (), (_EXCLUDE, choice))
 
 
 def overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
@@ -162,3 +190,12 @@ def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
                 if target is not None:
                     found |= {target.value} if target.op == "const" else set(facts.ids)  # type: ignore[arg-type]
     return frozenset(found)
+
+
+def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
+    """The passes without assignments to properties that no cell can come to override: there is no place for them."""
+
+    def kept(moment: Moment) -> Moment:
+        return replace(moment, rules=tuple(r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)))
+
+    return tuple(replace(pass_, moments=tuple(kept(moment) for moment in pass_.moments)) for pass_ in passes)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 
-from powderdsl.diagnostics import Reporter, Span
+from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import MAX_MAGNITUDE, MAX_OFFSET, OCTANTS
 from powderdsl.model.types import (
     CHANCE,
@@ -98,7 +98,7 @@ def describe(operand: Operand) -> str:
     match operand:
         case Expr():
             return {"int": "a whole number", "flag": "a condition", "element": "an element", "direction": "a direction",
-                    "chance": "a chance", "draw": "a random draw", "real": "a number", "vec2": "a vector"}[operand.kind.name]  # fmt: skip
+                    "chance": "a chance", "draw": "a random draw", "real": "a number", "vec2": "a vector"}.get(operand.kind.name, "a number")  # fmt: skip
         case SetOf():
             return "an element" if operand.name else "a set of elements"
         case Place():
@@ -121,13 +121,26 @@ class Coercer:
 
     def __init__(self, reporter: Reporter):
         self.reporter = reporter
+        self._misused: set[tuple[Span, str]] = set()
 
     def fail(self, code: str, message: str, span: Span, label: str = "", helps: tuple[str, ...] = ()) -> Poisoned:
         self.reporter.error(code, message, span, label, helps=helps)
         return Poisoned()
 
     def wrong(self, operand: Operand, wanted: str, span: Span, *helps: str) -> Poisoned:
-        return self.fail("PD401", f"expected {wanted}, found {describe(operand)}", span, f"this is {describe(operand)}", helps)
+        if isinstance(operand, Broken):
+            return Poisoned()
+        found = describe(operand)
+        secondary = []
+        if isinstance(operand, Expr) and operand.op == "let" and operand.span is not None and operand.span != span:
+            if (operand.span, wanted) in self._misused:
+                return Poisoned()  # one value of the wrong kind is one mistake, however often it is used
+            self._misused.add((operand.span, wanted))
+            secondary = [Label(operand.span, "its value, set here")]
+        self.reporter.error(
+            "PD401", f"expected {wanted}, found {found}", span, f"this is {found}", secondary=secondary, helps=helps
+        )
+        return Poisoned()
 
     def flag(self, operand: Operand, span: Span) -> Expr:
         match operand:
@@ -141,6 +154,8 @@ class Coercer:
                 return FALSE
             case Expr() if operand.kind.name == "int":
                 raise self.wrong(operand, "a condition", span, "compare it: `… > 0`")
+            case Expr() if operand.kind.name == "draw":
+                raise self.wrong(operand, "a condition", span, "compare it with a chance: `… < 5%`")
             case Place():
                 raise self.wrong(operand, "a condition", span, "say what is there: `… is ELEMENT`")
         raise self.wrong(operand, "a condition", span)
@@ -220,7 +235,9 @@ class Coercer:
         if isinstance(value, Number):
             if not 0 <= value.value <= 1:
                 shown = f"{float(value.value * 100):g}%"
-                raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%")
+                meant = 1 < value.value <= 100 and "%" not in span.text
+                cure = f"did you mean `{float(value.value):g}%`?" if meant else "write a chance from `0%` to `100%`"
+                raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%", (cure,))
             return Expr("const", CHANCE, value=value.value, span=span)
         if value.kind.name in ("chance", "real"):
             return value

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from powderdsl.diagnostics import Reporter, Source
+from powderdsl.diagnostics import Label, Reporter, Source, Span
 from powderdsl.model.schema import KEYS, Reader, first_line
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
@@ -144,6 +144,14 @@ def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | No
     reader = _PackReader(reporter, source)
     if tree.get("ruleset") is not None:
         return reader.ruleset(tree)
+    if tree.entries and not any(key.text in KEYS["pack"] for key, _ in tree.entries if key.text != "about"):
+        key = tree.entries[0][0]
+        drawn = key.text in ("scene", "scenes")
+        reporter.error(
+            "PD109", "a file without `pack` or `ruleset`", key.span, "this is a drawn world" if drawn else "not a rule file",
+            helps=["name it as a world, not among the rules" if drawn else "a pack starts with `pack: NAME`"],
+        )  # fmt: skip
+        return None
     return reader.pack(tree)
 
 
@@ -262,7 +270,7 @@ class _PackReader(Reader):
                 entries = self.mapping(value, "stream", f"the stream `{key.text}`")
                 bits = self.number(entries, "bits", 16, 32) or 16
                 if bits not in (16, 32):
-                    self.reporter.error("PD110", "`bits` must be 16 or 32", self.scalar(entries, "bits").span)  # type: ignore[union-attr]
+                    self.reporter.error("PD110", "`bits` must be 16 or 32", entries["bits"][1].span, "neither of them")
                     bits = 16
                 found.append(StreamDecl(key, bits))
             return tuple(found)
@@ -280,12 +288,16 @@ class _PackReader(Reader):
         for word in self.words(rows_node):
             parts = word.text.split()
             if not all(re.fullmatch(r"-?[0-9]{1,3}", part) for part in parts):
-                self.reporter.error("PD110", "a kernel row has whole weights", word.span, "not a row of whole numbers", helps=['write "1 0 1"'])
+                self.reporter.error(
+                    "PD110", "a kernel row that is not whole numbers", word.span, "not a row of weights", helps=['write "1 0 1"']
+                )
                 return None
             rows.append(tuple(int(part) for part in parts))
         if not rows or len(rows) % 2 == 0 or len({len(row) for row in rows}) != 1 or len(rows[0]) % 2 == 0 or max(len(rows), len(rows[0])) > 31:
             self.reporter.error(
-                "PD110", f"kernel `{key.text}` has no middle", key.span, "needs an odd number of equally long rows of an odd length, up to 31"
+                "PD110", f"kernel `{key.text}` has no middle", key.span,
+                f"{len(rows)} row{'s' * (len(rows) != 1)} of {', '.join(sorted({str(len(row)) for row in rows})) or 'no'} weights",
+                helps=["write an odd number of rows, each with the same odd number of weights, at most 31"],
             )
             return None
         return KernelDecl(key, tuple(rows), wrap)
@@ -294,19 +306,32 @@ class _PackReader(Reader):
         entries = self.mapping(node, "element", f"the element `{key.text}`")
         color = self.scalar(entries, "color")
         if color is not None and not re.fullmatch(r"#[0-9A-Fa-f]{6}", color.text):
-            helps = ['YAML takes an unquoted `#` for a comment: write "#RRGGBB" with quotes'] if color.text in ("", "~") else ['write "#RRGGBB"']
-            span = entries["color"][0].span if color.text == "" else color.span
-            self.reporter.error("PD110", f"`{color.text}` is not a colour", span, 'expected "#RRGGBB"', helps=helps)
+            rest = self._comment_after(color)
+            helps = ['put quotes around it: color: "#RRGGBB"']
+            if rest is not None:
+                self.reporter.error("PD110", "a colour that YAML takes for a comment", rest, "a comment", helps=helps)
+            else:
+                self.reporter.error("PD110", f"`{color.text}` is not a colour", color.span, 'expected "#RRGGBB"', helps=helps)
             color = None
         glyph = self.scalar(entries, "glyph")
         if glyph is not None and not (len(glyph.text) == 1 and "!" <= glyph.text <= "~" and glyph.text != "?"):
-            self.reporter.error("PD110", "a glyph is one ASCII character", glyph.span, "expected one printable character, not `?`")
+            self.reporter.error("PD110", f"`{glyph.text}` is not a glyph", glyph.span, "expected one printable ASCII character, not `?`", helps=['quote it: glyph: "#"'])
             glyph = None
         return ElementDecl(
             key, self.number(entries, "id", 0, 255), self.scalar(entries, "id"), color.text.upper() if color else "#000000",
             glyph.text if glyph else "", self.text(entries, "about"), self.words(entries.get("tags", (None, None))[1]),
             self.open_values(entries, "element"), self.choice(entries, "override", ("yes", "no", "true", "false")) in ("yes", "true"),
         )
+
+    def _comment_after(self, value: Scalar) -> Span | None:
+        """The comment that stands where a value should, if there is one."""
+        text = self.source.text
+        end = text.find("\n", value.span.start)
+        line = text[value.span.start : end if end >= 0 else len(text)]
+        if value.text or not line.lstrip().startswith("#"):
+            return None
+        start = value.span.start + line.index("#")
+        return Span(self.source, start, start + len(line[line.index("#") :].rstrip()))
 
     def also(self, key: Scalar, node: Node) -> AlsoDecl:
         if isinstance(node, (Sequence, Scalar)):
@@ -332,8 +357,8 @@ class _PackReader(Reader):
         actions = [(key, value) for key, value in entries.values() if key.text == "do" or key.text.startswith(("for ", "repeat "))]
         if len(actions) > 1:
             self.reporter.error(
-                "PD107", "a block does one thing", actions[1][0].span, "a second action",
-                helps=["what comes next stands under `then:`"],
+                "PD107", "a block with two actions", actions[1][0].span, "the second one",
+                secondary=[Label(actions[0][0].span, "the first one")], helps=["put what comes next under `then:`"],
             )
         header = None
         rules: tuple[Syntax, ...] = ()
@@ -343,8 +368,8 @@ class _PackReader(Reader):
             if key.text != "do":
                 header = parse_scalar(key, "header", self.reporter)
             rules, blocks = self.body(body)
-        elif "then" not in entries:
-            self.reporter.error("PD109", "a block does something", first_line(node), "`do:`, `for …:` or `repeat …:` is missing")
+        elif "then" not in entries and isinstance(node, Mapping) and len(entries) == len(node.entries):
+            self.reporter.error("PD109", "a block that does nothing", first_line(node), "it lacks `do:`, `for …:` or `repeat …:`", helps=["put the rules under `do:`"])
         then: tuple[Block, ...] = ()
         if "then" in entries:
             then_rules, then_blocks = self.body(entries["then"][1])
@@ -361,9 +386,9 @@ class _PackReader(Reader):
         if len(kinds) > 1:
             first = next(item for item in items if isinstance(item, Mapping) != isinstance(items[0], Mapping))
             self.reporter.error(
-                "PD204", "a list of rules is one moment, a list of blocks a sequence", first_line(first), "this is of the other kind",
-                helps=["put the rules of one moment into a block of their own: `- do: [...]`"],
-                notes=["a rule with `: ` in it reads as a mapping to YAML"],
+                "PD204", "rules and blocks in one list", first_line(first), "not of the kind of the first item",
+                notes=["a list of rules is one moment; a list of blocks happens one after the other"],
+                helps=["put each group of rules under a `- do:` of its own; quote a rule that has `: ` in it"],
             )
             return (), ()
         if True in kinds:
@@ -387,7 +412,7 @@ class _PackReader(Reader):
             if match:
                 steps = int(match[1])
             else:
-                self.reporter.error("PD110", "`after` says how many steps", after.span, "expected `50 steps`")
+                self.reporter.error("PD110", "`after` says how many steps", after.span, "not a number of steps", helps=["write `50 steps`"])
         always = entries.get("always", (None, None))[1]
         lines = () if always is None else tuple(line for item in (always.items if isinstance(always, Sequence) else (always,)) if (line := self.line(item)))
         return TestDecl(

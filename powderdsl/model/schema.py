@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
@@ -142,34 +143,52 @@ class Reader:
     def mapping(self, node: Node, context: str, what: str) -> dict[str, tuple[Scalar, Node]]:
         """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""
         if not isinstance(node, Mapping):
-            self.shape(node, f"a mapping with the keys of {what}", "known keys: " + ", ".join(KEYS[context]))
+            cure = "known keys: " + ", ".join(KEYS[context])
+            if isinstance(node, Scalar) and node.text:
+                cure = "a key ends with `:`" if node.text.startswith(PREFIXES.get(context, ("\0",))) else cure
+            self.shape(node, f"a mapping with the keys of {what}", cure)
             return {}
         known = KEYS[context]
+        missing = {name for name, row in known.items() if row.required and node.get(name) is None}
         entries: dict[str, tuple[Scalar, Node]] = {}
         for key, value in node.entries:
             prefixed = key.text.startswith(PREFIXES.get(context, ())) and bool(PREFIXES.get(context))
-            if key.text in known or prefixed or context in OPEN:
+            misspelt = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
+            if key.text in known or prefixed or (context in OPEN and not misspelt):
                 entries[key.text] = (key, value)
                 if key.text in known:
                     self._check_shape(known[key.text], key, value)
             else:
+                missing -= set(misspelt)  # a key that is there under a wrong name is one mistake
                 self.reporter.error(
                     "PD108", f"unknown key `{key.text}`", key.span, f"not a key of {what}",
-                    helps=suggest(key.text, known, f"keys of {what}") or ["known keys: " + ", ".join(known)],
+                    helps=self._key_help(key.text, context, what),
                 )
-        for name, key_row in known.items():
-            if key_row.required and name not in entries:
-                self.reporter.error(
-                    "PD109", f"{what} lacks `{name}`", Span(node.span.source, node.span.start, node.span.start + 1),
-                    f"`{name}` is missing", helps=[f"`{name}`: {key_row.about}"],
-                )
+        for name in sorted(missing):
+            start = node.span.start
+            self.reporter.error(
+                "PD109", f"{what} lacks `{name}`", Span(node.span.source, start, start + 1),
+                f"`{name}` is missing", helps=[f"`{name}`: {known[name].about}"],
+            )  # fmt: skip
         return entries
+
+    def _key_help(self, word: str, context: str, what: str) -> tuple[str, ...]:
+        """The cure for an unknown key: what it should be called, where it belongs, or that it is a rule."""
+        if any(sign in word for sign in ("->", ":=", " swaps ", " moves ", "swap ")):
+            return ("YAML takes text before `: ` for a key: quote the rule",)
+        close = suggest(word, KEYS[context], f"keys of {what}")
+        if close and close[0].startswith("did"):
+            return close
+        homes = [home for home in ("pack", "pass", "element") if home != context and word in KEYS[home]]
+        if homes:
+            article = "an" if homes[0] == "element" else "a"
+            return (f"`{word}` is a key of {article} {homes[0]}: check the indentation",)
+        return close or ("known keys: " + ", ".join(KEYS[context]),)
 
     def _check_shape(self, row: Key, key: Scalar, value: Node) -> None:
         wants_scalar = row.shape in ("text", "word", "number", "flag", "line")
         if wants_scalar and not isinstance(value, Scalar):
-            help_text = "in a `{…}` a value with commas needs quotes, or a line of its own" if isinstance(value, Mapping) else ""
-            self.shape(value, f"a single value for `{key.text}`", help_text)
+            self.shape(value, f"a single value for `{key.text}`", f"`{key.text}`: {row.about}")
 
     def named(self, node: Node | None, what: str) -> Iterator[tuple[Scalar, Node]]:
         """Entries of a mapping whose keys are new names; bad names are reported and left out."""
@@ -188,8 +207,6 @@ class Reader:
             return True
         clean = re.sub(r"[^A-Za-z0-9_]+", "_", key.text).strip("_")[:MAX_NAME]
         helps = [f"write `{clean}`"] if NAME.match(clean) else []
-        if not key.text or set(key.text) & set("()%:"):
-            helps = ["inside `{…}` YAML ends a value at a comma: quote the line, or give it a line of its own"]
         self.reporter.error(
             "PD111", f"`{key.text[:MAX_NAME]}` cannot name {what}", key.span, "letters, digits and `_`, a letter first",
             helps=helps,
@@ -224,10 +241,16 @@ class Reader:
         if value is None:
             return None
         if not re.fullmatch(r"-?(0|[1-9][0-9]{0,8})", value.text):
-            self.reporter.error("PD110", f"`{key}` must be a whole number", value.span, "not a whole number")
+            self.reporter.error(
+                "PD110", f"`{key}` must be a whole number", value.span, "not a whole number",
+                helps=[f"write a number from {lo} to {hi}"],
+            )  # fmt: skip
             return None
         if not lo <= int(value.text) <= hi:
-            self.reporter.error("PD402", f"`{key}` must lie in {lo}..{hi}", value.span, "out of range")
+            self.reporter.error(
+                "PD402", f"`{key}` must lie in {lo}..{hi}", value.span, "out of range",
+                helps=[f"write a number from {lo} to {hi}"],
+            )  # fmt: skip
             return None
         return int(value.text)
 

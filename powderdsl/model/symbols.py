@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from powderdsl.diagnostics import Label, Reporter, Span
-from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, grid_kernel
+from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS, grid_kernel
 from powderdsl.model.literals import read_bounds
 from powderdsl.model.compose import Composition, Named
 from powderdsl.model.operands import (
@@ -57,9 +57,17 @@ class Symbols:
     def ids(self) -> tuple[int, ...]:
         return tuple(element.id for element in self.composition.elements.values())
 
-    def names(self) -> list[str]:
-        """All words that an expression can use, for suggestions."""
+    def names(self, *, after_dot: bool = False) -> list[str]:
+        """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbour."""
+        if after_dot:
+            return [*self.properties, *self.fields, *self.streams, *DIRECTIONS]
         return [*self.constants, *self.properties, *self.fields, *self.streams, *(p.split(".")[1] for p in self.params)]
+
+    def is_declared(self, name: str, pack: str) -> bool:
+        """Whether some pack declares the name, even if its declaration is wrong."""
+        found = self.composition
+        tables = (found.properties, found.fields, found.streams, found.kernels, found.sets, found.element_decls)
+        return any(name in table for table in tables) or f"{pack}.{name}" in found.params
 
 
 def base_symbols(composition: Composition) -> Symbols:
@@ -74,6 +82,23 @@ def base_symbols(composition: Composition) -> Symbols:
     constants |= {name: SetOf(tuple(sorted(ids))) for name, ids in composition.tags.items()}
     symbols.streams |= {name: Stream(name, stream_ident(name), s.decl.bits) for name, s in composition.streams.items()}
     return symbols
+
+
+_KINDS_ELSEWHERE = {
+    "int": "0..9",
+    "integer": "0..9",
+    "number": "0..9",
+    "uint8": "0..255",
+    "float": "real(0..1)",
+    "float32": "real(0..1)",
+    "double": "real(0..1)",
+    "bool": "flag",
+    "boolean": "flag",
+    "vector": "vec2(-100..100)",
+    "vec": "vec2(-100..100)",
+    "probability": "chance",
+}
+"""Kinds by the names that other languages give them, and how they are written here."""
 
 
 def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
@@ -91,6 +116,12 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
     if syntax.kind == "call" and syntax.text in ("real", "vec2") and len(syntax.children) == 1:
         lo, hi = read_bounds(syntax.children[0], coercer)
         return Kind(syntax.text, lo, hi)
+    word = syntax.text if syntax.kind in ("name", "call") else ""
+    close = suggest(word, KIND_WORDS) if word else ()
+    if word in _KINDS_ELSEWHERE:
+        helps = (f"write `{_KINDS_ELSEWHERE[word]}`",)
+    elif close and close[0].startswith("did"):
+        helps = close
     raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", helps)
 
 

@@ -11,50 +11,12 @@ from lark.utils import TextSlice
 
 from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.hints import character_help, expected_words, token_help, was_cut
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_LENGTH = 2000
 MAX_DEPTH = 48
 STARTS = ("rule", "expression", "header")
-
-TERMINAL_WORDS = {
-    "NAME": "a name",
-    "INTEGER": "a whole number",
-    "DECIMAL": "a number",
-    "PERCENT": "a percentage",
-    "UPDATE": "`:=`",
-    "COMPARE": "a comparison",
-    "LPAR": "`(`",
-    "RPAR": "`)`",
-    "COMMA": "`,`",
-    "DOT": "`.`",
-    "PLUS": "`+`",
-    "MINUS": "`-`",
-    "STAR": "`*`",
-    "SLASH": "`/`",
-    "QMARK": "`?`",
-    "__ANON_0": "`->`",
-    "__ANON_1": "`..`",
-    "$END": "the end of the line",
-}
-"""What each terminal is called in messages; keywords, which are missing here, are called by themselves."""
-
-_VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
-_HINTS = (
-    ("=", "compare with `==`, assign with `:=`"),
-    ("&", "write `and`"),
-    ("|", "write `or`"),
-    ("!", "write `not`, or `!=` between two values"),
-    ("{", "the line language has no braces; in YAML's `{…}` a rule with commas needs a block list"),
-    ("[", "sets are written `(a, b)`"),
-    ("→", "write `->`"),
-    ("≥", "write `>=`"),
-    ("≤", "write `<=`"),
-    ('"', "names stand without quotes"),
-    ("'", "names stand without quotes"),
-    (":", "assign with `:=`"),
-)
-
 
 @lru_cache(maxsize=1)
 def parser() -> Lark:
@@ -84,7 +46,8 @@ def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | Non
     span = scalar.content
     if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
         reporter.error(
-            "PD203", "escapes in a quoted rule", scalar.span, "escaped or doubled quotes", helps=["write the line without quotes"]
+            "PD203", "escapes in a quoted rule", scalar.span, "a backslash, or doubled quotes",
+            helps=["write the line without quotes, or without the escapes"],
         )
         return None
     return parse_text(span.source, span.start, span.end, start, reporter)
@@ -135,12 +98,13 @@ def _convert(tree: Tree | Token, source: Source, fallback: Span, depth: int) -> 
 
 def _report_syntax_error(error: UnexpectedInput, source: Source, begin: int, end: int, reporter: Reporter) -> None:
     text = source.text
-    helps: list[str] = []
     if isinstance(error, UnexpectedCharacters):
-        start = error.pos_in_stream
-        char = text[start]
-        helps = [cure for hint, cure in _HINTS if char == hint][:1]
-        reporter.error("PD201", f"unexpected character `{char}`", Span(source, start, start + 1), "not part of a rule", helps=helps)
+        start = error.pos_in_stream or begin
+        cure = character_help(text, start)
+        reporter.error(
+            "PD201", f"unexpected character `{text[start]}`", Span(source, start, start + 1), "not part of a rule",
+            helps=[cure] if cure else [],
+        )  # fmt: skip
         return
     assert isinstance(error, UnexpectedToken)
     token = error.token
@@ -149,30 +113,10 @@ def _report_syntax_error(error: UnexpectedInput, source: Source, begin: int, end
     start = min(max(start, begin), max(len(text) - 1, 0))
     stop = start + (1 if at_end else len(token))
     accepted = set(error.accepts or error.expected or ())
-    expected = _expected_words(accepted)
-    if token.type == "UPDATE" or (not at_end and token in (":=", "+=", "-=")):
-        helps = ["only a field of this cell, or of a neighbour, can be assigned"]
-    elif not at_end and token == "if" and "where" in {name.lower() for name in accepted}:
-        helps = ["an assignment says `where`: `field := value where condition`"]
-    elif not at_end and token == "where":
-        helps = ["only assignments say `where`; this rule says `if`"]
-    if at_end and text.count("(", begin, end) > text.count(")", begin, end):
-        helps = ["inside `{…}` YAML ends a value at a comma: quote the line, or give it a line of its own"]
-    what = "the line ends too early" if at_end else f"unexpected `{token}`"
-    label = f"expected {expected}" if expected else ""
-    reporter.error("PD201", what, Span(source, start, max(stop, start + 1)), label, helps=helps)
-
-
-def _expected_words(accepted: set[str]) -> str:
-    words = set()
-    rest = set(accepted)
-    if _VALUE_STARTS <= rest:
-        words.add("a value")
-        rest -= {"NAME", "INTEGER", "DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE", "LPAR", "CHANCE", "ANY", "ALL", "MINUS", "NOT"}
-    operators = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "__ANON_1"}
-    if len(rest & operators) > 3:
-        words.add("an operator")
-        rest -= operators | {"DOT", "QMARK"}
-    for name in rest:
-        words.add(TERMINAL_WORDS.get(name, f"`{name.lower()}`"))
-    return ", ".join(sorted(words)[:8])
+    expected = expected_words(accepted)
+    cure = token_help("" if at_end else str(token), accepted, text[begin:start], was_cut(text, begin, end))
+    reporter.error(
+        "PD201", "the line ends too early" if at_end else f"unexpected `{token}`",
+        Span(source, start, max(stop, start + 1)), f"expected {expected}" if expected else "",
+        helps=[cure] if cure else [],
+    )  # fmt: skip

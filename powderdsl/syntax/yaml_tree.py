@@ -17,7 +17,8 @@ MAX_CHARACTERS = 1 << 20
 MAX_DEPTH = 32
 MAX_NODES = 50_000
 
-_Loader: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Loader: type | None = getattr(yaml, "CSafeLoader", None)
+"""libyaml's parser. The pure Python one is twenty times slower and refuses `[name?]`, so it is no fallback."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,10 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
             notes=[f"{source.name}: a rule file may have {MAX_CHARACTERS:,} characters"],
             helps=["split the pack, or check that this is the file you meant"],
         )
+        return None
+    if _Loader is None:
+        helps = ["reinstall it from a wheel: `pip install --force-reinstall pyyaml`"]
+        reporter.error("PD701", "PyYAML was built without libyaml", None, helps=helps)
         return None
     builder = _Builder(source, reporter)
     try:
@@ -173,11 +178,7 @@ class _Builder:
             elif key.text == "<<" and key.style == "plain":
                 self._fail("PD105", "the merge key `<<` is not allowed", key.span, "not allowed", "write the entries out")
             elif start.flow_style and isinstance(value, Scalar) and value.style == "plain" and not value.text:
-                # Nothing in a rule file has a key without a value: a comma has cut something in two.
-                self._fail(
-                    "PD107", f"`{key.text}` has no value", key.span, "a comma before it ended the value",
-                    "inside `{…}` YAML ends a value at a comma: put quotes around it, or give it a line of its own",
-                )
+                self._no_value(key, first=not seen)
             elif key.text in seen:
                 other = (Label(seen[key.text], "first time here"),)
                 self._fail(
@@ -188,6 +189,17 @@ class _Builder:
                 seen[key.text] = key.span
                 entries.append((key, value))
         return Mapping(tuple(entries), self._collection_span(start, entries[-1][1].span if entries else None))
+
+    def _no_value(self, key: Scalar, *, first: bool) -> None:
+        """Nothing in `{…}` has a key without a value: most often a comma has cut a value in two."""
+        if self.source.text[key.span.end :].lstrip().startswith(":"):
+            label, cure = "nothing stands after its `:`", 'write its value; one with `#` in it needs quotes: "#RRGGBB"'
+        elif first:
+            label, cure = "a key without a `:`", "`{…}` holds `key: value` pairs: write this without the braces"
+        else:
+            label = "the comma before it ended the value before it"
+            cure = "put quotes around a value with a comma, or give it a line of its own, outside `{…}`"
+        self._fail("PD107", f"`{key.text}` has no value", key.span, label, cure)
 
     def _collection_span(self, start, last: Span | None) -> Span:  # type: ignore[no-untyped-def]
         # A block collection's end mark runs to the next token; the last child's end is where a reader sees it end.

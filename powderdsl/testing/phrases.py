@@ -6,16 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from powderdsl.model.builtins import MAX_MAGNITUDE
-from powderdsl.model.types import DIRECTION, ELEMENT, FLAG, REAL, VEC2, Kind, integer
+from powderdsl.model.types import Kind
 from powderdsl.testing.choices import Choices
-from powderdsl.testing.vocabulary import CHANCES, Words
+from powderdsl.testing.vocabulary import CHANCES, Manner, Words
 
 PLACES = ("below", "left", "above", "right", "below.right", "above.left", "at(0, 2)", "at(-2, 1)", "at(3, 0)", "at(-7, -15)")
 SIDES = ("below", "left", "above", "right", "below.left", "above.right")
 """Places that are directions too."""
 
-PLACE, ONE, NUMBER = Kind("place"), Kind("one"), Kind("number")
-"""Kinds of loop variables: a neighbour, an element's name, a number (with bounds)."""
+PLACE, SIDE, ONE, NUMBER = Kind("place"), Kind("side"), Kind("one"), Kind("number", 0, 2)
+"""Kinds of loop variables: a neighbour, one of the eight next to a cell, an element's name, a number."""
 
 LIMIT = MAX_MAGNITUDE // 2
 
@@ -36,6 +36,7 @@ class Phrases:
 
     choices: Choices
     words: Words
+    manner: Manner
     locals: dict[str, Kind]
     scratch: dict[str, Kind]
     """Fields of the pass; they are locals of their own kind too."""
@@ -68,18 +69,43 @@ class Phrases:
                 return self.direction(depth).text
         return self.flag(depth, bare=True).text
 
+    def fitting(self, kind: Kind, depth: int) -> str:
+        """Like `of_kind`; a constant lies in the kind's range, other values may lie outside."""
+        if kind.name not in ("int", "real"):
+            return self.of_kind(kind, depth)
+        phrase = (self.whole if kind.name == "int" or not self.manner.reals else self.real)(depth)
+        if not phrase.fixed:
+            return phrase.text
+        return f"clamp({phrase.text}, {kind.lo:g}, {kind.hi:g})"
+
     # Names
 
     def place(self) -> str:
         """A neighbour."""
-        loops = self._locals("place")
+        loops = self.sides()
         if loops and self.choices.maybe(60):
             side = self.choices.pick(loops)
             return self.choices.weighted([(6, side), (1, f"opposite({side})"), (1, f"below.{side}"), (1, f"{side}.left")])
         return self.choices.pick(PLACES)
 
-    def _locals(self, kind: str) -> list[str]:
-        return [name for name, k in self.locals.items() if k.name == kind]
+    def _locals(self, *kinds: str) -> list[str]:
+        return [name for name, k in self.locals.items() if k.name in kinds]
+
+    def sides(self) -> list[str]:
+        """Loop variables that are neighbours."""
+        return self._locals("place", "side")
+
+    def ones(self) -> list[str]:
+        """Loop variables that are elements."""
+        return self._locals("one")
+
+    def lets(self, kind: str) -> list[str]:
+        """Values of a kind that were fixed earlier."""
+        return [name for name in self._locals(kind) if name not in self.scratch]
+
+    def a_number(self) -> str:
+        """A number known when rules are unrolled."""
+        return self.choices.pick([*self._locals("number"), "1", "2", "4"])
 
     def _seen(self, name: str) -> str:
         """A value, here or at a neighbour."""
@@ -104,8 +130,8 @@ class Phrases:
         )
 
     def kernel(self) -> str | None:
-        """`in KERNEL`, or nothing, for the default."""
-        return self.choices.pick([None, *self.words.kernels])
+        """A kernel's name, or None for the default."""
+        return self.choices.pick([*self.words.kernels] if not self.manner.borders else [None, *self.words.kernels])
 
     def chance(self, depth: int) -> str:
         """What may stand after `with chance`."""
@@ -125,7 +151,8 @@ class Phrases:
         return Phrase(name)
 
     def _real_chance(self, depth: int) -> Phrase | None:
-        return None if depth <= 0 else self.whole(depth - 1) if self.choices.maybe(30) else self.real(depth - 1)
+        phrase = self.whole(depth - 1) if self.choices.maybe(30) else self.real(depth - 1)
+        return None if depth <= 0 or phrase.fixed else phrase
 
     # Conditions
 
@@ -153,12 +180,12 @@ class Phrases:
         name = self._param("flag")
         return None if name is None else Phrase(name)
 
-    def _inside(self, depth: int) -> Phrase:
-        return Phrase(f"inside({self.place()})")
+    def _inside(self, depth: int) -> Phrase | None:
+        return Phrase(f"inside({self.place()})") if self.manner.borders else None
 
     def _static(self, depth: int) -> Phrase:
         """What is known when rules are unrolled."""
-        one, number, side = (self._locals(kind) for kind in ("one", "number", "place"))
+        one, number, side = self._locals("one"), self._locals("number"), self.sides()
         options = ["yes", "no", "2 < 3", *(f"{name} is {self.group()}" for name in one)]
         options += [*(f"{name} == 1" for name in number), *(f"{name} is left" for name in side)]
         options += [f"{name} in (left, below)" for name in side]
@@ -239,7 +266,7 @@ class Phrases:
     def _is_direction(self, depth: int) -> Phrase | None:
         if not (self.words.of_kind("direction") or self.words.of_kind("vec2")):
             return None
-        left = self._direction_value(depth)
+        left = self.runtime_direction(depth)
         sides = [*SIDES, *self._locals("side")]
         return Phrase(
             self.choices.pick(
@@ -247,14 +274,14 @@ class Phrases:
                     f"({left.text} == {self.choices.pick(sides)})",
                     f"({left.text} is {self.choices.pick(sides)})",
                     f"({left.text} in ({self.choices.pick(sides)}, {self.choices.pick(sides)}))",
-                    f"({left.text} != {self._direction_value(depth - 1).text})",
+                    f"({left.text} != {self.runtime_direction(depth - 1).text})",
                 ]
             )
         )
 
     def _flag_there(self, depth: int) -> Phrase | None:
         """`left is CONDITION`: the condition as it is at a neighbour."""
-        lets = self._locals("flag")
+        lets = self.lets("flag")
         inner = self.choices.pick(lets) if lets and self.choices.maybe(70) else f"({self._compare_whole(depth).text} or {self.flag(0).text})"
         return Phrase(f"({self.place()} is {inner})")
 
@@ -264,8 +291,8 @@ class Phrases:
         groups = [*self.words.groups, f"({choices.pick(self.words.elements)}, {choices.pick(self.words.elements)})"]
         return choices.weighted(
             [
-                (4, (Kind("side"), choices.pick(["(left, right)", "sides", "diagonals", "(below, above.left)"]))),
-                (3, (Kind("number", 0, 2), choices.pick(["0..2", "0..1"]))),
+                (4, (SIDE, choices.pick(["(left, right)", "sides", "diagonals", "(below, above.left)"]))),
+                (3, (NUMBER, choices.pick(["0..2", "0..1"]))),
                 (2, (ONE, choices.pick(groups))),
                 (1, (PLACE, "(at(0, 2), at(-3, 1))")),
             ]
@@ -354,11 +381,12 @@ class Phrases:
     def _modulo(self, depth: int) -> Phrase:
         choices = self.choices
         modulus = choices.pick([2, 3, 1, 4, 7, 64])
-        inner = choices.pick(["row", "column", "step", "(row + step)", "(column - row)"])
+        step, column = ("step", "column") if self.manner.borders else ("step", "step")
+        inner = choices.pick(["row", "column", "step", "(row + step)", "(column - row)"]) if self.manner.borders else "step"
         if choices.maybe(50):
             value = self.whole(depth - 1)
             if not value.fixed:
-                inner = value.text if choices.maybe(60) else f"({value.text} {choices.pick('+-')} {choices.pick(['step', 'column'])})"
+                inner = value.text if choices.maybe(60) else f"({value.text} {choices.pick('+-')} {choices.pick([step, column])})"
         return Phrase(f"({inner} mod {modulus})", 0, modulus - 1)
 
     def _choose_whole(self, depth: int) -> Phrase:
@@ -394,6 +422,10 @@ class Phrases:
         first, second = (a, b) if self.choices.maybe(70) else (b, a)
         return Phrase(f"({first.text} {self.choices.pick('+-*')} {second.text})")
 
+    def _vary(self, phrase: Phrase) -> str:
+        """A real that is no constant: constants would have to be whole here."""
+        return f"(0.5 * length(vector({phrase.text}, {phrase.text})))" if phrase.fixed else phrase.text
+
     def _divide(self, depth: int) -> Phrase | None:
         a, b = (self.choices.weighted([(2, self.real), (1, self.whole)])(depth - 1) for _ in range(2))
         if a.fixed and b.fixed:
@@ -428,7 +460,9 @@ class Phrases:
     def _scaled_draw(self, depth: int) -> Phrase | None:
         if not self.words.streams:
             return None
-        return Phrase(f"({self.draw(depth - 1).text} {self.choices.pick('*/+-')} {self.choices.pick(['0.7', '2.5', '0.001'])})")
+        if self.choices.maybe(30):
+            return Phrase(f"({self.draw(depth - 1).text} {self.choices.pick('+-')} {self._vary(self.real(depth - 1))})")
+        return Phrase(f"({self.draw(depth - 1).text} {self.choices.pick('*/')} {self.choices.pick(['0.7', '2.5', '0.001'])})")
 
     def vector(self, depth: int) -> Phrase:
         leaves = [(6, self._vector_name), (2, self._pair)]
@@ -479,10 +513,10 @@ class Phrases:
 
     def direction(self, depth: int) -> Phrase:
         if self.choices.maybe(50):
-            return self._direction_value(depth)
+            return self.runtime_direction(depth)
         return Phrase(self.choices.pick([*SIDES, *self._locals("side")]))
 
-    def _direction_value(self, depth: int) -> Phrase:
+    def runtime_direction(self, depth: int) -> Phrase:
         """A direction that hangs on the world."""
         name = self._named("direction")
         if name is None or (depth > 0 and self.choices.maybe(30)):
@@ -491,5 +525,3 @@ class Phrases:
             return Phrase(f"({name} if {self.flag(depth - 1, bare=True).text} else {self.direction(depth - 1).text})")
         return Phrase(name)
 
-
-__all__ = ["DIRECTION", "ELEMENT", "FLAG", "NUMBER", "ONE", "PLACE", "REAL", "VEC2", "Phrase", "Phrases", "integer"]

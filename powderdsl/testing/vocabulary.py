@@ -41,20 +41,34 @@ class Words:
         return [name for table in (self.fields, self.properties) for name, k in table.items() if k.name == kind]
 
 
-def declare(choices: Choices) -> tuple[Words, dict[str, Tree]]:
+@dataclass(frozen=True)
+class Manner:
+    """What a random ruleset may do. Tests of single properties leave out what would break the property."""
+
+    draws: bool = True
+    """Streams of random numbers, and chances."""
+    borders: bool = True
+    """Anything that knows where the grid ends: `row`, `column`, `inside`, kernels that do not wrap."""
+    reals: bool = True
+    symmetry: bool = True
+    forms: tuple[str, ...] = ("transform", "swap", "move", "assign", "push")
+
+
+def declare(choices: Choices, manner: Manner) -> tuple[Words, dict[str, Tree]]:
     """Random declarations: the words, and the sections of the file."""
     words = Words()
-    words.kernels |= {name: tuple(w for _, _, w in kernel.weights) for name, kernel in KERNELS.items()}
+    if manner.borders:
+        words.kernels |= {name: tuple(w for _, _, w in kernel.weights) for name, kernel in KERNELS.items()}
     sections: dict[str, Tree] = {}
     count = choices.weighted([(4, 2), (2, 1), (3, 3), (3, 4), (1, 6), (1, 9)])
     words.elements = [f"e{i}" for i in range(count)]
     words.ids = _ids(choices, count)
     tags = [f"t{i}" for i in range(choices.whole(0, 2))]
-    sections["params"] = _params(choices, words)
-    sections["properties"] = _properties(choices, words)
-    sections["fields"] = _fields(choices, words)
-    sections["streams"] = _streams(choices, words)
-    sections["kernels"] = _kernels(choices, words)
+    sections["params"] = _params(choices, words, manner)
+    sections["properties"] = _properties(choices, words, manner)
+    sections["fields"] = _fields(choices, words, manner)
+    sections["streams"] = _streams(choices, words, manner)
+    sections["kernels"] = _kernels(choices, words, manner)
     sections["tags"] = {tag: "a tag" for tag in tags}
     sections["elements"] = {
         name: _element(choices, words, identity, tags) for name, identity in zip(words.elements, words.ids, strict=True)
@@ -75,11 +89,11 @@ def _ids(choices: Choices, count: int) -> list[int]:
     return ids
 
 
-def _params(choices: Choices, words: Words) -> dict[str, Tree]:
+def _params(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
     for i in range(choices.weighted([(3, 0), (3, 1), (2, 2), (1, 4)])):
         name = f"q{i}"
-        kind = choices.pick([CHANCE, integer(0, 7), FLAG, Kind("real", -10, 10), integer(-300, 300)])
+        kind = choices.pick([CHANCE, integer(0, 7), FLAG, integer(-300, 300), *([Kind("real", -10, 10)] if manner.reals else [])])
         words.params[name] = kind
         value = _constant(choices, kind)
         inferred = kind == FLAG or value.endswith("%")
@@ -87,11 +101,11 @@ def _params(choices: Choices, words: Words) -> dict[str, Tree]:
     return section
 
 
-def _properties(choices: Choices, words: Words) -> dict[str, Tree]:
+def _properties(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
     for i in range(choices.weighted([(3, 2), (2, 1), (2, 3), (1, 0), (1, 5)])):
         name = f"p{i}"
-        kind = choices.weighted([(4, integer(0, 7)), (3, FLAG), (2, CHANCE), (2, _range(choices))])
+        kind = choices.weighted([(4, integer(0, 7)), (3, FLAG), (2, CHANCE), (2, some_range(choices))])
         words.properties[name] = kind
         if choices.maybe(30):
             section[name] = str(kind)
@@ -100,14 +114,15 @@ def _properties(choices: Choices, words: Words) -> dict[str, Tree]:
     return section
 
 
-def _fields(choices: Choices, words: Words) -> dict[str, Tree]:
+def _fields(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
     for i in range(choices.weighted([(3, 2), (2, 1), (3, 3), (2, 4), (1, 0), (1, 7)])):
         name = f"f{i}"
         real, vector = (Kind(k, -b, b) for k, b in (("real", choices.pick([100, 1, 1000])), ("vec2", choices.pick([100, 2]))))
         if choices.maybe(10):
             real = Kind("real", 0, 1)
-        kind = choices.weighted([(4, _range(choices)), (3, FLAG), (2, ELEMENT), (2, DIRECTION), (3, real), (3, vector)])
+        floats = [(3, real), (3, vector)] if manner.reals else []
+        kind = choices.weighted([(4, some_range(choices)), (3, FLAG), (2, ELEMENT), (2, DIRECTION), *floats])
         words.fields[name] = kind
         entry: dict[str, Tree] = {"type": str(kind), "at": choices.pick(["element", "place"])}
         if kind == ELEMENT:
@@ -124,8 +139,8 @@ def _fields(choices: Choices, words: Words) -> dict[str, Tree]:
     return section
 
 
-def _streams(choices: Choices, words: Words) -> Tree:
-    count = choices.weighted([(3, 1), (2, 2), (1, 0)])
+def _streams(choices: Choices, words: Words, manner: Manner) -> Tree:
+    count = choices.weighted([(3, 1), (2, 2), (1, 0)]) if manner.draws else 0
     for i in range(count):
         words.streams[f"r{i}"] = 32 if choices.maybe(30) else 16
     if all(bits == 16 for bits in words.streams.values()) and choices.maybe(50):
@@ -133,9 +148,9 @@ def _streams(choices: Choices, words: Words) -> Tree:
     return {name: {"bits": str(bits)} for name, bits in words.streams.items()}
 
 
-def _kernels(choices: Choices, words: Words) -> dict[str, Tree]:
+def _kernels(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
-    for i in range(choices.weighted([(2, 1), (2, 0), (1, 2)])):
+    for i in range(choices.weighted([(2, 1), (2, 0 if manner.borders else 1), (1, 2)])):
         name = f"k{i}"
         height, width = choices.pick([(3, 3), (1, 3), (3, 1), (1, 1), (5, 5), (1, 5), (5, 3)])
         dull = choices.maybe(50)
@@ -143,7 +158,7 @@ def _kernels(choices: Choices, words: Words) -> dict[str, Tree]:
         rows = [[choices.pick(weight) for _ in range(width)] for _ in range(height)]
         words.kernels[name] = tuple(w for row in rows for w in row if w)
         text: list[Tree] = [" ".join(map(str, row)) for row in rows]
-        section[name] = {"rows": text, "edges": "wrap"} if choices.maybe(40) else text
+        section[name] = {"rows": text, "edges": "wrap"} if choices.maybe(40) or not manner.borders else text
     return section
 
 
@@ -170,7 +185,8 @@ def _sets(choices: Choices, words: Words) -> dict[str, Tree]:
     return section
 
 
-def _range(choices: Choices) -> Kind:
+def some_range(choices: Choices) -> Kind:
+    """A range of whole numbers."""
     return integer(*choices.pick(RANGES))
 
 

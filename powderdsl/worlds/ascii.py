@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
-from powderdsl.draw import to_numpy
 from powderdsl.model.types import Element
 from powderdsl.worlds.files import failure, read_source
 from powderdsl.worlds.raster import MAX_CELLS
@@ -104,7 +103,7 @@ def write_ascii(
     What it writes, `read_ascii` reads with the same elements and legend. Raises ValueError for ids that no
     element has, and for another shape.
     """
-    world = to_numpy(ids)
+    world = np.asarray(ids.cpu() if hasattr(ids, "cpu") else ids)
     if world.ndim != 2 or world.dtype.kind not in "iu":
         raise ValueError(f"ids must be integers [H, W], not {world.dtype} {world.shape}")
     # The legend's characters come first, so they win over glyphs here too.

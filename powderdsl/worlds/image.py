@@ -1,4 +1,4 @@
-"""Worlds as PNG pictures, one pixel a cell, by the elements' exact colours."""
+"""Worlds from PNG pictures, one pixel a cell, by the elements' exact colours."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
-from powderdsl.draw import palette, rgb
-from powderdsl.media import write_png
 from powderdsl.model.types import Element
 from powderdsl.worlds.files import failure
 from powderdsl.worlds.raster import MAX_CELLS
@@ -27,7 +25,7 @@ _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 
 
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a PNG file. Raises CompileError.
+    """The ids uint8 [H, W] of a PNG file, as `media.write_png` writes of `draw.rgb`. Raises CompileError.
 
     PD609 names every pixel colour that is no element's (and the nearest element), PD607 a picture of too many
     pixels, which is not decoded, PD602 a file that is no PNG, PD101 one that cannot be read.
@@ -57,11 +55,6 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 
 def _pack(color: str) -> int:
     return int.from_bytes(bytes.fromhex(color[1:]) + b"\xff", "little")
-
-
-def write_image(path: str | Path, ids: Any, elements: Sequence[Element]) -> None:
-    """Write ids [H, W], array or tensor, as a PNG that `read_image` reads. Raises as `draw.rgb` does."""
-    write_png(path, rgb(ids, palette(elements)))
 
 
 def _pixels(path: Path) -> NDArray[np.uint8]:

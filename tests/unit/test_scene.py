@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 
 from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
 from powderdsl.worlds.raster import MAX_COORDINATE, Box, Disk, Frame, Line, mask, paint
-from powderdsl.worlds.scene import find_scene, load_scene, load_scenes, read_scenes, shipped_scenes
-from powderdsl.worlds.statements import STATEMENTS, parse_statement
+from powderdsl.worlds.scene import (
+    STATEMENTS,
+    find_scene,
+    load_scene,
+    load_scenes,
+    parse_statement,
+    read_scenes,
+    shipped_scenes,
+)
 from tests.unit.elements import ELEMENTS, ID, RULES, Rules
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -424,7 +431,9 @@ def test_a_world_may_have_any_shape_within_the_limit(tmp_path):
         ("zzz", "PD601", "sand-on-water"),
         ("nowhere.yaml", "PD101", ""),
         (str(DESIGNED), "PD601", f"{DESIGNED}#sand-on-water"),
-        (f"{DESIGNED}#gas", "PD601", ""),
+        (f"{DESIGNED}#gas-flow", "PD601", "did you mean `gas-flowing`?"),
+        ("x" * 5000, "PD601", "sand-on-water"),
+        ("x" * 5000 + ".yaml", "PD101", ""),
         ("bad\0name.yaml", "PD101", ""),
         (str(ROOT / "tests"), "PD601", ""),
     ],

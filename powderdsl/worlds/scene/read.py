@@ -1,37 +1,16 @@
-"""Scene files: start worlds drawn in one-line statements, later ones over earlier ones.
-
-    scene: NAME
-    about: What it shows, in a sentence.
-    size: [64, 64]                                     # rows, columns
-    fill: ELEMENT
-    draw:
-      - line ELEMENT from (63, 5) to (32, 5) width 3   # points are (row, column)
-      - disk ELEMENT at (32, 32) radius 10
-      - box ELEMENT rows 32:64                         # a:b leaves b out; all columns unless it says so
-      - box ELEMENT rows 48:end columns :16            # `48:` means the same, but YAML takes it for a key
-      - frame ELEMENT
-
-`draw` may also be a `|` block, one statement a line. A file with several scenes has a list under `scenes`.
-"""
+"""Scene files: YAML -> scenes. Everything is checked but element names, which need a ruleset."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span, suggest
 from powderdsl.model.schema import Key, Reader, first_line
-from powderdsl.model.types import Element
 from powderdsl.syntax import yaml_tree
-from powderdsl.worlds.files import failure, read_source
-from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, mask, paint
-from powderdsl.worlds.statements import parse_statement
+from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, mask
+from powderdsl.worlds.scene.statements import parse_statement
 
 SCENE_KEYS = {
     "scene": Key("word", "the scene's name", True),
@@ -49,11 +28,7 @@ FILE_KEYS = {
 """The keys of a file with several scenes."""
 
 
-class HasElements(Protocol):
-    """A ruleset, as far as scenes need one."""
-
-    @property
-    def elements(self) -> Sequence[Element]: ...
+SIZE_RULE = f"a world has at least one row and one column, and at most {MAX_CELLS:,} cells"
 
 
 @dataclass(frozen=True)
@@ -67,100 +42,6 @@ class Scene:
     paints: tuple[Paint, ...]
     span: Span = field(compare=False, repr=False)
     fill_span: Span = field(compare=False, repr=False)
-
-
-def load_scene(
-    path_or_name: str | Path, ruleset: HasElements, *, size: Size | None = None
-) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a scene: a file, ``FILE#NAME`` for one of several, or a shipped scene's name.
-
-    With another `size` shapes stay where they are, a frame and open ends follow the edge. Raises CompileError
-    with everything that is wrong.
-    """
-    return draw_scene(find_scene(path_or_name), ruleset, size=size)
-
-
-def load_scenes(
-    path: str | Path, ruleset: HasElements, *, size: Size | None = None
-) -> dict[str, NDArray[np.uint8]]:
-    """Every scene of a file by name, uint8 [H, W] each, in the order of the file. Raises CompileError."""
-    reporter = Reporter()
-    drawn = {scene.name: _draw(scene, ruleset, size, reporter) for scene in _read_file(Path(path))}
-    reporter.raise_if_errors()
-    return {name: ids for name, ids in drawn.items() if ids is not None}
-
-
-def find_scene(path_or_name: str | Path) -> Scene:
-    """A scene from a file, or a shipped one by name. Raises CompileError (PD601 for an unknown name)."""
-    text = str(path_or_name)
-    file, _, name = text.rpartition("#") if "#" in text else (text, "", "")
-    if file.lower().endswith((".yaml", ".yml")) or Path(file).is_file():
-        scenes = {scene.name: scene for scene in _read_file(Path(file))}
-        if not name and len(scenes) == 1:
-            return next(iter(scenes.values()))
-        if name in scenes:
-            return scenes[name]
-        helps = suggest(name, scenes) if name else ()
-        example = next(iter(scenes), "NAME")
-        raise failure(
-            "PD601",
-            f"no scene `{name}` in {file}" if name else f"{file} has {len(scenes)} scenes",
-            helps=helps or (f"say which: {file}#{example}",),
-        )
-    shipped = {scene.name: scene for scene in shipped_scenes()}
-    if text in shipped:
-        return shipped[text]
-    raise failure(
-        "PD601",
-        f"unknown scene `{text}`",
-        helps=suggest(text, shipped) or ("shipped: " + ", ".join(shipped),),
-    )
-
-
-def shipped_scenes() -> tuple[Scene, ...]:
-    """The scenes that come with the package, files in alphabetical order."""
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "data" / "tasks" / "scenes"
-    directory = installed if installed.is_dir() else package.parent / "tasks" / "scenes"
-    return tuple(scene for path in sorted(directory.glob("*.yaml")) for scene in _read_file(path))
-
-
-def _read_file(path: Path) -> tuple[Scene, ...]:
-    reporter = Reporter()
-    source = read_source(path, reporter)
-    scenes = read_scenes(source, reporter) if source else ()
-    reporter.raise_if_errors()
-    return scenes
-
-
-def draw_scene(scene: Scene, ruleset: HasElements, *, size: Size | None = None) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a scene. Raises CompileError: PD604 unknown elements, PD607 a bad `size`."""
-    reporter = Reporter()
-    ids = _draw(scene, ruleset, size, reporter)
-    reporter.raise_if_errors()
-    assert ids is not None
-    return ids
-
-
-def _draw(
-    scene: Scene, ruleset: HasElements, size: Size | None, reporter: Reporter
-) -> NDArray[np.uint8] | None:
-    height, width = size or scene.size
-    if not (height >= 1 and width >= 1 and height * width <= MAX_CELLS):
-        raise failure("PD607", f"a world of {height}×{width} cells", helps=(_SIZE_RULE,))
-    ids = {element.qualified: element.id for element in ruleset.elements}
-    ids |= {element.name: element.id for element in ruleset.elements}
-    used = [(scene.fill, scene.fill_span), *((one.element, one.element_span) for one in scene.paints)]
-    unknown = [(name, span) for name, span in used if name not in ids]
-    for name, span in unknown:
-        reporter.error(
-            "PD604",
-            f"unknown element `{name}`",
-            span,
-            "not an element of this ruleset",
-            helps=suggest(name, {element.name for element in ruleset.elements}, "its elements"),
-        )
-    return None if unknown else paint((height, width), ids[scene.fill], scene.paints, ids)
 
 
 def read_scenes(source: Source, reporter: Reporter) -> tuple[Scene, ...]:
@@ -257,9 +138,6 @@ def _read_scene(node: yaml_tree.Node, reader: Reader) -> Scene | None:
     return Scene(name.text, about, size, fill.text, paints, name.span, fill.span)
 
 
-_SIZE_RULE = f"a world has at least one row and one column, and at most {MAX_CELLS:,} cells"
-
-
 def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
     items = node.items if isinstance(node, yaml_tree.Sequence) else ()
     words = [item.text for item in items if isinstance(item, yaml_tree.Scalar)]
@@ -280,7 +158,7 @@ def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
             f"a world of {rows}×{columns} cells",
             node.span,
             "too small or too large",
-            helps=[_SIZE_RULE],
+            helps=[SIZE_RULE],
         )
         return None
     return rows, columns

@@ -1,4 +1,4 @@
-"""Drawing statements: the text of one line -> a `Paint`. What its cells are is raster.py's business."""
+"""Drawing statements: the text of one line -> a `Paint`. Which cells that is, raster.py says."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lark.utils import TextSlice
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.worlds.raster import MAX_COORDINATE, Box, Disk, Frame, Line, Paint, Point, Shape, Slice
 
-MAX_LENGTH = 500
+MAX_STATEMENT = 500
 
 STATEMENTS = {
     "line": "line ELEMENT from (ROW, COLUMN) to (ROW, COLUMN) width NUMBER",
@@ -50,9 +50,11 @@ def _parser() -> Lark:
 
 def parse_statement(span: Span, reporter: Reporter) -> Paint | None:
     """The statement that stands at `span`, or None after reporting bad syntax (PD605) or numbers (PD606)."""
-    if len(span.text) > MAX_LENGTH:
+    if len(span.text) > MAX_STATEMENT:
         start = Span(span.source, span.start, span.start + 1)
-        reporter.error("PD605", "a statement that never ends", start, f"longer than {MAX_LENGTH} characters")
+        reporter.error(
+            "PD605", "a statement that never ends", start, f"longer than {MAX_STATEMENT} characters"
+        )
         return None
     try:
         tree = _parser().parse(TextSlice(span.source.text, span.start, span.end))

@@ -1,0 +1,200 @@
+"""Tables of docs/*.md that follow from tables of the package: `python docs/generate.py`, or `--check` to compare.
+
+A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is between them is written anew.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
+
+from powderdsl.compiler import shipped_rules
+from powderdsl.ir.ops import OPS
+from powderdsl.model.builtins import (
+    COORDINATES,
+    DIRECTION_SETS,
+    DIRECTIONS,
+    FUNCTIONS,
+    KERNELS,
+    KIND_WORDS,
+    MAX_MAGNITUDE,
+    MAX_OFFSET,
+    RESERVED,
+)
+from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
+from powderdsl.model.examples import MAX_SIDE
+from powderdsl.model.schema import KEYS, MAX_NAME, OPEN
+from powderdsl.model.text import show_offset
+from powderdsl.model.types import Kernel
+from powderdsl.passes import PIPELINE
+from powderdsl.syntax import parse, yaml_tree
+from powderdsl.syntax.parse import reserved_words
+
+DOCS = Path(__file__).resolve().parent
+MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+SHAPES = {
+    "text": "text",
+    "word": "a word",
+    "words": "words",
+    "number": "a number",
+    "flag": "`yes` or `no`",
+    "mapping": "a mapping",
+    "list": "a list",
+    "lines": "expressions",
+    "line": "an expression",
+    "block": "a block",
+    "any": "see below",
+}
+"""Shapes of `schema.Key`, as readers see them."""
+
+
+def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """A Markdown table; `|` inside cells is escaped."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def keys(context: str) -> str:
+    """The keys of one kind of mapping in a rule file."""
+    rows = [
+        (f"`{name}`" + (" *" if key.required else ""), SHAPES[key.shape], key.about)
+        for name, key in KEYS[context].items()
+    ]
+    if context in OPEN:
+        rows.append((f"*{OPEN[context]}'s name*", "an expression", "its value"))
+    return table(("key", "value", "what it says"), rows)
+
+
+def directions() -> str:
+    rows = [(f"`{name}`", f"({dy}, {dx})") for name, (dy, dx) in DIRECTIONS.items()]
+    return table(("name", "(rows down, columns right)"), rows)
+
+
+def direction_sets() -> str:
+    def listed(name: str) -> str:
+        return ", ".join(_path(offset) for offset in DIRECTION_SETS[name])
+
+    return table(("set", "in this order"), [(f"`{name}`", listed(name)) for name in DIRECTION_SETS])
+
+
+def _path(offset: tuple[int, int]) -> str:
+    """`above.left` for a diagonal, `above` for the rest."""
+    dy, dx = offset
+    parts = [show_offset((dy, 0))] * (dy != 0) + [show_offset((0, dx))] * (dx != 0)
+    return f"`{'.'.join(parts)}`"
+
+
+def kernels() -> str:
+    def drawn(kernel: Kernel) -> str:
+        weights = {(dy, dx): weight for dy, dx, weight in kernel.weights}
+        reach = range(-kernel.radius, kernel.radius + 1)
+        return " / ".join(" ".join(str(weights.get((dy, dx), 0)) for dx in reach) for dy in reach)
+
+    return table(("kernel", "rows"), [(f"`{name}`", drawn(kernel)) for name, kernel in KERNELS.items()])
+
+
+def functions() -> str:
+    return table(("function", "value"), [(f"`{f.signature}`", f.about) for f in FUNCTIONS.values()])
+
+
+def kinds() -> str:
+    rows = [("`LOW..HIGH`", "a whole number between two bounds, both included")]
+    rows += [(f"`{word}`", about) for word, about in KIND_WORDS.items()]
+    return table(("kind", "values"), rows)
+
+
+def words() -> str:
+    """Every word that no definition may take."""
+    listed = sorted(RESERVED | reserved_words() | {"elements"})
+    return ", ".join(f"`{word}`" for word in listed) + ".\n"
+
+
+def coordinates() -> str:
+    return ", ".join(f"`{word}`" for word in COORDINATES) + "\n"
+
+
+def limits() -> str:
+    rows = [
+        ("characters in a rule file", yaml_tree.MAX_CHARACTERS),
+        ("values in a rule file", yaml_tree.MAX_NODES),
+        ("depth of nesting in YAML", yaml_tree.MAX_DEPTH),
+        ("characters in one rule", parse.MAX_LENGTH),
+        ("depth of nesting in one rule", parse.MAX_DEPTH),
+        ("characters in a name", MAX_NAME),
+        ("elements of a ruleset", 256),
+        ("distance of a neighbour, in cells", MAX_OFFSET),
+        ("size of a number", MAX_MAGNITUDE),
+        ("modulus of `mod`", 64),
+        ("rounds of one loop", 64),
+        ("moments of a pass", MAX_MOMENTS),
+        ("rules of a ruleset, loops unrolled", MAX_RULES),
+        ("side of a world in a test", MAX_SIDE),
+    ]
+    return table(("what", "at most"), [(what, f"{most:,}") for what, most in rows])
+
+
+def shipped() -> str:
+    """The packs and rulesets that come with powderdsl."""
+    from powderdsl.compiler import read
+    from powderdsl.diagnostics import Reporter
+
+    rows = []
+    for name in shipped_rules():
+        packs, ruleset = read([name], Reporter())
+        about = ruleset.about if ruleset else packs[0].about
+        rows.append((f"`{name}`", "ruleset" if ruleset else "pack", about))
+    return table(("name", "", "what it is"), rows)
+
+
+def stages() -> str:
+    return table(("stage", "what it does"), [(f"`{stage.name}`", stage.about) for stage in PIPELINE])
+
+
+def operations() -> str:
+    return f"{len(OPS)} operations: " + ", ".join(f"`{name}`" for name in OPS) + ".\n"
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "directions": directions,
+    "direction sets": direction_sets,
+    "kernels": kernels,
+    "functions": functions,
+    "kinds": kinds,
+    "words": words,
+    "limits": limits,
+    "shipped": shipped,
+    "stages": stages,
+    "operations": operations,
+    **{f"keys {context}": (lambda context=context: keys(context)) for context in KEYS},
+}
+"""What can stand between markers, by name."""
+
+
+def generated(markdown: str) -> str:
+    """A page with all its tables written anew. Raises KeyError for a table that does not exist."""
+    return MARKED.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], markdown)
+
+
+def stale_pages() -> list[Path]:
+    """Pages whose tables are not what the package says."""
+    return [page for page in sorted(DOCS.rglob("*.md")) if generated(text := page.read_text("utf-8")) != text]
+
+
+def main(arguments: list[str]) -> int:
+    """Write the stale pages, or name them and return 1 under `--check`."""
+    stale = stale_pages()
+    for page in stale:
+        print(f"{'stale' if '--check' in arguments else 'written'}: {page.relative_to(DOCS.parent)}")
+        if "--check" not in arguments:
+            page.write_text(generated(page.read_text("utf-8")), "utf-8")
+    return 1 if stale and "--check" in arguments else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,48 @@
+"""Batches of worlds as one picture, and what of them is shown as motion."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.cli.exits import BadInput
+from powderdsl.draw import contact_sheet, palette, rgb, scale, to_numpy
+
+if TYPE_CHECKING:
+    from powderdsl.simulator import World
+
+USUAL_SIDE = 512
+MAX_SIDE = 16_384
+"""Pixels a side. More would take gigabytes before the first one is written."""
+
+
+def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8]:
+    """A batch as one picture, uint8 [H', W', 3]: up to `most` worlds side by side, cells of `factor` pixels.
+
+    Cells that a vector field moves are tinted. Without a factor a side has about USUAL_SIDE pixels. Raises
+    BadInput for pictures of more than MAX_SIDE.
+    """
+    shown = min(len(world), most)
+    columns = math.ceil(math.sqrt(shown))
+    longest = max(world.shape[1:]) * columns
+    factor = factor or max(1, min(8, USUAL_SIDE // longest))
+    if longest * factor > MAX_SIDE:
+        raise BadInput(f"a picture of {longest * factor:,} pixels a side: choose a smaller --scale or --size")
+    few = world.select(slice(0, shown))
+    images = to_numpy(scale(rgb(few.ids, palette(few.sim.ruleset.elements), motion_of(few)), factor))
+    return images[0] if shown == 1 else contact_sheet(images, columns=columns)
+
+
+def first_world(world: World) -> tuple[Any, Any]:
+    """The ids [H, W] and the motion [2, H, W] (or None) of the first world of a batch."""
+    motion = motion_of(world)
+    return world.ids[0], None if motion is None else motion[0]
+
+
+def motion_of(world: World) -> Any:
+    """The first vector field, float32 [B, 2, H, W], which pictures show as a tint; None if there is none."""
+    names = [item.name for item in world.sim.ruleset.fields if item.kind.name == "vec2"]
+    return world[names[0]] if names else None

@@ -1,0 +1,203 @@
+"""`powderdsl show`: what a ruleset consists of, as tables or as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import click
+
+from powderdsl.cli.exits import colour_wanted
+from powderdsl.cli.options import load_rules, rules_argument, set_option
+from powderdsl.diagnostics import Span
+from powderdsl.model.reactions import reactions
+from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
+from powderdsl.model.types import Element, Param, Pass, Property, Ruleset, Value
+
+
+@click.command("show")
+@rules_argument
+@click.option(
+    "--format",
+    "layout",
+    type=click.Choice(("text", "json")),
+    default="text",
+    show_default=True,
+    help="Tables, or one JSON object.",
+)
+@set_option
+def command(rules: str, layout: str, settings: dict[str, str]) -> None:
+    """List elements, reactions, passes and parameters."""
+    ruleset = load_rules(rules, settings)
+    if layout == "json":
+        click.echo(json.dumps(_data(ruleset), indent=2, ensure_ascii=False))
+    else:
+        click.echo("\n".join(_text(ruleset, colour_wanted(sys.stdout))), color=True)
+
+
+def rule_spans(pass_: Pass) -> tuple[Span, ...]:
+    """Where the rules of a pass stand, each line once: loops and symmetries make many rules of one."""
+    return tuple(dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules))
+
+
+# Tables
+
+
+def _text(ruleset: Ruleset, colour: bool) -> Iterator[str]:
+    yield f"{ruleset.name}{': ' if ruleset.about else ''}{ruleset.about}"
+    yield f"packs: {' '.join(ruleset.packs)}"
+    for title, rows in (
+        (f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", _element_rows(ruleset, colour)),
+        ("Reactions", _reaction_rows(ruleset)),
+        ("Passes, in order", _pass_rows(ruleset)),
+        ("Parameters (--set NAME=VALUE)", _param_rows(ruleset)),
+    ):
+        yield ""
+        yield title
+        yield from table(rows)
+
+
+def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines with aligned columns, the first row as heading; numbers stand to the right."""
+    if len(rows) < 2:
+        yield "  none"
+        return
+    widths = [max(_width(row[i]) for row in rows) for i in range(len(rows[0]))]
+    right = [all(_bare(row[i]).isdigit() for row in rows[1:]) for i in range(len(rows[0]))]
+    for row in rows:
+        cells = []
+        for cell, width, to_right in zip(row, widths, right, strict=True):
+            gap = " " * (width - _width(cell))
+            cells.append(gap + cell if to_right else cell + gap)
+        yield ("  " + "  ".join(cells)).rstrip()
+
+
+def _bare(cell: str) -> str:
+    return click.unstyle(cell)
+
+
+def _width(cell: str) -> int:
+    return len(_bare(cell))
+
+
+def _swatch(element: Element, colour: bool) -> str:
+    if not colour:
+        return element.color
+    red, green, blue = bytes.fromhex(element.color[1:])
+    return f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {element.color}"
+
+
+def _element_rows(ruleset: Ruleset, colour: bool) -> list[list[str]]:
+    rows = [["id", "element", "pack", "glyph", "colour", *(p.name for p in ruleset.properties), "tags"]]
+    for element in ruleset.elements:
+        values = [_property_text(ruleset, prop, element) for prop in ruleset.properties]
+        head = [str(element.id), element.name, element.pack, element.glyph, _swatch(element, colour)]
+        rows.append([*head, *values, " ".join(sorted(element.tags))])
+    return rows
+
+
+def _property_text(ruleset: Ruleset, prop: Property, element: Element) -> str:
+    """Its value; `*` where cells may hold one of their own."""
+    text = show_value(ruleset, prop.kind, prop.values[element.id])
+    return f"{text}*" if element.id in prop.stored else text
+
+
+def _reaction_rows(ruleset: Ruleset) -> list[list[str]]:
+    rows = [["from", "to", "pass", "rule", "where"]]
+    for one in reactions(ruleset):
+        before, after = show_set(ruleset, one.before), show_set(ruleset, one.after)
+        rows.append([before, after, one.pass_name, one_line(one.span), place_of(one.span)])
+    return rows
+
+
+def _pass_rows(ruleset: Ruleset) -> list[list[str]]:
+    rows = [["", "pass", "pack", "moments", "rules", "where"]]
+    for number, one in enumerate(ruleset.passes, 1):
+        counts = [str(len(one.moments)), str(len(rule_spans(one)))]
+        rows.append([str(number), one.name, one.pack, *counts, place_of(one.span)])
+    return rows
+
+
+def _param_rows(ruleset: Ruleset) -> list[list[str]]:
+    rows = [["name", "value", "kind", "about", "where"]]
+    for param in ruleset.params:
+        value = show_value(ruleset, param.kind, param.default)
+        rows.append([param.name, value, str(param.kind), param.about, place_of(param.span)])
+    return rows
+
+
+# JSON
+
+
+def _plain(value: Value | str) -> Any:
+    """A constant for JSON: chances as numbers in 0..1."""
+    if isinstance(value, (str, int)):
+        return value
+    return [float(part) for part in value] if isinstance(value, tuple) else float(value)
+
+
+def _data(ruleset: Ruleset) -> dict[str, Any]:
+    return {
+        "name": ruleset.name,
+        "about": ruleset.about,
+        "packs": list(ruleset.packs),
+        "slots": ruleset.slots,
+        "elements": [_element_data(ruleset, element) for element in ruleset.elements],
+        "properties": [
+            {"name": p.name, "kind": str(p.kind), "pack": p.pack, "where": place_of(p.span)}
+            for p in ruleset.properties
+        ],
+        "fields": [
+            {"name": f.name, "kind": str(f.kind), "at": f.at, "pack": f.pack, "where": place_of(f.span)}
+            for f in ruleset.fields
+        ],
+        "reactions": [
+            {
+                "from": [element_name(ruleset, number) for number in one.before],
+                "to": [element_name(ruleset, number) for number in one.after],
+                "pass": one.pass_name,
+                "pack": one.pack,
+                "rule": one_line(one.span),
+                "where": place_of(one.span),
+            }
+            for one in reactions(ruleset)
+        ],
+        "passes": [_pass_data(one) for one in ruleset.passes],
+        "params": [_param_data(param) for param in ruleset.params],
+    }
+
+
+def _element_data(ruleset: Ruleset, element: Element) -> dict[str, Any]:
+    return {
+        "id": element.id,
+        "name": element.name,
+        "pack": element.pack,
+        "glyph": element.glyph,
+        "color": element.color,
+        "about": element.about,
+        "tags": sorted(element.tags),
+        "properties": {prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
+        "where": place_of(element.span),
+    }
+
+
+def _pass_data(one: Pass) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "pack": one.pack,
+        "moments": len(one.moments),
+        "rules": [{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(one)],
+        "where": place_of(one.span),
+    }
+
+
+def _param_data(param: Param) -> dict[str, Any]:
+    return {
+        "name": param.name,
+        "value": _plain(param.default),
+        "kind": str(param.kind),
+        "about": param.about,
+        "where": place_of(param.span),
+    }

@@ -1,0 +1,134 @@
+"""Where a run starts: a saved world, a picture, a drawing, a scene, or shapes strewn at random."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.model.reactions import moved_ids, unchanging_ids
+from powderdsl.model.types import Ruleset
+from powderdsl.worlds.files import failure
+from powderdsl.worlds.raster import MAX_CELLS, Box, Disk, Frame, Line, Shape, Size, mask
+
+if TYPE_CHECKING:
+    from powderdsl.simulator import Simulator, World
+
+DEFAULT_SIZE: Size = (64, 64)
+KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
+
+
+def is_saved(name: str | None) -> bool:
+    return name is not None and name.lower().endswith(".npz")
+
+
+def start_world(
+    sim: Simulator, name: str | None, size: Size | None, batch: int | None, seed: int | None
+) -> World:
+    """The worlds that a run starts from.
+
+    A saved world goes on as it was saved, random future included, so `size`, `batch` and `seed` do not go
+    with it. A drawn world stands `batch` times, each with random numbers of its own. Without a name every
+    world is strewn by itself.
+
+    Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
+    """
+    if name is not None and is_saved(name):
+        _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
+        from powderdsl.worlds.store import load_world
+
+        with user_values():
+            return load_world(name, sim)
+    count, number = batch or 1, seed or 0
+    if name is None:
+        ids = strew(sim.ruleset, size or DEFAULT_SIZE, count, number)
+    else:
+        ids = np.repeat(drawn_ids(name, sim.ruleset, size)[None], count, axis=0)
+    with user_values():
+        return sim.world(ids, seed=number)
+
+
+def drawn_ids(name: str, ruleset: Ruleset, size: Size | None) -> NDArray[np.uint8]:
+    """The ids uint8 [H, W] of a picture, an ASCII drawing or a scene; only scenes can have another `size`."""
+    suffix = Path(name).suffix.lower()
+    if suffix == ".png":
+        _refuse_options("a picture has its own", size=size)
+        from powderdsl.worlds.image import read_image
+
+        return read_image(name, ruleset.elements)
+    if suffix == ".txt":
+        _refuse_options("a drawing has its own", size=size)
+        from powderdsl.worlds.ascii import load_ascii
+
+        return load_ascii(name, ruleset.elements)
+    if Path(name).is_file() and suffix not in (".yaml", ".yml"):
+        raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
+    if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name) and suffix not in (".yaml", ".yml"):
+        raise failure("PD601", f"no world {name}", helps=(KINDS,))
+    from powderdsl.worlds.scene import load_scene
+
+    return load_scene(name, ruleset, size=size)
+
+
+def _refuse_options(reason: str, **options: object) -> None:
+    for option, value in options.items():
+        if value is not None:
+            raise BadInput(f"--{option} does not go with this world: {reason}")
+
+
+def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uint8]:
+    """Worlds of shapes at random places, uint8 [batch, H, W]: world i depends on `seed` and i alone.
+
+    The ground is the element of the lowest id. On it lie 24 disks, boxes and lines of the other elements,
+    each of them solid, or only half of its cells. If anything in the ruleset moves and some element never
+    changes, the first such element frames the world, so that nothing falls out of it.
+    """
+    height, width = size
+    if height * width * batch > MAX_CELLS:
+        raise failure(
+            "PD607",
+            f"{batch} worlds of {height}×{width} cells",
+            helps=(f"shapes are strewn over at most {MAX_CELLS:,} cells",),
+        )
+    everything = [element.id for element in ruleset.elements]
+    ground, others = everything[0], everything[1:]
+    worlds = np.full((batch, height, width), ground, dtype=np.uint8)
+    if not others:
+        return worlds
+    frame = _frame_element(ruleset, ground) if min(size) >= 3 else None
+    edge = mask(Frame(), size)
+    for index, world in enumerate(worlds):
+        random = np.random.default_rng([seed, index])
+        for _ in range(24):
+            cells = mask(_shape(random, size), size)
+            element = others[random.integers(len(others))]
+            if random.random() < 0.5:
+                cells &= random.random(size) < 0.5
+            world[cells] = element
+        if frame is not None:
+            world[edge] = frame
+    return worlds
+
+
+def _shape(random: np.random.Generator, size: Size) -> Shape:
+    """A shape up to about a quarter of the world across, anywhere in it."""
+    row, column = (int(random.integers(side)) for side in size)
+    reach = max(min(size) // 8, 1)
+    match random.integers(3):
+        case 0:
+            return Disk((row, column), int(random.integers(1, reach + 2)))
+        case 1:
+            rows, columns = (int(number) for number in random.integers(1, 2 * reach + 1, 2))
+            return Box((row, row + rows), (column, column + columns))
+    down, right = (int(number) for number in random.integers(-2 * reach, 2 * reach + 1, 2))
+    return Line((row, column), (row + down, column + right), 1)
+
+
+def _frame_element(ruleset: Ruleset, ground: int) -> int | None:
+    if not moved_ids(ruleset):
+        return None
+    return min(unchanging_ids(ruleset) - {ground}, default=None)

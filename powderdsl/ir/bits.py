@@ -1,0 +1,391 @@
+"""IR on numbers -> IR on bit planes: every whole number becomes a few flags, every rule gates, shifts and swaps.
+
+The result is ordinary IR without whole numbers: flags and reals remain. Slots of whole numbers become one flag slot
+a plane, ``element:0`` the lowest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from powderdsl.ir.build import Builder
+from powderdsl.ir.gates import Bits, Gates, width
+from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Program, SlotType, Step, nodes_of
+
+MAX_TABLE_BITS = 12
+
+
+class NotBits(Exception):
+    """Something that planes cannot carry; the dense backend can."""
+
+
+def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
+    """The planes of a slot, lowest bit first; flags and reals stay one slot."""
+    if slot.type.name != "int":
+        return (slot,)
+    count, _ = width(slot.type.lo, slot.type.hi)
+    return tuple(SlotType(f"{slot.name}:{i}", FLAG, int(slot.default) >> i & 1, slot.resets) for i in range(count))
+
+
+def lower_bits(program: Program) -> Program:
+    """The program on planes. Raises NotBits with the pass that cannot be."""
+    slots = tuple(plane for slot in program.slots for plane in plane_slots(slot))
+    types = {slot.name: slot for slot in program.slots}
+    passes = tuple(_PassBits(types).lower(pass_) for pass_ in program.passes)
+    return replace(program, slots=slots, passes=passes)
+
+
+@dataclass
+class _PassBits:
+    slots: dict[str, SlotType]
+    build: Builder = field(default_factory=Builder)
+
+    def lower(self, pass_: PassGraph) -> PassGraph:
+        self.gates = Gates(self.build)
+        self.values: dict[int, Node | Bits] = {}
+        for node in nodes_of(pass_):
+            self._visit(node)
+        moments = []
+        for step in pass_.moments:
+            writes = tuple(w for name, node in step.writes for w in self._write(name, node))
+            guards = []
+            for guard in step.guards:
+                for part in _with_arguments(guard):
+                    self._visit(part)
+                guards.append(self._flag(guard))
+            moments.append(Step(step.label, step.place, writes, tuple(guards)))
+        outputs = tuple(w for name, node in pass_.outputs for w in self._write(name, node))
+        kept = tuple((name, node) for name, node in outputs if not (node.op == "input" and node.attr == name))
+        return PassGraph(pass_.name, pass_.pack, tuple(moments), kept)
+
+    def _visit(self, node: Node) -> None:
+        if id(node) not in self.values:
+            self.build.place = node.places[0] if node.places else ""
+            self.values[id(node)] = self._lower(node)
+
+    def _write(self, name: str, node: Node) -> list[tuple[str, Node]]:
+        """The planes that a write of a slot becomes. Scratch slots have no declared range: theirs is the node's."""
+        value = self.values[id(node)]
+        if isinstance(value, Node):
+            return [(name, value)]
+        if name in self.slots:
+            type = self.slots[name].type
+            value = self.gates.fit(value, type.lo, type.hi)
+        return [(f"{name}:{i}", plane) for i, plane in enumerate(value.planes)]
+
+    def _flag(self, node: Node) -> Node:
+        value = self.values[id(node)]
+        assert isinstance(value, Node)
+        return value
+
+    def _bits(self, node: Node) -> Bits:
+        value = self.values[id(node)]
+        assert isinstance(value, Bits)
+        return value
+
+    def _lower(self, node: Node) -> Node | Bits:
+        gates, build = self.gates, self.build
+        args = node.args
+        match node.op:
+            case "input":
+                return self._input(node)
+            case "const" if node.type.name == "int":
+                return gates.constant(int(node.attr))  # type: ignore[call-overload]
+            case "param" if node.type.name == "int":
+                count, signed = width(node.type.lo, node.type.hi)
+                name, view = node.attr  # type: ignore[misc]
+                planes = tuple(build.make("param", FLAG, attr=(name, view, i)) for i in range(count))
+                return Bits(planes, signed)
+            case "coordinate":
+                count, signed = width(node.type.lo, node.type.hi)
+                planes = tuple(build.make("coordinate", FLAG, attr=(*node.attr, i)) for i in range(count))  # type: ignore[misc]
+                return Bits(planes, signed)
+            case "below":
+                return self._below(node)
+            case "shift":
+                return self._shift(node)
+            case "count":
+                return self._count(node)
+            case "not":
+                return gates.not_(self._flag(args[0]))
+            case "and":
+                return gates.and_(self._flag(args[0]), self._flag(args[1]))
+            case "or":
+                return gates.or_(self._flag(args[0]), self._flag(args[1]))
+            case "xor":
+                return gates.xor(self._flag(args[0]), self._flag(args[1]))
+            case "in_set":
+                return self._in_set(node)
+            case "table":
+                return self._table(node)
+            case "eq" | "lt" | "le" if args[0].type.name == "int":
+                return self._compare(node)
+            case "select" if node.type.name == "int":
+                condition = self._flag(args[0])
+                return gates.select(condition, self._bits(args[1]), self._bits(args[2]), node.type.lo, node.type.hi)
+            case "select" if node.type == FLAG:
+                return gates.mux(self._flag(args[0]), self._flag(args[1]), self._flag(args[2]))
+            case "swap" | "arrive":
+                return self._movement(node)
+            case "to_real":
+                return self._to_real(args[0])
+        if node.type.name == "int":
+            return self._arithmetic(node)
+        return build.make(node.op, node.type, *(self._flag(arg) for arg in args), attr=node.attr)
+
+    def _input(self, node: Node) -> Node | Bits:
+        if node.type.name != "int":
+            return self.build.input(str(node.attr), node.type)
+        slot = self.slots[str(node.attr)]
+        count, signed = width(slot.type.lo, slot.type.hi)
+        stored = Bits(tuple(self.build.input(f"{slot.name}:{i}", FLAG) for i in range(count)), signed)
+        return self.gates.fit(stored, node.type.lo, node.type.hi)
+
+    def _shift(self, node: Node) -> Node | Bits:
+        dy, dx, wraps = node.attr  # type: ignore[misc]
+        value = self.values[id(node.args[0])]
+        if isinstance(value, Bits):
+            value = self.gates.fit(value, node.type.lo, node.type.hi)
+            return Bits(tuple(self.gates.shift(p, (dy, dx), wraps) for p in value.planes), value.signed)
+        if value.type == FLAG:
+            return self.gates.shift(value, (dy, dx), wraps)
+        return self.build.shift(value, (dy, dx), wraps)
+
+    def _movement(self, node: Node) -> Node | Bits:
+        """Swaps stay swaps, a plane each: backends exchange planes in place."""
+        movers = self._flag(node.args[1])
+        content, rest = self.values[id(node.args[0])], self.values[id(node.args[2])]
+        make = self.build.swap if node.op == "swap" else self.build.arrive
+        offset = node.attr
+        if isinstance(content, Node):
+            assert isinstance(rest, Node)
+            return make(content, movers, rest, offset)  # type: ignore[arg-type]
+        assert isinstance(rest, Bits)
+        content = self.gates.fit(content, node.type.lo, node.type.hi)
+        rest = self.gates.fit(rest, node.type.lo, node.type.hi)
+        planes = []
+        for a, b in zip(content.planes, rest.planes, strict=True):
+            planes.append(a if a is b and a.op == "const" else make(a, movers, b, offset))  # type: ignore[arg-type]
+        return Bits(tuple(planes), content.signed)
+
+    def _below(self, node: Node) -> Node:
+        """A draw below a limit. A constant limit is an attribute; another is given plane by plane, highest first."""
+        limit = node.args[0]
+        stream, bits = node.attr  # type: ignore[misc]
+        if limit.op == "select":
+            condition, yes, no = limit.args
+            parts = [self._below(replace_argument(node, arg)) for arg in (yes, no)]
+            return self.gates.mux(self._flag(condition), *parts)
+        if limit.op == "const":
+            count = int(limit.attr)  # type: ignore[call-overload]
+            if count <= 0:
+                return self.gates.no
+            if count >= 1 << bits:
+                return self.gates.yes
+            return self.build.make("chance", FLAG, attr=(stream, bits, count))
+        planes = self.gates.fit(self._bits(limit), 0, 1 << bits).planes
+        return self.build.make("below_planes", FLAG, *reversed(planes), attr=(stream, bits))
+
+    def _in_set(self, node: Node) -> Node:
+        value = self._bits(node.args[0])
+        lo, hi = node.args[0].type.lo, node.args[0].type.hi
+        members = node.attr
+        assert isinstance(members, frozenset)
+        return self._function(value, lo, hi, lambda v: v in members)
+
+    def _function(self, value: Bits, lo: int, hi: int, function) -> Node:  # type: ignore[no-untyped-def]
+        """A flag that depends on a small whole number only."""
+        count = len(value.planes)
+        if count > MAX_TABLE_BITS:
+            raise NotBits(f"a table over {count} planes")
+        table: list[bool | None] = [None] * (1 << count)
+        for number in range(lo, hi + 1):
+            table[number & ((1 << count) - 1)] = bool(function(number))
+        return self.gates.truth_table(value.planes, table)
+
+    def _table(self, node: Node) -> Bits:
+        value = self._bits(node.args[0])
+        lo, hi = node.args[0].type.lo, node.args[0].type.hi
+        count, signed = width(node.type.lo, node.type.hi)
+        entries = node.attr
+        assert isinstance(entries, tuple)
+        hi = min(hi, len(entries) - 1)
+        planes = tuple(self._function(value, lo, hi, lambda v, i=i: entries[v] >> i & 1) for i in range(count))
+        return Bits(planes, signed)
+
+    def _compare(self, node: Node) -> Node:
+        gates = self.gates
+        left, right = node.args
+        near = self._any_neighbour(node)
+        if near is not None:
+            return near
+        a, b = self._bits(left), self._bits(right)
+        for value, other, flipped in ((left, right, False), (right, left, True)):
+            planes = self._bits(value).planes
+            if other.op == "const" and len(planes) <= 5:
+                bound = int(other.attr)  # type: ignore[call-overload]
+                holds = {
+                    "eq": lambda v, c=bound: v == c,
+                    "lt": (lambda v, c=bound: c < v) if flipped else (lambda v, c=bound: v < c),
+                    "le": (lambda v, c=bound: c <= v) if flipped else (lambda v, c=bound: v <= c),
+                }[node.op]
+                return self._function(self._bits(value), value.type.lo, value.type.hi, holds)
+        if node.op == "eq":
+            return gates.eq(a, b)
+        return gates.lt(a, b) if node.op == "lt" else gates.not_(gates.lt(b, a))
+
+    def _any_neighbour(self, node: Node) -> Node | None:
+        """0 < count(x), 1 <= count(x), count(x) == 0: neighbours are joined, not counted."""
+        left, right = node.args
+        counted = right if right.op == "count" else left
+        if counted.op != "count" or any(weight < 0 for _, _, weight in counted.attr[0]):  # type: ignore[index]
+            return None
+        bound = left if counted is right else right
+        if bound.op != "const":
+            return None
+        limit = int(bound.attr)  # type: ignore[call-overload]
+        some = (node.op == "lt" and counted is right and limit == 0) or (node.op == "le" and counted is right and limit == 1)
+        none = (node.op == "eq" and limit == 0) or (node.op == "lt" and counted is left and limit == 1)
+        none = none or (node.op == "le" and counted is left and limit == 0)
+        if not (some or none):
+            return None
+        weights, wraps = counted.attr  # type: ignore[misc]
+        flag = self._flag(counted.args[0])
+        rows = self._rows(weights)
+        joined = self.gates.any([
+            self.gates.shift(self.gates.any([self.gates.shift(flag, (0, dx), wraps) for dx, _ in pattern]), (dy, 0), wraps)
+            for dy, pattern in rows.items()
+        ])  # fmt: skip
+        return joined if some else self.gates.not_(joined)
+
+    @staticmethod
+    def _rows(weights: tuple[tuple[int, int, int], ...]) -> dict[int, tuple[tuple[int, int], ...]]:
+        rows: dict[int, list[tuple[int, int]]] = {}
+        for dy, dx, weight in weights:
+            rows.setdefault(dy, []).append((dx, weight))
+        return {dy: tuple(pattern) for dy, pattern in rows.items()}
+
+    def _count(self, node: Node) -> Bits:
+        """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
+        gates = self.gates
+        weights, wraps = node.attr  # type: ignore[misc]
+        flag = self._flag(node.args[0])
+        sums: dict[tuple[tuple[int, int], ...], tuple[tuple[Node, ...], tuple[Node, ...]]] = {}
+        columns: tuple[list[list[Node]], list[list[Node]]] = ([], [])
+        for dy, pattern in self._rows(weights).items():
+            if pattern not in sums:
+                parts = []
+                for sign in (1, -1):
+                    own: list[list[Node]] = []
+                    size = 0
+                    for dx, weight in pattern:
+                        if weight * sign > 0:
+                            size += weight * sign
+                            _put(own, gates.shift(flag, (0, dx), wraps), weight * sign)
+                    parts.append(gates.total(own, size.bit_length()))
+                sums[pattern] = (parts[0], parts[1])
+            for target, planes in zip(columns, sums[pattern], strict=True):
+                for i, plane in enumerate(planes):
+                    _put(target, gates.shift(plane, (dy, 0), wraps), 1 << i)
+        lo, hi = node.type.lo, node.type.hi
+        plus = Bits(gates.total(columns[0], max(hi.bit_length(), 1)))
+        if lo >= 0:
+            return gates.fit(plus, lo, hi)
+        minus = Bits(gates.total(columns[1], max((-lo).bit_length(), 1)))
+        return gates.sub(plus, minus, lo, hi)
+
+    def _arithmetic(self, node: Node) -> Bits:
+        gates = self.gates
+        lo, hi = node.type.lo, node.type.hi
+        args = [self._bits(arg) for arg in node.args]
+        match node.op:
+            case "add":
+                return gates.add(args[0], args[1], lo, hi)
+            case "sub":
+                return gates.sub(args[0], args[1], lo, hi)
+            case "neg":
+                return gates.sub(gates.constant(0), args[0], lo, hi)
+            case "abs":
+                negative = args[0].planes[-1] if args[0].signed else gates.no
+                inner = node.args[0].type
+                minus = gates.sub(gates.constant(0), args[0], -inner.hi, -inner.lo)
+                return gates.select(negative, minus, args[0], lo, hi)
+            case "min":
+                return gates.select(gates.lt(args[0], args[1]), args[0], args[1], lo, hi)
+            case "max":
+                return gates.select(gates.lt(args[0], args[1]), args[1], args[0], lo, hi)
+            case "mul":
+                return self._multiply(args[0], args[1], lo, hi)
+            case "mod":
+                return self._mod(node, args[0])
+        raise NotBits(f"{node.op} of whole numbers")
+
+    def _multiply(self, a: Bits, b: Bits, lo: int, hi: int) -> Bits:
+        """Shifted additions; a negative factor counts its sign bit as minus."""
+        gates = self.gates
+        result = gates.constant(0)
+        count, _ = width(min(lo, 0), hi)
+        bound = 1 << count
+        for i, bit in enumerate(b.planes):
+            term = Bits((*[gates.no] * i, *(gates.and_(bit, p) for p in a.planes)), a.signed)
+            if b.signed and i == len(b.planes) - 1:
+                result = gates.sub(result, term, -bound, bound - 1)
+            else:
+                result = gates.add(result, term, -bound, bound - 1)
+        return gates.fit(result, lo, hi)
+
+    def _mod(self, node: Node, value: Bits) -> Bits:
+        modulus = node.attr
+        assert isinstance(modulus, int)
+        count, signed = width(0, modulus - 1)
+        if modulus & (modulus - 1) == 0:
+            return Bits(tuple(self.gates.bit(value, i) if i < modulus.bit_length() - 1 else self.gates.no for i in range(count)), signed)
+        inner = node.args[0].type
+        planes = tuple(self._function(value, inner.lo, inner.hi, lambda v, i=i: v % modulus >> i & 1) for i in range(count))
+        return Bits(planes, signed)
+
+    def _to_real(self, argument: Node) -> Node:
+        """A number from its planes: exact, since whole numbers stay below 2^24."""
+        build = self.build
+        value = self.values[id(argument)]
+        if isinstance(value, Node):
+            if value.type == REAL:
+                return value
+            return build.select(value, build.real(1.0), build.real(0.0))
+        if max(abs(argument.type.lo), abs(argument.type.hi)) >= 1 << 24:
+            raise NotBits("a whole number too large for float32")
+        total: Node = build.real(0.0)
+        for i, plane in enumerate(value.planes):
+            weight = -float(1 << i) if value.signed and i == len(value.planes) - 1 else float(1 << i)
+            if plane is not self.gates.no:
+                total = build.arithmetic("add", total, build.select(plane, build.real(weight), build.real(0.0)))
+        return total
+
+
+def replace_argument(node: Node, argument: Node) -> Node:
+    """The node on another argument, outside any graph: only to be lowered."""
+    return Node(node.op, node.type, (argument,), node.attr, -1, node.places)
+
+
+def _put(columns: list[list[Node]], plane: Node, weight: int) -> None:
+    """Add a plane of some weight to columns of bits."""
+    if plane.op == "const" and not plane.attr:
+        return
+    for i in range(weight.bit_length()):
+        if weight >> i & 1:
+            while len(columns) <= i:
+                columns.append([])
+            columns[i].append(plane)
+
+
+def _with_arguments(node: Node) -> list[Node]:
+    ordered: dict[int, Node] = {}
+    stack = [(node, False)]
+    while stack:
+        top, ready = stack.pop()
+        if ready:
+            ordered.setdefault(id(top), top)
+        elif id(top) not in ordered:
+            stack.append((top, True))
+            stack.extend((arg, False) for arg in top.args)
+    return list(ordered.values())

@@ -1,0 +1,261 @@
+"""Boolean circuits on flag planes: gates that fold as they are built, adders, comparators, truth tables.
+
+A whole number is a `Bits`: planes from the lowest bit, and whether the highest one is a sign (two's complement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import permutations
+
+from powderdsl.ir.build import Builder
+from powderdsl.ir.ops import FLAG, Node, Offset
+
+
+@dataclass(frozen=True)
+class Bits:
+    """Planes of a whole number, lowest first."""
+
+    planes: tuple[Node, ...]
+    signed: bool = False
+
+
+def width(lo: int, hi: int) -> tuple[int, bool]:
+    """How many planes a range takes, and whether the last is a sign."""
+    if lo >= 0:
+        return max(hi.bit_length(), 1), False
+    return max((-lo - 1).bit_length(), max(hi, 0).bit_length()) + 1, True
+
+
+class Gates:
+    """Makes gates in a builder's graph; constants and repetitions fold at once."""
+
+    def __init__(self, build: Builder):
+        self.build = build
+        self.no = build.flag(False)
+        self.yes = build.flag(True)
+
+    def not_(self, a: Node) -> Node:
+        if a is self.no:
+            return self.yes
+        if a is self.yes:
+            return self.no
+        return a.args[0] if a.op == "not" else self.build.not_(a)
+
+    def and_(self, a: Node, b: Node) -> Node:
+        if a is self.no or b is self.no or _opposite(a, b):
+            return self.no
+        if a is self.yes or a is b:
+            return b
+        return a if b is self.yes else self.build.and_(a, b)
+
+    def or_(self, a: Node, b: Node) -> Node:
+        if a is self.yes or b is self.yes or _opposite(a, b):
+            return self.yes
+        if a is self.no or a is b:
+            return b
+        return a if b is self.no else self.build.or_(a, b)
+
+    def xor(self, a: Node, b: Node) -> Node:
+        if a is b:
+            return self.no
+        if _opposite(a, b):
+            return self.yes
+        for x, y in ((a, b), (b, a)):
+            if x is self.no:
+                return y
+            if x is self.yes:
+                return self.not_(y)
+        if a.op == "not" and b.op == "not":
+            return self.xor(a.args[0], b.args[0])
+        for x, y in ((a, b), (b, a)):
+            if x.op == "not":
+                return self.not_(self.xor(x.args[0], y))
+        return self.build.make("xor", FLAG, a, b)
+
+    def mux(self, condition: Node, yes: Node, no: Node) -> Node:
+        """`yes` where the condition holds, else `no`."""
+        if condition is self.yes or yes is no:
+            return yes
+        if condition is self.no:
+            return no
+        if yes is self.yes or yes is condition:
+            return self.or_(condition, no)
+        if yes is self.no:
+            return self.and_(self.not_(condition), no)
+        if no is self.no or no is condition:
+            return self.and_(condition, yes)
+        if no is self.yes:
+            return self.or_(self.not_(condition), yes)
+        if _opposite(yes, no):
+            return self.xor(self.not_(condition), yes)
+        if condition.op == "not":
+            return self.build.select(condition.args[0], no, yes)
+        return self.build.select(condition, yes, no)
+
+    def all(self, flags: Sequence[Node]) -> Node:
+        result = self.yes
+        for flag in flags:
+            result = self.and_(result, flag)
+        return result
+
+    def any(self, flags: Sequence[Node]) -> Node:
+        result = self.no
+        for flag in flags:
+            result = self.or_(result, flag)
+        return result
+
+    def shift(self, a: Node, offset: Offset, wraps: bool) -> Node:
+        if a is self.no or (a is self.yes and wraps) or offset == (0, 0):
+            return a
+        if a.op == "shift" and a.attr[2] and wraps:  # type: ignore[index]
+            dy, dx, _ = a.attr  # type: ignore[misc]
+            return self.shift(a.args[0], (dy + offset[0], dx + offset[1]), True)
+        return self.build.shift(a, offset, wraps)
+
+    # Whole numbers
+
+    def constant(self, value: int) -> Bits:
+        count, signed = width(value, value)
+        return Bits(tuple(self.yes if value >> i & 1 else self.no for i in range(count)), signed)
+
+    def bit(self, a: Bits, index: int) -> Node:
+        """Bit `index`, the sign or zero beyond the stored ones."""
+        if index < len(a.planes):
+            return a.planes[index]
+        return a.planes[-1] if a.signed else self.no
+
+    def fit(self, a: Bits, lo: int, hi: int) -> Bits:
+        """The same number in the planes of a range that holds it."""
+        count, signed = width(lo, hi)
+        return Bits(tuple(self.bit(a, i) for i in range(count)), signed)
+
+    def full_adder(self, a: Node, b: Node, c: Node) -> tuple[Node, Node]:
+        """Sum and carry of three bits."""
+        half = self.xor(a, b)
+        return self.xor(half, c), self.or_(self.and_(a, b), self.and_(half, c))
+
+    def add(self, a: Bits, b: Bits, lo: int, hi: int, carry: Node | None = None) -> Bits:
+        """a + b (+ carry), whose range is lo..hi."""
+        count, signed = width(lo, hi)
+        carry = carry or self.no
+        planes = []
+        for i in range(count):
+            total, carry = self.full_adder(self.bit(a, i), self.bit(b, i), carry)
+            planes.append(total)
+        return Bits(tuple(planes), signed)
+
+    def invert(self, a: Bits) -> Bits:
+        """-a - 1."""
+        planes = a.planes if a.signed else (*a.planes, self.no)
+        return Bits(tuple(self.not_(p) for p in planes), True)
+
+    def sub(self, a: Bits, b: Bits, lo: int, hi: int) -> Bits:
+        return self.add(a, self.invert(b), lo, hi, self.yes)
+
+    def eq(self, a: Bits, b: Bits) -> Node:
+        count = max(len(a.planes), len(b.planes)) + (a.signed != b.signed)
+        return self.all([self.not_(self.xor(self.bit(a, i), self.bit(b, i))) for i in range(count)])
+
+    def lt(self, a: Bits, b: Bits) -> Node:
+        """a < b: from the lowest bit, the highest difference decides."""
+        count = max(len(a.planes), len(b.planes)) + (a.signed != b.signed)
+        result = self.no
+        for i in range(count):
+            x, y = self.bit(a, i), self.bit(b, i)
+            if i == count - 1 and (a.signed or b.signed):  # the sign counts the other way
+                x, y = y, x
+            result = self.mux(self.xor(x, y), y, result)
+        return result
+
+    def select(self, condition: Node, yes: Bits, no: Bits, lo: int, hi: int) -> Bits:
+        yes, no = self.fit(yes, lo, hi), self.fit(no, lo, hi)
+        pairs = zip(yes.planes, no.planes, strict=True)
+        return Bits(tuple(self.mux(condition, a, b) for a, b in pairs), yes.signed)
+
+    def total(self, columns: list[list[Node]], count: int) -> tuple[Node, ...]:
+        """The sum of bits given by weight (columns[i] have weight 2^i), as `count` planes: a carry-save tree."""
+        planes = []
+        for i in range(count):
+            column = list(columns[i]) if i < len(columns) else []
+            while len(column) > 1:
+                third = column.pop(0) if len(column) > 2 else self.no
+                total, carry = self.full_adder(column.pop(0), column.pop(0), third)
+                column.append(total)
+                while len(columns) <= i + 1:
+                    columns.append([])
+                columns[i + 1].append(carry)
+            planes.append(column[0] if column else self.no)
+        return tuple(planes)
+
+    def truth_table(self, inputs: Sequence[Node], values: Sequence[bool | None]) -> Node:
+        """Any function of a few planes; values by number, None where the number never occurs."""
+        used = [i for i, plane in enumerate(inputs) if plane is not self.no and plane is not self.yes]
+        fixed = sum(1 << i for i, plane in enumerate(inputs) if plane is self.yes)
+        table = []
+        for index in range(1 << len(used)):
+            number = fixed | sum(1 << used[k] for k in range(len(used)) if index >> k & 1)
+            table.append(values[number] if number < len(values) else None)
+        order = _best_order(tuple(table), len(used))
+        return self._expand([inputs[i] for i in used], tuple(table), order)
+
+    def _expand(self, inputs: list[Node], table: tuple[bool | None, ...], order: tuple[int, ...]) -> Node:
+        gates = {
+            "no": lambda: self.no,
+            "yes": lambda: self.yes,
+            "and": lambda i, f: self.and_(inputs[i], f),
+            "andnot": lambda i, f: self.and_(self.not_(inputs[i]), f),
+            "or": lambda i, f: self.or_(inputs[i], f),
+            "ornot": lambda i, f: self.or_(self.not_(inputs[i]), f),
+            "xor": lambda i, f: self.xor(inputs[i], f),
+            "mux": lambda i, f, g: self.mux(inputs[i], f, g),
+        }
+        return _shannon(table, order, gates)
+
+
+def _opposite(a: Node, b: Node) -> bool:
+    return (a.op == "not" and a.args[0] is b) or (b.op == "not" and b.args[0] is a)
+
+
+def _shannon(table: tuple[bool | None, ...], order: tuple[int, ...], gates: dict[str, Callable]):  # type: ignore[type-arg, no-untyped-def]
+    """Split a truth table on its inputs in order; halves that agree where both matter are joined."""
+    cares = {value for value in table if value is not None}
+    if True not in cares:
+        return gates["no"]()
+    if False not in cares:
+        return gates["yes"]()
+    split, rest = order[0], order[1:]
+    low = tuple(v if not i >> split & 1 else None for i, v in enumerate(table))
+    high = tuple(v if i >> split & 1 else None for i, v in enumerate(table))
+    bit = 1 << split
+    pairs = [(table[i & ~bit], table[i | bit]) for i in range(len(table))]
+    if all(a is None or b is None or a == b for a, b in pairs):
+        joined = tuple(a if a is not None else b for a, b in pairs)
+        return _shannon(joined, rest, gates)
+    if all(a is None or b is None or a != b for a, b in pairs):
+        flipped = tuple(a if a is not None else (None if b is None else not b) for a, b in pairs)
+        return gates["xor"](split, _shannon(flipped, rest, gates))
+    sets = ({v for v in low if v is not None}, {v for v in high if v is not None})
+    if sets[0] == {False}:
+        return gates["and"](split, _shannon(high, rest, gates))
+    if sets[1] == {False}:
+        return gates["andnot"](split, _shannon(low, rest, gates))
+    if sets[0] == {True}:
+        return gates["ornot"](split, _shannon(high, rest, gates))
+    if sets[1] == {True}:
+        return gates["or"](split, _shannon(low, rest, gates))
+    return gates["mux"](split, _shannon(high, rest, gates), _shannon(low, rest, gates))
+
+
+@lru_cache(maxsize=4096)
+def _best_order(table: tuple[bool | None, ...], inputs: int) -> tuple[int, ...]:
+    """The order of inputs that takes the fewest gates; highest first where there are too many to try."""
+    if inputs > 5:
+        return tuple(reversed(range(inputs)))
+    cost: dict[str, Callable] = {  # type: ignore[type-arg]
+        "no": lambda: 0, "yes": lambda: 0, "and": lambda i, f: f + 1, "andnot": lambda i, f: f + 1, "or": lambda i, f: f + 1,
+        "ornot": lambda i, f: f + 1, "xor": lambda i, f: f + 1, "mux": lambda i, f, g: f + g + 2,
+    }  # fmt: skip
+    return min(permutations(range(inputs)), key=lambda order: _shannon(table, order, cost))

@@ -1,0 +1,262 @@
+"""The checked model as text: one line a definition and a rule, each with its place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+
+from powderdsl.diagnostics import Span
+from powderdsl.model.builtins import DIRECTIONS, OCTANTS
+from powderdsl.model.operands import TRUE
+from powderdsl.model.types import (
+    Assign,
+    Expr,
+    Field,
+    Kernel,
+    Kind,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Rule,
+    Ruleset,
+    Swap,
+    Transform,
+    Value,
+)
+
+_INFIX: dict[str, tuple[str, int, int]] = {
+    # operation: (sign, how tightly it binds, how tightly its right side must bind without parentheses)
+    "or": ("or", 1, 1),
+    "and": ("and", 2, 2),
+    "eq": ("==", 4, 5),
+    "lt": ("<", 4, 5),
+    "le": ("<=", 4, 5),
+    "add": ("+", 5, 6),
+    "sub": ("-", 5, 6),
+    "mul": ("*", 6, 7),
+    "div": ("/", 6, 7),
+}
+_COMPARISONS = ("eq", "lt", "le")
+_ATOM = 9
+_PLACES = {offset: name for name, offset in DIRECTIONS.items()}
+
+
+def print_model(ruleset: Ruleset, passes: Iterable[str] | None = None) -> str:
+    """The whole model, or only these passes of it. Ends with a line break; equal models give equal texts."""
+    printer = _Printer(ruleset)
+    chosen = None if passes is None else frozenset(passes)
+    lines = [] if chosen is not None else [*printer.head(), ""]
+    blocks = ["\n".join(printer.pass_lines(p)) for p in ruleset.passes if chosen is None or p.name in chosen]
+    text = "\n".join(lines) + ("\n" if lines else "") + "\n\n".join(blocks)
+    kernels = printer.kernel_lines() if chosen is None else []
+    return text.rstrip("\n") + "\n" + ("\n" + "\n".join(kernels) + "\n" if kernels else "")
+
+
+def place_of(span: Span) -> str:
+    """`file:line`."""
+    return f"{span.source.name}:{span.line}"
+
+
+def one_line(span: Span) -> str:
+    """The text of a place, its line breaks as blanks."""
+    return " ".join(span.text.split())
+
+
+def show_number(value: float | Fraction) -> str:
+    """A number as short as it can be written exactly: `7`, `0.5`, `1/3`."""
+    if isinstance(value, Fraction) and value != Fraction(str(float(value))):
+        return str(value)
+    number = float(value)
+    return repr(int(number)) if number.is_integer() and abs(number) < 1e15 else repr(number)
+
+
+def show_value(ruleset: Ruleset, kind: Kind, value: Value | str) -> str:
+    """A constant as rule files write it: `20%`, `yes`, an element's name; text names a parameter."""
+    match value:
+        case str():
+            return value
+        case tuple():
+            return f"({', '.join(show_number(part) for part in value)})"
+    match kind.name:
+        case "flag":
+            return "yes" if value else "no"
+        case "element":
+            return element_name(ruleset, int(value))
+        case "direction":
+            return show_offset(OCTANTS[int(value)])
+        case "chance":
+            percent = value * 100
+            # Floats of parameters are meant as the decimal they print as: 2% is not 2.0000000000000004%.
+            return f"{percent:.10g}%" if isinstance(percent, float) else f"{show_number(percent)}%"
+    return show_number(value)
+
+
+def element_name(ruleset: Ruleset, number: int) -> str:
+    return next((element.name for element in ruleset.elements if element.id == number), f"#{number}")
+
+
+def show_set(ruleset: Ruleset, ids: Iterable[int]) -> str:
+    """A set of elements, the shorter way round: `(a, b)`, or `any but (c)` for most of them."""
+    chosen = frozenset(ids)
+    everything = [element.id for element in ruleset.elements]
+    if chosen.issuperset(everything) and everything:
+        return "any"
+    missing = [number for number in everything if number not in chosen]
+    if len(missing) < 4 and len(missing) < len(chosen):
+        return f"any but {_names(ruleset, missing)}"
+    return _names(ruleset, sorted(chosen))
+
+
+def _names(ruleset: Ruleset, ids: list[int]) -> str:
+    names = [element_name(ruleset, number) for number in ids]
+    return names[0] if len(names) == 1 else f"({', '.join(names)})"
+
+
+def show_offset(offset: Offset) -> str:
+    """A neighbour's name, or `at(rows, columns)`."""
+    return _PLACES.get(offset, f"at({offset[0]}, {offset[1]})")
+
+
+class _Printer:
+    """Prints one ruleset; remembers the kernels it met, to name and list them."""
+
+    def __init__(self, ruleset: Ruleset):
+        self.ruleset = ruleset
+        self.kernels: dict[Kernel, str] = {}
+
+    # Definitions
+
+    def head(self) -> Iterator[str]:
+        rules = self.ruleset
+        yield f"ruleset {rules.name}"
+        yield f"packs {' '.join(rules.packs)}"
+        yield f"slots {rules.slots}"
+        yield f"matrix {' '.join(rules.matrix)}"
+        for element in rules.elements:
+            tags = f" tags {' '.join(sorted(element.tags))}" if element.tags else ""
+            head = f"element {element.id} {element.qualified} {element.glyph} {element.color}{tags}"
+            yield self.placed(head, element.span)
+        for prop in rules.properties:
+            values = ", ".join(
+                f"{e.name} {show_value(rules, prop.kind, prop.values[e.id])}" for e in rules.elements
+            )
+            stored = f" stored {show_set(rules, prop.stored)}" if prop.stored else ""
+            yield self.placed(f"property {prop.name} {prop.kind}{stored}: {values}", prop.span)
+        for item in rules.fields:
+            yield self.placed(f"field {self.field(item)}", item.span)
+        for stream in rules.streams:
+            yield f"stream {stream.name} {stream.bits} bits, number {stream.ident:#010x}"
+        for param in rules.params:
+            value = show_value(rules, param.kind, param.default)
+            yield self.placed(f"param {param.name} {param.kind} = {value}", param.span)
+        for example in rules.tests:
+            steps = f"{example.steps} step{'' if example.steps == 1 else 's'}"
+            yield self.placed(f"test {example.pack}: {example.name}, {steps}", example.span)
+
+    def field(self, item: Field) -> str:
+        default = show_value(self.ruleset, item.kind, item.default)
+        of = f" of {show_set(self.ruleset, item.of)}" if item.of is not None else ""
+        resets = " resets step" if item.resets else ""
+        return f"{item.name} {item.kind} at {item.at}{of} default {default}{resets}"
+
+    def kernel_lines(self) -> list[str]:
+        lines = []
+        for kernel, name in self.kernels.items():
+            weights = " ".join(f"({dy},{dx})={weight}" for dy, dx, weight in kernel.weights)
+            lines.append(f"kernel {name}{' wrap' if kernel.wrap else ''}: {weights}")
+        return lines
+
+    @staticmethod
+    def placed(text: str, span: Span) -> str:
+        return f"{text}  # {place_of(span)}"
+
+    # Passes
+
+    def pass_lines(self, pass_: Pass) -> Iterator[str]:
+        yield self.placed(f"pass {pass_.name} of {pass_.pack}", pass_.span)
+        for item in pass_.scratch:
+            yield self.placed(f"  scratch {item.name} {item.kind}", item.span)
+        for moment in pass_.moments:
+            yield from self.moment_lines(moment)
+
+    def moment_lines(self, moment: Moment) -> Iterator[str]:
+        label = f" [{moment.label}]" if moment.label else ""
+        policy = "" if moment.policy == "prove" else f" conflicts {moment.policy}"
+        yield f"  moment{label}{policy}"
+        for let in moment.lets:
+            yield self.placed(f"    let {let.name}: {let.value.kind} = {self.expr(let.value)}", let.span)
+        for rule in moment.rules:
+            yield self.placed(f"    {self.rule(rule)}", rule.span)
+
+    def rule(self, rule: Rule) -> str:
+        text = ""
+        match rule:
+            case Transform():
+                text = f"become {self.expr(rule.target)}{self.condition('if', rule.mask)}"
+            case Swap():
+                text = f"swap {show_offset(rule.offset)}{self.condition('if', rule.mask)}"
+            case Move():
+                leaving = self.expr(rule.leaving)
+                text = f"move {show_offset(rule.offset)} leaving {leaving}{self.condition('if', rule.mask)}"
+            case Assign():
+                return self.assignment(rule) + self.condition("where", rule.mask)
+        return text + "".join(f", then {self.assignment(effect)}" for effect in rule.effects)
+
+    def condition(self, word: str, mask: Expr | None) -> str:
+        return "" if mask is None or mask == TRUE else f" {word} {self.expr(mask)}"
+
+    def assignment(self, write: Assign) -> str:
+        place = "" if write.offset == (0, 0) else f"{show_offset(write.offset)}."
+        return f"{place}{write.field} {write.op} {self.expr(write.value)}"
+
+    # Expressions
+
+    def expr(self, expr: Expr, binding: int = 0) -> str:
+        """An expression, in parentheses if it binds less tightly than it must."""
+        text, level = self._expr(expr)
+        return f"({text})" if level < binding else text
+
+    def _expr(self, expr: Expr) -> tuple[str, int]:
+        """The text of an expression, and how tightly it binds."""
+        rules, args = self.ruleset, expr.args
+        if expr.op in _INFIX:
+            sign, level, right = _INFIX[expr.op]
+            left = level + 1 if expr.op in _COMPARISONS else level
+            return f"{self.expr(args[0], left)} {sign} {self.expr(args[1], right)}", level
+        match expr.op:
+            case "const":
+                return show_value(rules, expr.kind, expr.value), _ATOM  # type: ignore[arg-type]
+            case "element":
+                return "element", _ATOM
+            case "draw":  # a stream may be called like anything else
+                return f"draw({expr.value})", _ATOM
+            case "coordinate":
+                return "{} mod {}".format(*expr.value), 6  # type: ignore[misc]
+            case "inside":
+                return f"inside({show_offset(expr.value)})", _ATOM  # type: ignore[arg-type]
+            case "look":
+                return f"{show_offset(expr.value)}.{self.expr(args[0], _ATOM)}", _ATOM  # type: ignore[arg-type]
+            case "member":
+                return f"{self.expr(args[0], 5)} in {show_set(rules, expr.value)}", 4  # type: ignore[arg-type]
+            case "not":
+                return f"not {self.expr(args[0], 3)}", 3
+            case "neg":
+                return f"-{self.expr(args[0], 7)}", 7
+            case "mod":
+                return f"{self.expr(args[0], 6)} mod {expr.value}", 6
+            case "count" | "sum":
+                kernel = self.kernel(expr.value)  # type: ignore[arg-type]
+                return f"{expr.op}({self.expr(args[0], 5)} in {kernel})", _ATOM
+            case "choose":
+                return f"{self.expr(args[1], 1)} if {self.expr(args[0], 1)} else {self.expr(args[2])}", 0
+            case _ if args:
+                return f"{expr.op}({', '.join(self.expr(arg) for arg in args)})", _ATOM
+        return str(expr.value), _ATOM
+
+    def kernel(self, kernel: Kernel) -> str:
+        """Its name; those that share one, as copies under a symmetry do, are numbered."""
+        if kernel not in self.kernels:
+            copies = sum(other.name == kernel.name for other in self.kernels)
+            self.kernels[kernel] = f"{kernel.name}#{copies + 1}" if copies else kernel.name
+        return self.kernels[kernel]

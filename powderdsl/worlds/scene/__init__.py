@@ -1,0 +1,31 @@
+"""Scene files: start worlds drawn in one-line statements, later ones over earlier ones.
+
+    scene: NAME
+    about: What it shows, in a sentence.
+    size: [64, 64]                                     # rows, columns
+    fill: ELEMENT
+    draw:
+      - line ELEMENT from (63, 5) to (32, 5) width 3   # points are (row, column)
+      - disk ELEMENT at (32, 32) radius 10
+      - box ELEMENT rows 32:64                         # a:b leaves b out; all columns unless it says so
+      - box ELEMENT rows 48:end columns :16            # `48:` means the same, but YAML takes it for a key
+      - frame ELEMENT
+
+`draw` may also be a `|` block, one statement a line. A file with several scenes has a list under `scenes`.
+"""
+
+from powderdsl.worlds.scene.load import draw_scene, find_scene, load_scene, load_scenes, shipped_scenes
+from powderdsl.worlds.scene.read import Scene, read_scenes
+from powderdsl.worlds.scene.statements import STATEMENTS, parse_statement
+
+__all__ = [
+    "STATEMENTS",
+    "Scene",
+    "draw_scene",
+    "find_scene",
+    "load_scene",
+    "load_scenes",
+    "parse_statement",
+    "read_scenes",
+    "shipped_scenes",
+]

@@ -1,0 +1,490 @@
+"""Classic cellular automata written in the rule language, against what is known of them, on every backend.
+
+The packs (rules/life.yaml and so on) share nothing with the physics of Powderworld: they show that the
+language is general. Each is checked against patterns from the literature, or against a few lines of NumPy or
+plain Python that say the same thing in another way.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+import powderdsl
+from powderdsl import Simulator, World
+from powderdsl.worlds.ascii import read_ascii, write_ascii
+
+Cells = set[tuple[int, int]]
+
+
+@pytest.fixture(params=["reference", "torch"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@cache
+def simulator(pack: str, backend: str) -> Simulator:
+    return powderdsl.compile(powderdsl.load(pack), backend=backend)
+
+
+def drawn(sim: Simulator, art: str) -> World:
+    """A batch of one world, drawn with the pack's glyphs."""
+    return sim.world(read_ascii(art, sim.ruleset.elements)[None])
+
+
+def shown(world: World) -> list[str]:
+    """The rows of the first world, to compare with drawings."""
+    return write_ascii(world.ids[0], world.sim.ruleset.elements).split()
+
+
+def rows(art: str) -> list[str]:
+    return art.split()
+
+
+def noise(sim: Simulator, shape: tuple[int, ...], *, seed: int, p: list[float] | None = None) -> np.ndarray:
+    """Random ids uint8 [B, H, W], with these probabilities by id."""
+    return np.random.default_rng(seed).choice(len(sim.elements), shape, p=p).astype(np.uint8)
+
+
+def around(cells: np.ndarray) -> np.ndarray:
+    """How many of the eight neighbours hold, on a torus: bool [..., H, W] -> int [..., H, W]."""
+    shifts = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
+    return sum(np.roll(cells, shift, (-2, -1)).astype(int) for shift in shifts)  # type: ignore[return-value]
+
+
+# Life
+
+GLIDER = rows(
+    """
+    .O...
+    ..O..
+    OOO..
+    .....
+    .....
+    """
+)
+R_PENTOMINO: Cells = {(0, 1), (0, 2), (1, 0), (1, 1), (2, 1)}
+GOSPER_GUN = rows(
+    """
+    ........................O...........
+    ......................O.O...........
+    ............OO......OO............OO
+    ...........O...O....OO............OO
+    OO........O.....O...OO..............
+    OO........O...O.OO....O.O...........
+    ..........O.....O.......O...........
+    ...........O...O....................
+    ............OO......................
+    """
+)
+
+
+def life(sim: Simulator, pattern: list[str], height: int, width: int, at: tuple[int, int]) -> World:
+    """A Life world with a pattern in it, its top left corner `at` a row and a column."""
+    ids = np.zeros((1, height, width), np.uint8)
+    art = read_ascii("\n".join(pattern), sim.ruleset.elements)
+    ids[0, at[0] : at[0] + art.shape[0], at[1] : at[1] + art.shape[1]] = art
+    return sim.world(ids)
+
+
+def next_generation(cells: Cells) -> Cells:
+    """Life on an endless plane, by counting how often each cell is somebody's neighbour."""
+    counts: dict[tuple[int, int], int] = {}
+    for y, x in cells:
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                if (dy, dx) != (0, 0):
+                    place = (y + dy, x + dx)
+                    counts[place] = counts.get(place, 0) + 1
+    return {place for place, n in counts.items() if n == 3 or (n == 2 and place in cells)}
+
+
+def test_a_glider_moves_one_cell_down_and_right_in_four_generations(backend: str) -> None:
+    sim = simulator("life", backend)
+    world = life(sim, GLIDER, 20, 20, at=(3, 4))
+    for i in range(1, 5):
+        world = sim.step(world, 4)
+        expected = life(sim, GLIDER, 20, 20, at=(3 + i, 4 + i))
+        assert torch.equal(world.ids, expected.ids)
+
+
+def test_a_glider_crosses_the_edges_of_the_torus(backend: str) -> None:
+    sim = simulator("life", backend)
+    start = life(sim, GLIDER, 12, 8, at=(0, 0))
+    # It is home when it has gone round the 12 rows and the 8 columns a whole number of times: after 24 cells.
+    halfway = sim.step(start, 4 * 12)
+    assert not torch.equal(halfway.ids, start.ids)
+    assert torch.equal(sim.step(halfway, 4 * 12).ids, start.ids)
+    assert torch.equal(sim.step(start, 4 * 5).ids, torch.roll(start.ids, (5, 5), (1, 2)))
+
+
+def test_a_blinker_has_period_two(backend: str) -> None:
+    sim = simulator("life", backend)
+    lying = life(sim, ["OOO"], 5, 5, at=(2, 1))
+    standing = life(sim, ["O", "O", "O"], 5, 5, at=(1, 2))
+    assert torch.equal(sim.step(lying).ids, standing.ids)
+    assert torch.equal(sim.step(lying, 2).ids, lying.ids)
+
+
+def test_the_gosper_gun_fires_a_glider_every_thirty_generations(backend: str) -> None:
+    sim = simulator("life", backend)
+    start = life(sim, GOSPER_GUN, 60, 60, at=(4, 4))
+    gun = (slice(None), slice(0, 13), slice(None))
+    world = start
+    for shots in range(1, 5):
+        world = sim.step(world, 30)
+        assert int(world.ids.sum()) == 36 + 5 * shots
+        assert torch.equal(world.ids[gun], start.ids[gun]), "the gun is as it was"
+    # In the 60 generations of two shots a glider flies 15 cells.
+    assert int(world.ids[0, 18:26].sum()) == 5
+    assert torch.equal(sim.step(world, 60).ids[0, 33:41], torch.roll(world.ids[0, 18:26], 15, 1))
+
+
+def test_the_r_pentomino_grows_as_it_is_known_to(backend: str) -> None:
+    generations = [R_PENTOMINO]
+    for _ in range(1103):
+        generations.append(next_generation(generations[-1]))
+    sizes = [len(cells) for cells in generations]
+    # As in the literature: at most 319 cells, in generation 821, and 116 from generation 1103 on.
+    assert (sizes.index(319), max(sizes), sizes[1102:]) == (821, 319, [118, 116])
+
+    sim = simulator("life", backend)
+    ids = np.zeros((1, 160, 160), np.uint8)
+    for y, x in R_PENTOMINO:
+        ids[0, 80 + y, 80 + x] = 1
+    world = sim.world(ids)
+    for generation in range(20, 201, 20):
+        world = sim.step(world, 20)
+        alive = {(y - 80, x - 80) for y, x in world.ids[0].nonzero().tolist()}
+        assert alive == generations[generation], f"generation {generation}"
+
+
+@pytest.mark.parametrize("shape", [(3, 16, 16), (2, 7, 33), (1, 3, 64), (1, 50, 3)])
+def test_random_life_agrees_with_a_direct_formula(backend: str, shape: tuple[int, int, int]) -> None:
+    sim = simulator("life", backend)
+    alive = noise(sim, shape, seed=1) == 1
+    world = sim.world(alive.astype(np.uint8))
+    for _ in range(8):
+        neighbours = around(alive)
+        alive = (neighbours == 3) | (alive & (neighbours == 2))
+        world = sim.step(world)
+        assert np.array_equal(world.ids.numpy() == 1, alive)
+
+
+# Wireworld. In the drawings A and B are the heads of the inputs' electrons, a and b their tails.
+
+OR_GATE = """
+    aA====.....
+    ......=====
+    bB====.....
+    """
+XOR_GATE = """
+    aA===......
+    .....=.....
+    ....====...
+    ....=..====
+    ....====...
+    .....=.....
+    bB===......
+    """
+# A and not (A and not B): an electron stops where three heads come down on it at the same moment.
+AND_GATE = """
+    ..bB====............
+    ........=...........
+    .......===..........
+    ........=...........
+    aA======.====.......
+    ...=.........=......
+    ...=........===.....
+    ...=.........=......
+    ....=========.======
+    """
+CLOCK = """
+    .====......
+    =....======
+    .@~==......
+    """
+
+
+def heads_at_the_end(sim: Simulator, art: str, steps: int, a: bool = False, b: bool = False) -> list[int]:
+    """When a head reaches the right end of the drawing's only wire there: step numbers from 1."""
+    for inputs, present in (("Aa", a), ("Bb", b)):
+        art = art.replace(inputs[0], "@" if present else "=").replace(inputs[1], "~" if present else "=")
+    # A margin keeps electrons from seeing the other side of the torus.
+    world = drawn(sim, "\n".join(row + ".." for row in [*rows(art), "." * len(rows(art)[0])]))
+    ((row, column),) = (world.ids[0, :, -3:-2] != 0).nonzero().tolist()
+    found = []
+    for step in range(1, steps + 1):
+        world = sim.step(world)
+        if shown(world)[row][column - 3] == "@":
+            found.append(step)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("gate", "delay", "truth"),
+    [
+        pytest.param(OR_GATE, 9, (False, True, True, True), id="or"),
+        pytest.param(XOR_GATE, 9, (False, True, True, False), id="xor"),
+        pytest.param(AND_GATE, 20, (False, False, False, True), id="and"),
+    ],
+)
+def test_gates_have_their_truth_tables(backend: str, gate: str, delay: int, truth: tuple[bool, ...]) -> None:
+    sim = simulator("wireworld", backend)
+    for i, expected in enumerate(truth):
+        times = heads_at_the_end(sim, gate, steps=40, a=bool(i & 2), b=bool(i & 1))
+        assert times == ([delay] if expected else []), f"a = {i >> 1}, b = {i & 1}"
+
+
+def test_a_clock_ticks_with_the_length_of_its_loop(backend: str) -> None:
+    sim = simulator("wireworld", backend)
+    times = heads_at_the_end(sim, CLOCK, steps=60)
+    assert len(times) >= 4
+    assert {later - earlier for earlier, later in pairwise(times)} == {10}
+
+
+def test_a_diode_lets_electrons_pass_one_way(backend: str) -> None:
+    sim = simulator("wireworld", backend)
+    open_way, blocked_way = (
+        """
+        .....==......
+        aA====.======
+        .....==......
+        """,
+        """
+        ......==.....
+        aA====.======
+        ......==.....
+        """,
+    )
+    assert heads_at_the_end(sim, open_way, steps=40, a=True) == [11]
+    assert heads_at_the_end(sim, blocked_way, steps=40, a=True) == []
+
+
+def test_an_electron_runs_along_a_wire(backend: str) -> None:
+    sim = simulator("wireworld", backend)
+    world = sim.step(drawn(sim, "........ \n ~@=====. \n ........"), 4)
+    assert shown(world) == ["........", "====~@=.", "........"]
+
+
+# Forest fire
+
+
+def forest(backend: str, growth: float, lightning: float) -> Simulator:
+    params = {"forest_fire.growth": growth, "forest_fire.lightning": lightning}
+    return powderdsl.compile(powderdsl.load("forest_fire", params=params), backend=backend)
+
+
+def test_fire_spreads_to_the_four_neighbours_and_burns_out(backend: str) -> None:
+    sim = forest(backend, growth=0, lightning=0)
+    ids = np.full((1, 15, 17), 1, np.uint8)
+    ids[0, 7, 8] = 2
+    world = sim.world(ids)
+    y, x = np.mgrid[:15, :17]
+    distance = abs(y - 7) + abs(x - 8)
+    for step in range(1, 18):
+        world = sim.step(world)
+        # Nothing crosses the edges: neighbours outside the grid count as nothing.
+        expected = np.select([distance < step, distance == step], [0, 2], 1)
+        assert np.array_equal(world.ids[0].numpy(), expected)
+
+
+def test_fire_does_not_jump_over_bare_ground(backend: str) -> None:
+    sim = forest(backend, growth=0, lightning=0)
+    world = drawn(sim, "TTf.TT \n TTTT.T \n ....TT")
+    assert shown(sim.step(world, 20)) == ["....TT", "....." + "T", "....TT"]
+
+
+def test_every_fire_leaves_bare_ground_and_every_change_is_a_lawful_one(backend: str) -> None:
+    sim = forest(backend, growth=0.3, lightning=0.1)
+    ground, tree, fire = 0, 1, 2
+    world = sim.world(noise(sim, (2, 40, 40), seed=3), seed=5)
+    for _ in range(10):
+        before, world = world.ids.numpy(), sim.step(world)
+        after = world.ids.numpy()
+        assert (after[before == fire] == ground).all()
+        assert np.isin(after[before == tree], (tree, fire)).all()
+        assert np.isin(after[before == ground], (ground, tree)).all()
+
+
+def test_growth_and_lightning_come_as_often_as_they_should(backend: str) -> None:
+    growth, lightning = 0.02, 1e-5
+    cells = 2**21
+    bare = forest(backend, growth, lightning).world(np.zeros((2, 1024, 1024), np.uint8), seed=11)
+    grown = int((bare.sim.step(bare).ids == 1).sum())
+    assert abs(grown - growth * cells) < 5 * np.sqrt(growth * cells)
+    wood = bare.sim.world(np.ones((2, 1024, 1024), np.uint8), seed=12)
+    struck = int((wood.sim.step(wood).ids == 2).sum())
+    # 21 are expected; draws of 16 bits could only give 0 or 32, and that is 5 deviations from neither.
+    assert 5 <= struck <= 45
+
+
+def test_a_forest_comes_to_rest_where_as_much_grows_as_burns(backend: str) -> None:
+    growth = 0.01
+    sim = forest(backend, growth, lightning=1e-4)
+    world = sim.step(sim.world(np.zeros((2, 64, 64), np.uint8), seed=2), 300)
+    shares = []
+    for _ in range(300):
+        world = sim.step(world)
+        shares.append([float((world.ids == kind).float().mean()) for kind in range(3)])
+    ground, tree, fire = np.mean(shares, 0)
+    assert ground + tree + fire == pytest.approx(1)
+    # A fire burns for one step, so there are as many fires as new trees.
+    assert fire == pytest.approx(growth * ground, rel=0.2)
+    assert 0.25 < tree < 0.6
+
+
+# Margolus: balls fly diagonally in blocks of 2×2 cells
+
+
+def test_a_ball_flies_diagonally(backend: str) -> None:
+    sim = simulator("margolus", backend)
+    for start, step in (((2, 2), (1, 1)), ((2, 3), (1, -1)), ((3, 2), (-1, 1)), ((3, 3), (-1, -1))):
+        ids = np.zeros((1, 8, 10), np.uint8)
+        ids[0][start] = 1
+        world = sim.world(ids)
+        for i in range(1, 50):
+            world = sim.step(world)
+            place = [(start[0] + i * step[0]) % 8, (start[1] + i * step[1]) % 10]
+            assert world.ids[0].nonzero().tolist() == [place]
+
+
+def test_two_balls_bounce_off_each_other(backend: str) -> None:
+    sim = simulator("margolus", backend)
+    world = drawn(
+        sim,
+        """
+        o.......
+        ........
+        ........
+        ........
+        ........
+        .....o..
+        ........
+        ........
+        """,
+    )
+    # They come along one diagonal, meet in the block of rows and columns 2 and 3, and leave along the other.
+    assert shown(sim.step(world, 2)) == rows(
+        """
+        ........
+        ........
+        ..o.....
+        ...o....
+        ........
+        ........
+        ........
+        ........
+        """
+    )
+    assert shown(sim.step(world, 4)) == rows(
+        """
+        ........
+        ....o...
+        ........
+        ........
+        .o......
+        ........
+        ........
+        ........
+        """
+    )
+
+
+def test_four_balls_at_rest_turn_a_ball_back(backend: str) -> None:
+    sim = simulator("margolus", backend)
+    rest = [[4, 7], [4, 8], [5, 7], [5, 8]]
+    ids = np.zeros((1, 12, 12), np.uint8)
+    for row, column in [*rest, (0, 4)]:
+        ids[0, row, column] = 1
+    world = sim.world(ids)
+    for place in [(1, 5), (2, 6), (3, 7), (3, 7), (2, 6), (1, 5), (0, 4)]:
+        world = sim.step(world)
+        assert world.ids[0].nonzero().tolist() == [list(place), *rest]
+
+
+@pytest.mark.parametrize("density", [0.05, 0.3, 0.7])
+def test_no_ball_is_lost_or_made(backend: str, density: float) -> None:
+    sim = simulator("margolus", backend)
+    ids = noise(sim, (4, 14, 22), seed=4, p=[1 - density, density])
+    world = sim.world(ids)
+    for _ in range(20):
+        world = sim.step(world)
+        assert world.ids.sum((1, 2)).tolist() == ids.sum((1, 2)).tolist()
+
+
+def test_time_runs_backwards(backend: str) -> None:
+    """A step undoes itself, and an odd number of steps meets the same blocks from either end."""
+    sim = simulator("margolus", backend)
+    start = sim.world(noise(sim, (3, 16, 24), seed=6, p=[0.7, 0.3]))
+    end = sim.step(start, 41)
+    assert not torch.equal(end.ids, start.ids)
+    assert torch.equal(sim.step(sim.world(end.ids), 41).ids, start.ids)
+
+
+def test_blocks_are_alike_but_for_their_grid(backend: str) -> None:
+    sim = simulator("margolus", backend)
+    ids = noise(sim, (2, 12, 16), seed=7, p=[0.7, 0.3])
+    expected = sim.step(sim.world(ids), 9).ids
+    even = sim.step(sim.world(np.roll(ids, (4, -6), (1, 2))), 9).ids
+    assert torch.equal(even, torch.roll(expected, (4, -6), (1, 2)))
+    # One cell down and right is the blocks' own shift from one step to the next.
+    first = sim.step(sim.world(ids))
+    later = sim.step(sim.world(np.roll(first.ids.numpy(), (1, 1), (1, 2))), 8).ids
+    assert torch.equal(later, torch.roll(expected, (1, 1), (1, 2)))
+
+
+# Others, each against a direct formula
+
+
+def test_brians_brain(backend: str) -> None:
+    sim = simulator("brians_brain", backend)
+    ids = noise(sim, (2, 20, 30), seed=8)
+    world = sim.world(ids)
+    for _ in range(10):
+        ids = np.select([ids == 1, ids == 2], [2, 0], (around(ids == 1) == 2).astype(int))
+        world = sim.step(world)
+        assert np.array_equal(world.ids.numpy(), ids)
+
+
+def test_cyclic(backend: str) -> None:
+    sim = simulator("cyclic", backend)
+    ids = noise(sim, (2, 24, 18), seed=9).astype(int)
+    world = sim.world(ids)
+    for _ in range(20):
+        eater = (ids + 1) % 6
+        sides = [np.roll(ids, shift, (1, 2)) for shift in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+        ids = np.where(np.any([side == eater for side in sides], axis=0), eater, ids)
+        world = sim.step(world)
+        assert np.array_equal(world.ids.numpy(), ids)
+
+
+def test_langtons_ant(backend: str) -> None:
+    sim = simulator("langtons_ant", backend)
+    ids = np.zeros((1, 32, 40), np.uint8)
+    ids[0, 16, 20] = 2
+    world = sim.world(ids)
+    black: Cells = set()
+    (y, x), heading = (16, 20), 0
+    for _ in range(6):
+        for _ in range(50):
+            heading = (heading + (3 if (y, x) in black else 1)) % 4
+            black ^= {(y, x)}
+            dy, dx = ((-1, 0), (0, 1), (1, 0), (0, -1))[heading]
+            y, x = (y + dy) % 32, (x + dx) % 40
+        world = sim.step(world, 50)
+        assert (world.ids[0] == 2).nonzero().tolist() == [[y, x]]
+        assert {(r, c) for r, c in (world.ids[0] == 1).nonzero().tolist()} == black - {(y, x)}
+
+
+def test_two_ants_that_meet_wait_for_each_other(backend: str) -> None:
+    sim = simulator("langtons_ant", backend)
+    world = sim.world(np.where(np.random.default_rng(10).random((2, 16, 16)) < 0.2, 2, 0))
+    ants = (world.ids == 2).sum()
+    for _ in range(20):
+        world = sim.step(world)
+        assert (world.ids == 2).sum() == ants

@@ -1,0 +1,280 @@
+"""The documentation, run: packs load and pass their tests, Python runs, commands exit with 0, links lead somewhere.
+
+Fenced blocks are run page by page, in order, in one temporary directory:
+
+* ``yaml``: a pack or ruleset. A block without ``pack:`` is part of a pack called `example`. Comments at its top say
+  what it needs and what is expected: ``# with: core+sand``, ``# error: PD301``, ``# warning: PD503``,
+  ``# note: PD506``. It is saved under its name, so that later blocks can load it, and its `tests:` are run.
+* ``rules``: one rule a line, each loaded in a pass of its own. ``expressions``: one value a line.
+* ``python``: one namespace a page.
+* ``console``: what follows ``$ powderdsl`` is run; other lines of the block must occur in what it prints.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import powderdsl
+from powderdsl.compiler import load_with_diagnostics
+from powderdsl.diagnostics import CompileError, Diagnostic, Severity
+from powderdsl.model.types import Ruleset
+from powderdsl.worlds.ascii import read_ascii, write_ascii
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+MANY_STEPS = 4
+"""Commands that run longer are cut to this many steps: what they print does not hang on it."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page: its language, its text, and the line it starts at."""
+
+    language: str
+    text: str
+    line: int
+
+    def expected(self, word: str) -> str:
+        """The value of a `# word: value` comment at the top of the block."""
+        head = re.match(r"(#.*\n)*", self.text)
+        found = re.search(rf"^# {word}: (.*)$", head[0] if head else "", re.MULTILINE)
+        return found[1].strip() if found else ""
+
+
+def blocks_of(page: str) -> list[Block]:
+    found = re.finditer(r"^```(\w*)\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    return [Block(one[1], one[2], page[: one.start()].count("\n") + 1) for one in found]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory that sees the repository's folders."""
+    for name in ("docs", "rules", "tasks"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# --- what runs each language
+
+
+def run_yaml(block: Block) -> None:
+    text = block.text
+    if not re.search(r"^(pack|ruleset):", text, re.MULTILINE):
+        text = f"pack: example\n{text}"
+    name = re.search(r"^(?:pack|ruleset): *(\w+)", text, re.MULTILINE)
+    assert name, "the block names no pack"
+    path = Path(f"{name[1]}.yaml")
+    path.write_text(text, encoding="utf-8")
+    ruleset, found = diagnosed(*filter(None, [block.expected("with")]), path)
+    for severity in Severity:
+        codes = sorted({one.code for one in found if one.severity is severity})
+        wanted = sorted(block.expected(severity.value).split())
+        if wanted or severity is not Severity.NOTE:
+            assert codes == wanted, f"{severity.value}: " + "; ".join(f"{one.code} {one.message}" for one in found)
+    if ruleset is not None:
+        run_tests(ruleset, name[1])
+
+
+def diagnosed(*names: str | Path) -> tuple[Ruleset | None, tuple[Diagnostic, ...]]:
+    try:
+        return load_with_diagnostics(*names)
+    except CompileError as error:
+        return None, tuple(error.diagnostics)
+
+
+def run_tests(ruleset: Ruleset, pack: str) -> None:
+    """The pack's own tests, as far as they say what a world becomes, on both backends."""
+    for example in (one for one in ruleset.tests if one.pack == pack and one.expect):
+        for backend in ("reference", "torch"):
+            sim = powderdsl.compile(ruleset, backend=backend)
+            legend = dict(example.legend)
+            start = read_ascii("\n".join(example.given), ruleset.elements, legend=legend)
+            world = sim.step(sim.world(start[None], seed=example.seed or 0), steps=example.steps)
+            shown = write_ascii(world.ids[0], ruleset.elements).split()
+            glyphs = {char: next(e.glyph for e in ruleset.elements if e.name == name) for char, name in legend.items()}
+            wanted = ["".join(glyphs.get(char, char) for char in row) for row in example.expect or ()]
+            for row, pattern in zip(shown, wanted, strict=True):
+                fits = all(b in ("?", a) for a, b in zip(row, pattern, strict=True))
+                assert fits, f"{example.name} ({backend}): {shown} is not {wanted}"
+
+
+def run_lines(block: Block) -> None:
+    """`rules` and `expressions`: each line alone, so that no line hides another's mistake."""
+    for line in block.text.splitlines():
+        line = re.sub(r"\s+# .*", "", line).strip()
+        if not line or line.startswith("# "):
+            continue
+        body = f"do:\n      - {line}" if block.language == "rules" else f"let: {{value: '{line}'}}\n    then: any -> here"
+        fields = block.expected("fields")
+        Path("line.yaml").write_text(
+            "pack: line\n" + (f"fields: {{{fields}}}\n" if fields else "") + f"passes:\n  line:\n    {body}\n"
+        )
+        _, found = diagnosed(*filter(None, [block.expected("with")]), "line.yaml")
+        errors = [f"{one.code} {one.message}" for one in found if one.severity is Severity.ERROR]
+        assert not errors, f"{line}: {errors}"
+
+
+def run_console(block: Block) -> None:
+    printed = ""
+    for line in block.text.splitlines():
+        if not line.startswith("$ "):
+            seen = line.strip() in ("", "…") or line.rstrip() in printed
+            assert seen, f"not printed: {line}\n{printed}"
+        elif line.startswith("$ powderdsl "):
+            printed = run_command(shlex.split(line.removeprefix("$ powderdsl "), comments=True))
+
+
+def run_command(arguments: list[str]) -> str:
+    for i, word in enumerate(arguments[:-1]):
+        if word == "--steps":
+            arguments[i + 1] = str(min(int(arguments[i + 1]), MANY_STEPS))
+    if "--watch" in arguments:  # needs a terminal
+        arguments.remove("--watch")
+    from powderdsl.cli import main
+
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, f"powderdsl {shlex.join(arguments)}: {result.output}"
+    return result.output
+
+
+def run_block(block: Block, namespace: dict[str, Any]) -> None:
+    match block.language:
+        case "yaml":
+            run_yaml(block)
+        case "rules" | "expressions":
+            run_lines(block)
+        case "console":
+            run_console(block)
+        case "python":
+            exec(compile(block.text, "<documentation>", "exec"), namespace)
+
+
+# --- the pages as they are
+
+
+def page_name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def runnable(page: Path) -> bool:
+    return any(block.language in ("yaml", "rules", "expressions", "python", "console") for block in blocks_of(read(page)))
+
+
+def read(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", filter(runnable, PAGES), ids=page_name)
+def test_blocks_run(page: Path, folder: Path) -> None:
+    namespace: dict[str, Any] = {"__name__": "documentation"}
+    for block in blocks_of(read(page)):
+        try:
+            run_block(block, namespace)
+        except BaseException as error:
+            error.add_note(f"in the {block.language} block at {page_name(page)}:{block.line}")
+            raise
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_links_lead_somewhere(page: Path) -> None:
+    assert list(dead_links(read(page), page)) == []
+
+
+def dead_links(text: str, page: Path) -> Iterator[str]:
+    """Relative links to files that do not exist, or to headings that a page does not have."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        file, _, anchor = target.partition("#")
+        other = (page.parent / file).resolve() if file else page
+        if not other.exists():
+            yield target
+        elif anchor and anchor not in headings(read(other)):
+            yield target
+
+
+def headings(text: str) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.fixture(scope="module")
+def generate() -> Any:
+    spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_tables_are_fresh(generate: Any) -> None:
+    stale = [page_name(page) for page in generate.stale_pages()]
+    assert stale == [], "run `python docs/generate.py`"
+
+
+def test_a_stale_table_would_be_seen(generate: Any) -> None:
+    page = "a\n<!-- generated: kernels -->\nold\n<!-- end -->\nb\n"
+    fresh = generate.generated(page)
+    assert "`box`" in fresh
+    assert "old" not in fresh
+    assert generate.generated(fresh) == fresh
+
+
+def test_every_table_of_keys_is_shown(generate: Any) -> None:
+    """A new kind of mapping, or a function, cannot stay undocumented."""
+    shown = {found for page in DOCS.rglob("*.md") for found in re.findall(r"<!-- generated: ([\w ]+) -->", read(page))}
+    assert generate.TABLES.keys() - shown == {"keys block"}  # the same as the block keys of a pass
+
+
+# --- the checks can fail
+
+
+@pytest.mark.parametrize(
+    ("language", "text"),
+    [
+        ("yaml", "# with: core\nelements: {salt: {id: 20, color: red}}\n"),
+        ("yaml", "# with: core\n# error: PD301\nelements: {salt: {id: 20, color: '#FFFFFF'}}\n"),
+        ("yaml", "# with: core\npasses: {x: {do: wall -> empty if density < 2}}\n"),
+        ("rules", "# with: core\nwall -> empty\nwall -> salt\n"),
+        ("expressions", "# with: core\ncount(wall) > 1\ncount(wall) > wall\n"),
+        ("console", "$ powderdsl explain PD999\n"),
+        ("console", "$ powderdsl --version\npowderdsl 77.0\n"),
+        ("python", "assert False\n"),
+    ],
+)
+def test_blocks_can_fail(language: str, text: str, folder: Path) -> None:
+    with pytest.raises(AssertionError):
+        run_block(Block(language, text, 1), {})
+
+
+def test_a_wrong_test_of_a_pack_fails(folder: Path) -> None:
+    text = "tests:\n  - stays:\n      given: '# .'\n      after: 1 step\n      expect: '# {}'\n"
+    run_block(Block("yaml", "# with: core\n" + text.replace("{}", "."), 1), {})
+    run_block(Block("yaml", "# with: core\n" + text.replace("{}", "'?'").replace("'# '?''", "'# ?'"), 1), {})
+    with pytest.raises(AssertionError, match="stays"):
+        run_block(Block("yaml", "# with: core\n" + text.replace("{}", "#"), 1), {})
+
+
+def test_links_can_fail() -> None:
+    text = "# Two words\n[a](gone.md) [b](#two-words) [c](#three) [d](https://example.org) [e](README.md#gone)\n"
+    assert list(dead_links(text, ROOT / "x.md")) in (["gone.md", "#three", "README.md#gone"], [])
+
+
+def test_blocks_are_found() -> None:
+    page = "a\n```yaml\n# with: core\nx: y\n```\n```\nplain\n```\n"
+    assert blocks_of(page) == [Block("yaml", "# with: core\nx: y\n", 2), Block("", "plain\n", 6)]
+    assert blocks_of(page)[0].expected("with") == "core"
+    assert np.all([not blocks_of(page)[0].expected("error")])
