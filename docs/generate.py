@@ -1,4 +1,4 @@
-"""Tables of docs/*.md that follow from tables of the package: `python docs/generate.py`, or `--check` to compare.
+"""Tables of README.md and docs/*.md that follow from the package: `python docs/generate.py`, or `--check` to compare.
 
 A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is between them is written anew.
 """
@@ -12,10 +12,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
+from powderdsl.cli.commands import COMMANDS
 from powderdsl.compiler import shipped_rules
-from powderdsl.ir.ops import OPS
 from powderdsl.model.builtins import (
-    COORDINATES,
     DIRECTION_SETS,
     DIRECTIONS,
     FUNCTIONS,
@@ -115,10 +114,6 @@ def words() -> str:
     return ", ".join(f"`{word}`" for word in listed) + ".\n"
 
 
-def coordinates() -> str:
-    return ", ".join(f"`{word}`" for word in COORDINATES) + "\n"
-
-
 def limits() -> str:
     rows = [
         ("characters in a rule file", yaml_tree.MAX_CHARACTERS),
@@ -156,8 +151,8 @@ def stages() -> str:
     return table(("stage", "what it does"), [(f"`{stage.name}`", stage.about) for stage in PIPELINE])
 
 
-def operations() -> str:
-    return f"{len(OPS)} operations: " + ", ".join(f"`{name}`" for name in OPS) + ".\n"
+def commands() -> str:
+    return table(("command", "what it does"), [(f"`powderdsl {name}`", about) for name, (_, about) in COMMANDS.items()])
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -170,7 +165,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "limits": limits,
     "shipped": shipped,
     "stages": stages,
-    "operations": operations,
+    "commands": commands,
     **{f"keys {context}": (lambda context=context: keys(context)) for context in KEYS},
 }
 """What can stand between markers, by name."""
@@ -183,7 +178,8 @@ def generated(markdown: str) -> str:
 
 def stale_pages() -> list[Path]:
     """Pages whose tables are not what the package says."""
-    return [page for page in sorted(DOCS.rglob("*.md")) if generated(text := page.read_text("utf-8")) != text]
+    pages = [DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))]
+    return [page for page in pages if generated(text := page.read_text("utf-8")) != text]
 
 
 def main(arguments: list[str]) -> int:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
     from powderdsl.simulator import Simulator
 
-BACKENDS = ("auto", "torch", "dense", "reference")
+BACKENDS = ("auto", "torch", "dense", "native", "reference")
 
 
 def shipped(folder: str) -> Path:

@@ -129,12 +129,12 @@ def _context(world: World) -> reference.Context:
     """What a condition reads of a world: its state as the oracle holds it, parameters, the clock."""
     ruleset = world.sim.ruleset
     wide: dict[str, type] = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
-    state = {
+    state: reference.State = {
         slot.name: to_numpy(world.state[slot.name]).astype(wide.get(slot.kind.name, np.int64))
         for slot in slots(ruleset)
     }
     dtypes: dict[str, type] = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
-    params = {
+    params: dict[str, reference.Array] = {
         param.name: np.full(len(world), float(param.default), dtypes[param.kind.name])  # type: ignore[arg-type]
         for param in ruleset.params
     }

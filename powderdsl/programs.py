@@ -27,7 +27,7 @@ class Runnable(Protocol):
         params: Mapping[str, Tensor],
         draws: Mapping[str, Tensor],
         passes: frozenset[str] | None,
-    ) -> dict[str, Tensor]:
+    ) -> Mapping[str, Tensor]:
         """The state `steps` later; the argument is not changed.
 
         `params` are float64 [B]; `draws` int64 [B, H, W] below 2^bits replace a stream's numbers.
@@ -65,15 +65,21 @@ class ReferenceProgram:
         return {name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()}
 
 
-def make_program(ruleset: Ruleset, backend: str, device: torch.device) -> Runnable:
-    """The program of a ruleset on a backend. Raises CompileError (PD701) if the device is not there."""
+def find_device(name: str | torch.device) -> torch.device:
+    """The torch device of a name. Raises CompileError (PD701) if it is not there."""
     try:
+        device = torch.device(name)
         torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
         reporter = Reporter()
         problem = str(error).splitlines()[0]
-        reporter.error("PD701", f"no device `{device}`", None, notes=[problem], helps=["run on `cpu`"])
+        reporter.error("PD701", f"no device `{name}`", None, notes=[problem], helps=["run on `cpu`"])
         raise CompileError(reporter.diagnostics) from None
+    return device
+
+
+def make_program(ruleset: Ruleset, backend: str, device: torch.device) -> Runnable:
+    """The program of a ruleset on a backend, for a device that is there."""
     if backend == "reference":
         return ReferenceProgram(ruleset)
     from powderdsl.backends.torch_dense import DenseProgram
@@ -84,4 +90,8 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device) -> Runnab
     program = lower(ruleset)
     if backend == "dense":
         return DenseProgram(program, device)
+    if backend == "native":
+        from powderdsl.backends.torch_native import NativeProgram
+
+        return NativeProgram(program, lower_bits(program))
     return PlanesProgram(program, lower_bits(program), device)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.programs import make_program
+from powderdsl.programs import find_device, make_program
 from powderdsl.diagnostics import suggest
 from powderdsl.model.state import SNAP, Slot, slots
 from powderdsl.model.types import Ruleset
@@ -73,7 +73,7 @@ class Simulator:
     def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device):
         self.ruleset = ruleset
         self.backend = backend
-        self.device = torch.device(device)
+        self.device = find_device(device)
         self._slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._program = make_program(ruleset, backend, self.device)
         self._known = torch.zeros(256, dtype=torch.bool, device=self.device)

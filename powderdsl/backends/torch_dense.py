@@ -122,13 +122,17 @@ class Kernels:
 
     def param(self, name: str, view: str) -> Tensor:
         """A parameter [B, 1, 1]: its value, or as a chance the number of draws below (`lt16`) or up to it (`le16`)."""
-        value = self.params[name][:, None, None]
+        return self.param_view(self.params[name], view)[:, None, None]
+
+    @staticmethod
+    def param_view(value: Tensor, view: str) -> Tensor:
+        """Parameter values (float64 [B]) as generated code wants them."""
         match view:
             case "flag":
                 return value != 0
             case "int":
                 return value.to(torch.int32)
-            case "real":
+            case "real" | "chance":
                 return value.to(torch.float32)
         count = 1 << int(view[2:])
         scaled = value * count - 0.5

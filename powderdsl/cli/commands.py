@@ -9,8 +9,7 @@ from typing import Any, NoReturn
 
 import click
 
-from powderdsl import __version__
-from powderdsl.cli.exits import report_failure
+from powderdsl.cli.exits import report_failure, version
 
 COMMANDS: dict[str, tuple[str, str]] = {
     # name: (module in powderdsl.cli, summary)
@@ -71,7 +70,7 @@ class CommandGroup(click.Group):
     name="powderdsl",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-@click.version_option(__version__, prog_name="powderdsl", message="%(prog)s %(version)s")
+@click.version_option(version(), prog_name="powderdsl", message="%(prog)s %(version)s")
 def main() -> None:
     """Physics as data, compiled to tensor kernels.
 

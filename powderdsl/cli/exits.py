@@ -31,6 +31,12 @@ class BadInput(click.ClickException):
         click.echo(f"error: {self.format_message()}", file=file, err=file is None)
 
 
+def version() -> str:
+    """The version of powderdsl."""
+    found: str = sys.modules["powderdsl"].__version__  # our own package, so it has been imported
+    return found
+
+
 @contextmanager
 def user_values() -> Iterator[None]:
     """What the Python API says about bad values, as one line: for calls that hand on what a user gave."""
@@ -90,7 +96,6 @@ def report_failure(error: BaseException) -> int:
 def _report_internal(error: BaseException) -> None:
     import platform
 
-    from powderdsl import __version__
     from powderdsl.diagnostics import Diagnostic, Label
 
     if os.environ.get("POWDERDSL_DEBUG") == "1":
@@ -98,7 +103,7 @@ def _report_internal(error: BaseException) -> None:
 
         traceback.print_exception(error)
     words = " ".join(str(error).split())[:300]
-    system = f"powderdsl {__version__}, Python {platform.python_version()}, {platform.system()}"
+    system = f"powderdsl {version()}, Python {platform.python_version()}, {platform.system()}"
     diagnostic = Diagnostic(
         "PD901",
         f"a mistake in powderdsl itself: {type(error).__name__}{': ' if words else ''}{words}",

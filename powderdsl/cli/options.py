@@ -23,6 +23,22 @@ MAX_SIDE = 1 << 24
 """Rows or columns of a world; how many cells it may have is the worlds' business."""
 
 
+class WholeType(click.ParamType):
+    """A whole number from `low` to `high`."""
+
+    name = "N"
+
+    def __init__(self, low: int, high: int):
+        self.low, self.high = low, high
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        if not re.fullmatch(r"[0-9]{1,20}", str(value)) or not self.low <= int(value) <= self.high:
+            self.fail(f"`{value}` is no whole number from {self.low} to {self.high}", param, ctx)
+        return int(value)
+
+
 class SizeType(click.ParamType):
     """`48x64`: rows and columns; `64`: as many of both."""
 

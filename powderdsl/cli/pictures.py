@@ -14,7 +14,7 @@ from powderdsl.draw import contact_sheet, palette, rgb, scale, to_numpy
 if TYPE_CHECKING:
     from powderdsl.simulator import World
 
-USUAL_SIDE = 512
+USUAL_SIDE = 400
 MAX_SIDE = 16_384
 """Pixels a side. More would take gigabytes before the first one is written."""
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import SizeType, check_writable, load_rules
+from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules
 
 
 @click.command("render")
@@ -15,7 +15,7 @@ from powderdsl.cli.options import SizeType, check_writable, load_rules
 @click.option("--rules", required=True, metavar="RULES", help="The rules whose elements the world has.")
 @click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="x.png.")
 @click.option("--size", type=SizeType(), help="Rows and columns of a scene, such as 48x64.")
-@click.option("--scale", type=click.IntRange(1, 64), help="Pixels a cell.  [default: a side of about 512]")
+@click.option("--scale", type=WholeType(1, 64), help="Pixels a cell.  [default: about 400 a side]")
 def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
     """Draw a world as a picture, without running it.
 
@@ -27,10 +27,11 @@ def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, sca
     ruleset = load_rules(rules, {})
     check_writable(out)
     from powderdsl.cli.pictures import pictures
-    from powderdsl.cli.start_worlds import start_world
+    from powderdsl.cli.start_worlds import start_ids, start_world
     from powderdsl.compiler import compile
     from powderdsl.media import write_png
 
+    ids = start_ids(ruleset, world, size, None, None)
     # Nothing runs, so the backend that takes no compiling will do.
-    start = start_world(compile(ruleset, backend="reference"), world, size, None, None)
+    start = start_world(compile(ruleset, backend="reference"), ids, world, None)
     write_png(out, pictures(start, most=len(start), factor=scale))

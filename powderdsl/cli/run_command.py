@@ -14,6 +14,7 @@ import click
 from powderdsl.cli.exits import colour_wanted, counted, user_values
 from powderdsl.cli.options import (
     SizeType,
+    WholeType,
     backend_option,
     check_writable,
     load_rules,
@@ -38,7 +39,7 @@ class Plan:
 
     steps: int
     every: int
-    fps: float
+    fps: int
     scale: int | None
     out: Path | None
     watch: bool
@@ -61,24 +62,18 @@ def _out(ctx: click.Context, param: click.Parameter, value: str | None) -> Path 
 @rules_argument
 @click.option("--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml, or a scene's name.")
 @click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
-@click.option("--batch", type=click.IntRange(1, 1 << 20), help="How many worlds.  [default: 1]")
-@click.option(
-    "--steps", type=click.IntRange(0, 10**9), default=240, show_default=True, help="How many steps."
-)
-@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
+@click.option("--batch", type=WholeType(1, 1 << 20), help="How many worlds.  [default: 1]")
+@click.option("--steps", type=WholeType(0, 10**9), default=240, show_default=True, help="How many steps.")
+@click.option("--seed", type=WholeType(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
 @backend_option("auto")
 @click.option("--device", default="cpu", show_default=True, help="A torch device: cpu, cuda, cuda:1.")
 @set_option
 @click.option("--out", metavar="FILE", callback=_out, help="x.png, x.gif, x.mp4, or x.npz to save.")
-@click.option("--scale", type=click.IntRange(1, 64), help="Pixels a cell.  [default: a side of about 512]")
-@click.option(
-    "--every", type=click.IntRange(1, 10**6), default=1, show_default=True, help="Show every n-th step."
-)
-@click.option(
-    "--fps", type=click.FloatRange(0.1, 240), default=30, show_default=True, help="Frames a second."
-)
+@click.option("--scale", type=WholeType(1, 64), help="Pixels a cell.  [default: about 400 a side]")
+@click.option("--every", type=WholeType(1, 10**6), default=1, show_default=True, help="Show every n-th step.")
+@click.option("--fps", type=WholeType(1, 240), default=30, show_default=True, help="Frames a second.")
 @click.option("--watch", is_flag=True, help="Show the first world in the terminal while it runs.")
-@click.option("--threads", type=click.IntRange(1, 1024), help="CPU threads.  [default: 1 for small batches]")
+@click.option("--threads", type=WholeType(1, 1024), help="CPU threads.  [default: 1 for small batches]")
 @click.option("-v", "--verbose", is_flag=True, help="Say how fast, and what became of it.")
 def command(
     rules: str,
@@ -93,7 +88,7 @@ def command(
     out: Path | None,
     scale: int | None,
     every: int,
-    fps: float,
+    fps: int,
     watch: bool,
     threads: int | None,
     verbose: bool,
@@ -106,11 +101,13 @@ def command(
     ruleset = load_rules(rules, settings)
     if out is not None:
         check_writable(out)
-    from powderdsl.cli.start_worlds import start_world
+    from powderdsl.cli.start_worlds import start_ids, start_world
     from powderdsl.compiler import compile
 
+    # The world first: compiling imports torch, and whoever mistyped a name should not wait for that.
+    ids = start_ids(ruleset, world, size, batch, seed)
     sim = compile(ruleset, backend=backend, device=device)
-    start = start_world(sim, world, size, batch, seed)
+    start = start_world(sim, ids, world, seed)
     used = _set_threads(threads, start)
     plan = Plan(steps, every, fps, scale, out, watch)
     began = time.perf_counter()

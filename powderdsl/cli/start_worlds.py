@@ -19,37 +19,41 @@ if TYPE_CHECKING:
     from powderdsl.simulator import Simulator, World
 
 DEFAULT_SIZE: Size = (64, 64)
+MAX_TOTAL = 16 * MAX_CELLS
+"""Cells of all worlds that are made at once."""
+
 KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
 
 
-def is_saved(name: str | None) -> bool:
-    return name is not None and name.lower().endswith(".npz")
-
-
-def start_world(
-    sim: Simulator, name: str | None, size: Size | None, batch: int | None, seed: int | None
-) -> World:
-    """The worlds that a run starts from.
+def start_ids(
+    ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None
+) -> NDArray[np.uint8] | None:
+    """The ids uint8 [B, H, W] that a run starts from, or None for a saved world, which has more than ids.
 
     A saved world goes on as it was saved, random future included, so `size`, `batch` and `seed` do not go
-    with it. A drawn world stands `batch` times, each with random numbers of its own. Without a name every
-    world is strewn by itself.
+    with it. A drawn world stands `batch` times. Without a name every world is strewn by itself.
 
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
     """
-    if name is not None and is_saved(name):
+    if name is None:
+        return strew(ruleset, size or DEFAULT_SIZE, batch or 1, seed or 0)
+    if name.lower().endswith(".npz"):
         _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
+        return None
+    ids = drawn_ids(name, ruleset, size)
+    _check_cells(batch or 1, ids.shape)
+    return np.repeat(ids[None], batch or 1, axis=0)
+
+
+def start_world(sim: Simulator, ids: NDArray[np.uint8] | None, name: str | None, seed: int | None) -> World:
+    """The worlds of what `start_ids` gave for the same name; each has random numbers of its own."""
+    with user_values():
+        if ids is not None:
+            return sim.world(ids, seed=seed or 0)
         from powderdsl.worlds.store import load_world
 
-        with user_values():
-            return load_world(name, sim)
-    count, number = batch or 1, seed or 0
-    if name is None:
-        ids = strew(sim.ruleset, size or DEFAULT_SIZE, count, number)
-    else:
-        ids = np.repeat(drawn_ids(name, sim.ruleset, size)[None], count, axis=0)
-    with user_values():
-        return sim.world(ids, seed=number)
+        assert name is not None
+        return load_world(name, sim)
 
 
 def drawn_ids(name: str, ruleset: Ruleset, size: Size | None) -> NDArray[np.uint8]:
@@ -80,6 +84,12 @@ def _refuse_options(reason: str, **options: object) -> None:
             raise BadInput(f"--{option} does not go with this world: {reason}")
 
 
+def _check_cells(batch: int, size: tuple[int, ...]) -> None:
+    if batch * size[0] * size[1] > MAX_TOTAL:
+        many = f"{batch} worlds of {size[0]}×{size[1]} cells"
+        raise failure("PD607", many, helps=(f"all worlds together have at most {MAX_TOTAL:,} cells",))
+
+
 def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uint8]:
     """Worlds of shapes at random places, uint8 [batch, H, W]: world i depends on `seed` and i alone.
 
@@ -88,12 +98,7 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
     changes, the first such element frames the world, so that nothing falls out of it.
     """
     height, width = size
-    if height * width * batch > MAX_CELLS:
-        raise failure(
-            "PD607",
-            f"{batch} worlds of {height}×{width} cells",
-            helps=(f"shapes are strewn over at most {MAX_CELLS:,} cells",),
-        )
+    _check_cells(batch, size)
     everything = [element.id for element in ruleset.elements]
     ground, others = everything[0], everything[1:]
     worlds = np.full((batch, height, width), ground, dtype=np.uint8)

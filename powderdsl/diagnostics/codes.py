@@ -75,7 +75,6 @@ _ROWS = (
     ("PD507", "unused-definition", _WARNING),
     ("PD508", "expansion-too-large", _ERROR),
     ("PD509", "rule-does-nothing", _WARNING),
-    ("PD510", "pass-order-undecided", _WARNING),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),
@@ -92,7 +91,6 @@ _ROWS = (
     ("PD613", "file-not-writable", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),
-    ("PD702", "backend-limit", _ERROR),
     # PD9xx: our own mistakes
     ("PD901", "internal-error", _ERROR),
 )

@@ -13,6 +13,10 @@ MAX_ERRORS = 200
 """A file with more mistakes than this is reported up to here: nobody reads further."""
 
 
+MAX_CANDIDATES = 500
+"""Names among which a misspelt one is looked for; if there are more, those with its first letter."""
+
+
 @dataclass(frozen=True)
 class Label:
     """A place and the words that finish the sentence under its caret. `span` is None where there is no text."""
@@ -60,6 +64,7 @@ class Reporter:
 
     def __init__(self) -> None:
         self._found: dict[Diagnostic, None] = {}
+        self._errors = 0
 
     def report(
         self,
@@ -72,10 +77,21 @@ class Reporter:
         notes: Sequence[str] = (),
         helps: Sequence[str] = (),
     ) -> None:
-        """Add a diagnostic. The code's row in the table decides whether it is an error, a warning or a note."""
+        """Add a diagnostic. The code's row in the table decides whether it is an error, a warning or a note.
+
+        Raises:
+            CompileError: with everything so far, when there are MAX_ERRORS errors.
+        """
         diagnostic = Diagnostic(code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps))
-        if len(self._found) < MAX_ERRORS or diagnostic.severity is Severity.ERROR:
-            self._found[diagnostic] = None
+        if diagnostic in self._found:
+            return
+        if diagnostic.severity is Severity.ERROR:
+            self._errors += 1
+        elif len(self._found) > 10 * MAX_ERRORS:
+            return
+        self._found[diagnostic] = None
+        if self._errors >= MAX_ERRORS:
+            self.raise_if_errors()
 
     error = report
 
@@ -86,18 +102,20 @@ class Reporter:
 
     @property
     def has_errors(self) -> bool:
-        return any(diagnostic.severity is Severity.ERROR for diagnostic in self._found)
+        return self._errors > 0
 
     def raise_if_errors(self) -> None:
         """Raise CompileError with the errors found (warnings and notes stay with the reporter)."""
         if self.has_errors:
             errors = [d for d in self.diagnostics if d.severity is Severity.ERROR]
-            raise CompileError(errors[:MAX_ERRORS])
+            raise CompileError(errors)
 
 
 def suggest(word: str, candidates: Iterable[str], kind: str = "") -> tuple[str, ...]:
     """Help lines for an unknown word: the close match, or the whole list when it is short."""
     known = sorted(set(candidates) - {word})
+    if len(known) > MAX_CANDIDATES:
+        known = [name for name in known if name[:1] == word[:1]][:MAX_CANDIDATES]
     close = get_close_matches(word.lower(), known, n=1, cutoff=0.6)
     if close:
         return (f"did you mean `{close[0]}`?",)

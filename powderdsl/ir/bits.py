@@ -159,6 +159,13 @@ class _PassBits:
         offset = node.attr
         if isinstance(content, Node):
             assert isinstance(rest, Node)
+            if content.type == REAL:  # cell by cell anyway: choices between what neighbours hold
+                dy, dx = offset  # type: ignore[misc]
+                targets = self.gates.shift(movers, (-dy, -dx), True)
+                moved = self.build.select(targets, self.build.shift(content, (-dy, -dx)), rest)
+                if node.op == "swap":
+                    moved = self.build.select(movers, self.build.shift(content, (dy, dx)), moved)
+                return moved
             return make(content, movers, rest, offset)  # type: ignore[arg-type]
         assert isinstance(rest, Bits)
         content = self.gates.fit(content, node.type.lo, node.type.hi)

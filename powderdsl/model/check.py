@@ -52,7 +52,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     stored = {name: overridden_ids(passes, name, facts) for name in elaborated.overridden}
     symbols.properties = {name: replace(p, stored=stored.get(name, frozenset())) for name, p in symbols.properties.items()}
     facts = _facts(symbols)
-    check_logic(passes, facts, elaborated.asleep, reporter)
+    check_logic(passes, facts, elaborated, reporter)
     _check_use(composition, typer, produced_ids(passes, facts), reporter)
     matrix = _matrix(composition, symbols, reporter)
     reporter.raise_if_errors()
@@ -263,9 +263,6 @@ def _check_use(composition: Composition, typer: Typer, produced: frozenset[int],
     for name, kernel in composition.kernels.items():
         if name not in typer.used:
             reporter.report("PD507", f"the kernel `{name}` is never used", kernel.decl.name.span, "no rule reads it", helps=["remove it"])
-    for name, ids in composition.tags.items():
-        if not ids and name in typer.used:
-            reporter.report("PD505", f"nothing has the tag `{name}`", composition.tag_spans[name], "rules that ask for it stay quiet", helps=["load a pack whose elements have it, or give it to an element"])
     for element in composition.elements.values():
         if element.id not in produced:
             reporter.report("PD504", f"no rule produces `{element.name}`", element.span, "it only comes from the start world, or by painting")

@@ -44,6 +44,7 @@ from powderdsl.syntax.ast import Syntax
 
 MAX_MOMENTS = 1000
 MAX_RULES = 5000
+MAX_BLOCKS = 5000
 
 _MIRROR: Matrix = ((1, 0), (0, -1))
 _TURN: Matrix = ((0, 1), (-1, 0))
@@ -72,6 +73,8 @@ class Elaborated:
     streams: list[Stream] = field(default_factory=list)
     overridden: set[str] = field(default_factory=set)
     asleep: dict[Span, str] = field(default_factory=dict)
+    empty: dict[Span, str] = field(default_factory=dict)
+    """Rules that ask for a set or tag without elements, and its name."""
     awake: set[Span] = field(default_factory=set)
 
 
@@ -82,6 +85,7 @@ class Elaborator:
         self.typer = typer
         self.result = Elaborated()
         self._rules = 0
+        self._blocks = 0
 
     def run(self, passes: tuple[Named[PassDecl], ...]) -> Elaborated:
         for named in passes:
@@ -100,6 +104,7 @@ class Elaborator:
         decl = named.decl
         self._name, self._pack = decl.name.text, named.pack
         self._chances = 0
+        self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
         self._pending: list[Let] = []
         self._moments: list[Moment] = []
@@ -107,9 +112,9 @@ class Elaborator:
         names: dict[str, Operand] = {}
         for item in decl.scratch:
             qualified = f"{self._name}.{item.name.text}"
-            self._fresh(item.name.text, item.name.span, Scope(named.pack, names))
+            fresh = self._fresh(item.name.text, item.name.span, Scope(named.pack, names))
             try:
-                kind = read_kind(item.type, self.typer) if item.type else None
+                kind = read_kind(item.type, self.typer) if item.type and fresh else None
             except Poisoned:
                 kind = None
             if kind is None:
@@ -123,19 +128,31 @@ class Elaborator:
             self._moments.append(Moment(tuple(self._pending), (), "prove", ""))
         return Pass(self._name, named.pack, tuple(scratch.values()), tuple(self._moments), decl.name.span)
 
-    def _fresh(self, name: str, span: Span, scope: Scope) -> None:
-        """A new local name may not hide another."""
-        if name in scope.locals or self.typer.find(name, span, Scope(scope.pack, {})) is not None:
-            self.typer.reporter.error(
-                "PD308", f"`{name}` already means something here", span, "hides the other meaning", helps=["choose another name"]
-            )
+    def _fresh(self, name: str, span: Span, scope: Scope) -> bool:
+        """Whether a local name is new; reports one that hides another."""
+        if name not in scope.locals and self.typer.find(name, span, Scope(scope.pack, {})) is None:
+            return True
+        self.typer.reporter.error(
+            "PD308", f"`{name}` already means something here", span, "hides the other meaning", helps=["choose another name"]
+        )  # fmt: skip
+        return False
 
     def _block(self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None) -> None:
+        self._blocks += 1
+        if self._blocks > MAX_BLOCKS and block.header is not None:
+            self._blocks = 0
+            raise self.typer.fail("PD508", "loops in loops that never end", block.header.span, "repeated too often", ("loop over fewer things",))
         symmetry, policy = block.symmetry or symmetry, block.policy or policy
         for scalar, syntax in block.lets:
-            self._fresh(scalar.text, scalar.span, scope)
-            scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope)})
-        for inner, inner_label in self._rounds(block, scope, label):
+            fresh = self._fresh(scalar.text, scalar.span, scope)
+            scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope) if fresh else Broken()})
+        rounds = self._rounds(block, scope, label)
+        if rounds == [] and block.header is not None and not self.typer.reporter.has_errors:
+            self.typer.reporter.report(
+                "PD506", "this loop has no rounds", block.header.span, "nothing to loop over",
+                helps=["it wakes up with a pack that has such elements"],
+            )  # fmt: skip
+        for inner, inner_label in rounds:
             if block.rules:
                 self._moment(block.rules, inner, inner_label, symmetry, policy)
             for child in block.blocks:
@@ -150,7 +167,7 @@ class Elaborator:
         if header.kind == "repeat":
             rounds = int(header.text) if len(header.text) < 4 else 1000
             if not 1 <= rounds <= 64:
-                self.typer.reporter.error("PD508", f"a loop of {header.text} rounds", header.span, "1 to 64 are possible")
+                self.typer.reporter.error("PD508", f"a loop of {header.text} rounds", header.span, "1 to 64 are possible", helps=["repeat less often"])
                 return []
             return [(scope, f"{label}round {i + 1}") for i in range(rounds)]
         try:
@@ -163,6 +180,7 @@ class Elaborator:
         return [(inner, ", ".join([*filter(None, [label]), *(f"{v} = {_show(inner.locals[v])}" for v in variables)])) for inner in scopes]
 
     def _let(self, name: str, syntax: Syntax, scope: Scope) -> Operand:
+        self.typer.start_rule(syntax.span)
         try:
             operand = self.typer.evaluate(syntax, scope)
             if isinstance(operand, (Number, Place)):
@@ -172,6 +190,8 @@ class Elaborator:
             return Broken()
         except Asleep as asleep:
             return Absent(asleep.name)
+        finally:
+            self._empty_lets |= self.typer.empty
         value = constant(value) if isinstance(value, Number) else value
         if value.op == "draw":
             return value  # a stream's draws are fixed for the whole step
@@ -200,6 +220,7 @@ class Elaborator:
 
     def _rule(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         self.typer.absent.clear()
+        self.typer.start_rule(syntax.span)
         try:
             rules = {
                 "transform": self._transform, "swap": self._swap, "move": self._move, "assign": self._assign, "push": self._push,
@@ -210,6 +231,9 @@ class Elaborator:
         except Asleep as asleep:
             self.result.asleep[syntax.span] = asleep.name
             return []
+        empty = self.typer.empty | self._empty_lets
+        if empty:
+            self.result.empty[syntax.span] = min(empty)
         rules = [rule for rule in rules if not (rule.mask == FALSE and self.typer.absent)]
         if rules:
             self.result.awake.add(syntax.span)

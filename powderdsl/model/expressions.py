@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
+from math import prod
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model import arithmetic
@@ -39,6 +40,18 @@ from powderdsl.syntax.ast import Syntax
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 IDENTITY: Matrix = ((1, 0), (0, 1))
 
+MAX_ROUNDS = 4096
+"""Rounds of one loop over several variables."""
+
+MAX_RULE_WORK = 5_000
+"""Parts of expressions that one rule may come to, quantifiers written out."""
+
+MAX_WORK = 250_000
+"""Parts of expressions that all rules may come to: some seconds."""
+
+MAX_SET_DEPTH = 24
+"""How many sets may be defined by each other in a row."""
+
 
 @dataclass(frozen=True)
 class Scope:
@@ -60,14 +73,31 @@ class Typer(Coercer):
         self.symbols = symbols
         self.used: set[str] = set()
         self.absent: set[str] = set()
+        self.empty: set[str] = set()
+        """Tags and sets without elements that the rule asks for."""
         self.set_definitions: dict[str, tuple[str, Syntax]] = {}
         self.resolving: list[str] = []
         self._unknown: dict[tuple[str, bool], dict[Span, None]] = {}
+        self._work = self._rule_start = 0
+        self._rule_span: Span | None = None
         self._cures: dict[tuple[str, bool], tuple[str, ...]] = {}
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """What the syntax stands for. Raises Poisoned after reporting, Asleep if it hangs on an absent name."""
+        self._work += 1
+        if self._work - self._rule_start > MAX_RULE_WORK or self._work > MAX_WORK:
+            self._rule_start = self._work  # once for a rule is enough
+            raise self.fail(
+                "PD508", "a rule that expands to too much" if self._work <= MAX_WORK else "rules that expand to too much",
+                self._rule_span or syntax.span, "written out, it has thousands of parts",
+                ("loop over fewer things, or name parts under `let:`",),
+            )  # fmt: skip
         return HANDLERS[syntax.kind](self, syntax, scope)
+
+    def start_rule(self, span: Span) -> None:
+        """From here on the work of the rule or value at `span` is counted."""
+        self._rule_start, self._rule_span = self._work, span
+        self.empty.clear()
 
     def condition(self, syntax: Syntax, scope: Scope) -> Expr:
         return self.flag(self.evaluate(syntax, scope), syntax.span)
@@ -123,7 +153,10 @@ class Typer(Coercer):
         if name in symbols.constants:
             if isinstance(symbols.constants[name], Broken):
                 raise Poisoned
-            return self.turn(symbols.constants[name], scope)
+            constant = symbols.constants[name]
+            if isinstance(constant, SetOf) and not constant.ids:
+                self.empty.add(name)
+            return self.turn(constant, scope)
         if name in symbols.properties:
             return Expr("property", symbols.properties[name].kind, value=name, span=span)
         if name in symbols.fields:
@@ -140,6 +173,8 @@ class Typer(Coercer):
         if name in self.resolving:
             path = " -> ".join(f"`{other}`" for other in [*self.resolving[self.resolving.index(name) :], name])
             raise self.fail("PD307", f"the set `{name}` is defined by itself", span, path, ("list elements or tags",))
+        if len(self.resolving) >= MAX_SET_DEPTH:
+            raise self.fail("PD508", f"more than {MAX_SET_DEPTH} sets that hang on each other", span, "too many in a row")
         pack, syntax = self.set_definitions[name]
         self.resolving.append(name)
         try:
@@ -351,6 +386,10 @@ class Typer(Coercer):
                 raise self.fail("PD308", f"`{variable.text}` already means something here", variable.span, "hides the other meaning", ("choose another name",))
             self.used.add(variable.text)
             domains.append([(variable.text, value) for value in self.domain(domain, scope)])
+        rounds = prod(len(domain) for domain in domains)
+        if rounds > MAX_ROUNDS:
+            place = bindings[0].span.to(bindings[-1].span)
+            raise self.fail("PD508", f"a loop of {rounds:,} rounds", place, f"the limit is {MAX_ROUNDS:,}", ("loop over fewer things",))
         return [scope.bind(**dict(choice)) for choice in product(*domains)]
 
     def domain(self, syntax: Syntax, scope: Scope) -> list[Operand]:
@@ -359,7 +398,7 @@ class Typer(Coercer):
         match operand:
             case Bounds():
                 if operand.hi - operand.lo >= 64:
-                    raise self.fail("PD508", f"a loop of {operand.hi - operand.lo + 1} rounds", syntax.span, "the limit is 64")
+                    raise self.fail("PD508", f"a loop of {operand.hi - operand.lo + 1:,} rounds", syntax.span, "the limit is 64", ("loop over fewer things",))
                 return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():
                 return [SetOf((i,), names[i]) for i in operand.ids]

@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from typing import TYPE_CHECKING
+
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.operands import ELEMENT_HERE, negation
 from powderdsl.model.operands import member as member_of
@@ -21,6 +23,9 @@ from powderdsl.model.types import (
     Swap,
     Transform,
 )
+
+if TYPE_CHECKING:
+    from powderdsl.model.elaborate import Elaborated
 
 HERE: Offset = (0, 0)
 
@@ -56,8 +61,10 @@ def head(span: Span) -> Span:
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
 
 
-def check_logic(passes: tuple[Pass, ...], facts: Facts, sleeping: dict[Span, str], reporter: Reporter) -> None:
-    """Report conflicts (errors) and rules that never fire or do nothing (warnings)."""
+def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, reporter: Reporter) -> None:
+    """Report conflicts (errors), rules that never fire or do nothing (warnings), and those that sleep (notes)."""
+    relaxed = facts.relaxed()
+    thinkable: set[Span] = set()
     alive: dict[Span, bool] = {}
     useful: dict[Span, bool] = {}
     conflicts: dict[Conflict, list[str]] = {}
@@ -71,14 +78,27 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, sleeping: dict[Span, str
                 useful[rule.span] = useful.get(rule.span, False) or not fires or _changes(rule, facts, lets)
                 if fires:
                     live.append(rule)
+                elif rule.mask is not None and satisfiable(relaxed, [(rule.mask, HERE)], lets):
+                    thinkable.add(rule.span)
             if moment.policy == "prove":
                 for conflict in _check_moment(live, facts, lets):
                     conflicts.setdefault(conflict, []).append(moment.label)
+    if facts.budget.is_exhausted:
+        busiest = max(passes, key=lambda pass_: sum(len(moment.rules) ** 2 for moment in pass_.moments))
+        reporter.error(
+            "PD508", f"the rules of `{busiest.name}` are too many to be checked against each other", busiest.span, "this pass",
+            helps=["put rules that need not happen at once under `then:`", "or choose what happens to conflicts: `conflicts: first_wins`"],
+        )  # fmt: skip
+        return
     for conflict, labels in conflicts.items():
         conflict.report(labels, reporter)
     for span, fires in alive.items():
-        if not fires and span in sleeping:
-            reporter.report("PD506", f"this rule is asleep: {sleeping[span]}", span, "cannot fire with these packs")
+        if not fires and span in elaborated.asleep:
+            _report_sleep(f"`{elaborated.asleep[span]}` is not loaded", span, reporter)
+        elif not fires and span in elaborated.empty:
+            _report_sleep(f"no element is in `{elaborated.empty[span]}`", span, reporter)
+        elif not fires and span in thinkable:
+            _report_sleep("no loaded element has the properties it asks for", span, reporter)
         elif not fires:
             reporter.report(
                 "PD503", "this rule can never fire", span, "no cell can fulfil all of it",
@@ -91,6 +111,13 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, sleeping: dict[Span, str
             )  # fmt: skip
 
 
+def _report_sleep(reason: str, span: Span, reporter: Reporter) -> None:
+    reporter.report(
+        "PD506", f"this rule is asleep: {reason}", span, "cannot happen with these packs",
+        helps=["it wakes up with a pack that brings what it asks for"],
+    )  # fmt: skip
+
+
 def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
     if isinstance(rule, Transform) and rule.target.op == "const" and not rule.effects:
         same = member_of(ELEMENT_HERE, (rule.target.value,))  # type: ignore[arg-type]
@@ -99,23 +126,28 @@ def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
 
 
 def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Iterator[Conflict]:
+    """The conflicts of one moment: for each rule the first rule before it, or itself, that it collides with."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
-    for i, first in enumerate(movers):
-        for second in movers[i:]:
-            for shift in _claims(first, second):
-                if satisfiable(facts, [(first.mask, HERE), (second.mask, shift)], lets):
-                    yield _conflict(first, second)
-                    break
+    for i, second in enumerate(movers):
+        for first in (second, *movers[:i]):
+            if facts.budget.is_exhausted:
+                return
+            if any(satisfiable(facts, [(first.mask, HERE), (second.mask, at)], lets) for at in _claims(first, second)):
+                yield _conflict(first, second)
+                break
     assigns = [rule for rule in rules if isinstance(rule, Assign) and rule.op == ":="]
-    for i, a in enumerate(assigns):
-        for b in assigns[i + 1 :]:
+    for i, b in enumerate(assigns):
+        for a in assigns[:i]:
             if a.field != b.field or a.value == b.value:
                 continue
+            if facts.budget.is_exhausted:
+                return
             shift = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
             assert a.mask is not None and b.mask is not None
             if satisfiable(facts, [(a.mask, HERE), (b.mask, shift)], lets):
                 message = f"two rules may assign `{a.field}` of one cell in the same moment"
                 yield Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
+                break
 
 
 def _claims(first: Rule, second: Rule) -> Iterator[Offset]:

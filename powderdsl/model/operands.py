@@ -89,6 +89,9 @@ class Asleep(Exception):
         self.name = name
 
 
+MAX_CHAIN = 16
+"""Longest chain of `and` or `or` that nests to one side: what walks expressions recurses."""
+
 ELEMENT_HERE = Expr("element", ELEMENT)
 TRUE, FALSE = Expr("const", FLAG, value=1), Expr("const", FLAG, value=0)
 
@@ -335,10 +338,7 @@ def conjunction(values: list[Expr], span: Span | None = None) -> Expr:
             return FALSE
         if value != TRUE:
             kept.append(value)
-    result = kept[0] if kept else TRUE
-    for value in kept[1:]:
-        result = Expr("and", FLAG, (result, value), span=span)
-    return result
+    return _joined("and", kept, span) if kept else TRUE
 
 
 def disjunction(values: list[Expr], span: Span | None = None) -> Expr:
@@ -349,7 +349,16 @@ def disjunction(values: list[Expr], span: Span | None = None) -> Expr:
             return TRUE
         if value != FALSE:
             kept.append(value)
-    result = kept[0] if kept else FALSE
-    for value in kept[1:]:
-        result = Expr("or", FLAG, (result, value), span=span)
+    return _joined("or", kept, span) if kept else FALSE
+
+
+def _joined(op: str, values: list[Expr], span: Span | None) -> Expr:
+    """All values under one operation, pair by pair from the left; long lists as a balanced tree."""
+    if len(values) > MAX_CHAIN:
+        middle = len(values) // 2
+        halves = (_joined(op, values[:middle], span), _joined(op, values[middle:], span))
+        return Expr(op, FLAG, halves, span=span)
+    result = values[0]
+    for value in values[1:]:
+        result = Expr(op, FLAG, (result, value), span=span)
     return result

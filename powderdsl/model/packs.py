@@ -382,6 +382,11 @@ class _PackReader(Reader):
     def body(self, node: Node) -> tuple[tuple[Syntax, ...], tuple[Block, ...]]:
         """A rule or a list of rules (one moment), or a block or a list of blocks (one after the other)."""
         items = node.items if isinstance(node, Sequence) else (node,)
+        if not items or (isinstance(node, Scalar) and not node.text):
+            self.reporter.error(
+                "PD109", "a place for rules without any", node.span, "nothing here", helps=["write rules, or leave the key out"]
+            )  # fmt: skip
+            return (), ()
         kinds = {isinstance(item, Mapping) for item in items}
         if len(kinds) > 1:
             first = next(item for item in items if isinstance(item, Mapping) != isinstance(items[0], Mapping))

@@ -7,7 +7,7 @@ The answer errs to one side only: False is a proof, True may mean "could not tel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -18,6 +18,34 @@ Assignment = dict[Key, object]
 
 MAX_DOMAIN = 256
 MAX_STEPS = 20_000
+MAX_LET = 150
+"""Nodes of a let's value that are looked through; a larger one is taken for free."""
+
+BUDGET = 600_000
+"""Nodes evaluated in all questions about one ruleset: a few seconds. The largest shipped ruleset needs a twentieth of it."""
+
+QUESTION = 60
+"""What a question costs besides its evaluations."""
+
+
+class _Exhausted(Exception):
+    """The questions take too long: from here on the answer is that it could not be told."""
+
+
+@dataclass
+class Budget:
+    """Work that is left for a ruleset's questions."""
+
+    left: int = BUDGET
+
+    def spend(self, nodes: int) -> None:
+        self.left -= nodes
+        if self.left < 0:
+            raise _Exhausted
+
+    @property
+    def is_exhausted(self) -> bool:
+        return self.left < 0
 
 
 @dataclass(frozen=True)
@@ -29,6 +57,16 @@ class Facts:
     field_sets: dict[str, frozenset[int]]
     """Fields that exist only on some elements: elsewhere they read their default."""
     field_defaults: dict[str, object]
+    budget: Budget = field(default_factory=Budget, compare=False, repr=False)
+
+
+    def relaxed(self) -> Facts:
+        """The same cells, but with any element's properties: what a rule could meet in other packs."""
+        free = {
+            name: replace(p, values=("?",) * len(p.values)) if p.kind.name == "chance" else replace(p, stored=frozenset(self.ids))
+            for name, p in self.properties.items()
+        }  # fmt: skip
+        return replace(self, properties=free)
 
 
 class _Unknown(Exception):
@@ -42,24 +80,36 @@ class Search:
         self.facts = facts
         self.lets = lets or {}
         self.conditions: list[tuple[Expr, Offset]] = []
+        self._opened: dict[str, tuple[Expr, int]] = {}
 
     def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
         """Add a condition; conjunctions are split, lets of this moment are looked through."""
-        condition = self._resolve(condition)
+        self._split(self._resolve(condition)[0], at)
+
+    def _split(self, condition: Expr, at: Offset) -> None:
         if condition.op == "and":
             for arg in condition.args:
-                self.require(arg, at)
+                self._split(arg, at)
         elif condition.op == "look":
-            self.require(condition.args[0], _plus(at, condition.value))
+            self._split(condition.args[0], _plus(at, condition.value))
         else:
             self.conditions.append((condition, at))
 
-    def _resolve(self, expr: Expr) -> Expr:
+    def _resolve(self, expr: Expr) -> tuple[Expr, int]:
+        """The expression with this moment's lets looked through, and how many nodes it has then."""
         if expr.op == "let" and expr.value in self.lets:
-            return self._resolve(self.lets[str(expr.value)])
+            name = str(expr.value)
+            if name not in self._opened:
+                value, size = self._resolve(self.lets[name])
+                self._opened[name] = (value, size) if size <= MAX_LET else (expr, 1)
+            return self._opened[name]
+        self.facts.budget.spend(1)
         if not expr.args:
-            return expr
-        return replace(expr, args=tuple(self._resolve(arg) for arg in expr.args))
+            return expr, 1
+        parts = [self._resolve(arg) for arg in expr.args]
+        args = tuple(part for part, _ in parts)
+        same = all(new is old for new, old in zip(args, expr.args, strict=True))
+        return expr if same else replace(expr, args=args), 1 + sum(size for _, size in parts)
 
     @cached_property
     def thresholds(self) -> dict[object, list[float]]:
@@ -138,6 +188,7 @@ class Search:
         found: set[Key] = set()
 
         def visit(node: Expr, at: Offset) -> None:
+            self.facts.budget.spend(1)
             match node.op:
                 case "element":
                     found.add(("element", None, at))
@@ -170,6 +221,7 @@ class Search:
         return frozenset(found)
 
     def _value(self, node: Expr, at: Offset, chosen: Assignment):  # type: ignore[no-untyped-def]
+        self.facts.budget.spend(1)
         match node.op:
             case "const":
                 return node.value
@@ -243,7 +295,11 @@ def _is_opaque(node: Expr) -> bool:
 
 def satisfiable(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None) -> bool:
     """False only if the conditions, each at its place, can never hold together."""
-    search = Search(facts, lets)
-    for condition, at in conditions:
-        search.require(condition, at)
-    return search.possible()
+    try:
+        facts.budget.spend(QUESTION)
+        search = Search(facts, lets)
+        for condition, at in conditions:
+            search.require(condition, at)
+        return search.possible()
+    except _Exhausted:
+        return True

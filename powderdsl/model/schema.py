@@ -105,7 +105,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "legend": Key("mapping", "what the characters mean, where glyphs will not do"),
         "after": Key("text", "how many steps it runs: `50 steps`"),
         "expect": Key("text", "what the world looks like then; `?` matches anything"),
-        "always": Key("any", "conditions over the whole world that hold after every step"),
+        "always": Key("any", "conditions that hold in every cell after every step"),
         "seed": Key("number", "the seed; several are tried without one"),
     },
 }

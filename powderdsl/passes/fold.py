@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import frexp
+
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, REAL, Node
 from powderdsl.ir.rewrite import Rewrite
@@ -169,6 +171,15 @@ def _below(node: Node, build: Builder) -> Node | None:
     return None
 
 
+def _divide(node: Node, build: Builder) -> Node | None:
+    """x / 2^k = x · 2^-k, exactly."""
+    if node.op == "div" and node.args[1].op == "const":
+        divisor = float(node.args[1].attr)  # type: ignore[arg-type]
+        if divisor and frexp(abs(divisor))[0] == 0.5:
+            return build.arithmetic("mul", node.args[0], build.real(1.0 / divisor))
+    return None
+
+
 def _count(node: Node, build: Builder) -> Node | None:
     if node.op == "count" and _is(node.args[0], False):
         return build.whole(0)
@@ -176,5 +187,5 @@ def _count(node: Node, build: Builder) -> Node | None:
 
 
 FOLD: tuple[Rewrite, ...] = (
-    _not, _and_or, _xor, _in_set, _compare, _whole_constants, _select, _movement, _shift_of_constant, _below, _count,
+    _not, _and_or, _xor, _in_set, _compare, _whole_constants, _select, _movement, _shift_of_constant, _below, _count, _divide,
 )  # fmt: skip

@@ -72,7 +72,7 @@ def parse_text(source: Source, begin: int, end: int, start: str, reporter: Repor
     except _TooDeep:
         reporter.error(
             "PD202", f"an expression nested more than {MAX_DEPTH} deep", Span(source, begin, begin + 1),
-            helps=["give parts of it names with `let:`"],
+            notes=["a long chain of `and`, `or` or `+` nests as well"], helps=["give parts of it names with `let:`"],
         )
         return None
 

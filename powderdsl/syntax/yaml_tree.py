@@ -116,9 +116,8 @@ class _Builder:
 
     def _forbid(self, event, what: str, cure: str) -> None:  # type: ignore[no-untyped-def]
         span = self._span(event)
-        first_line_end = self.source.text.find("\n", span.start)
-        end = min(span.end, first_line_end if first_line_end >= 0 else span.end)
-        place = Span(self.source, span.start, max(end, span.start + 1))
+        word = self.source.text[span.start : span.end].split(maxsplit=1)[:1]
+        place = Span(self.source, span.start, span.start + max(len(word[0]) if word else 0, 1))
         self.reporter.error("PD105", f"{what} is not allowed", place, "not allowed", helps=[cure])
         raise _Abort
 
@@ -159,15 +158,17 @@ class _Builder:
 
     def _sequence(self, start, events, depth: int) -> Sequence:  # type: ignore[no-untyped-def]
         items = []
+        event = start
         for event in events:
             if isinstance(event, yaml.SequenceEndEvent):
                 break
             items.append(self._node(event, events, depth + 1))
-        return Sequence(tuple(items), self._collection_span(start, items[-1].span if items else None))
+        return Sequence(tuple(items), self._collection_span(start, event, items[-1].span if items else None))
 
     def _mapping(self, start, events, depth: int) -> Mapping:  # type: ignore[no-untyped-def]
         entries: list[tuple[Scalar, Node]] = []
         seen: dict[str, Span] = {}
+        event = start
         for event in events:
             if isinstance(event, yaml.MappingEndEvent):
                 break
@@ -188,7 +189,8 @@ class _Builder:
             else:
                 seen[key.text] = key.span
                 entries.append((key, value))
-        return Mapping(tuple(entries), self._collection_span(start, entries[-1][1].span if entries else None))
+        last = entries[-1][1].span if entries else None
+        return Mapping(tuple(entries), self._collection_span(start, event, last))
 
     def _no_value(self, key: Scalar, *, first: bool) -> None:
         """Nothing in `{…}` has a key without a value: most often a comma has cut a value in two."""
@@ -201,7 +203,9 @@ class _Builder:
             cure = "put quotes around a value with a comma, or give it a line of its own, outside `{…}`"
         self._fail("PD107", f"`{key.text}` has no value", key.span, label, cure)
 
-    def _collection_span(self, start, last: Span | None) -> Span:  # type: ignore[no-untyped-def]
-        # A block collection's end mark runs to the next token; the last child's end is where a reader sees it end.
+    def _collection_span(self, start, end, last: Span | None) -> Span:  # type: ignore[no-untyped-def]
         begin = start.start_mark.index
+        if start.flow_style:
+            return Span(self.source, begin, max(end.end_mark.index, begin + 1))
+        # A block collection's end mark runs to the next token; the last child's end is where a reader sees it end.
         return Span(self.source, begin, max(start.end_mark.index, last.end if last else 0, begin + 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -29,16 +30,21 @@ def reduce_text(text: str, fails: Callable[[str], bool], tries: int = 5000) -> s
     root = parse_yaml(Source("case.yaml", text), Reporter())
     assert root is not None
     tree = to_tree(root)
-    while True:
-        for smaller in _smaller_trees(tree):
-            tries -= 1
-            if tries < 0:
-                return write_yaml(tree)
-            if fails(write_yaml(smaller)):
-                tree = smaller
+    position, last_success = 0, -1
+    while tries > 0:
+        # What follows a success is tried next, not what failed before it: one success rarely helps another.
+        smaller = next(islice(_smaller_trees(tree), position, None), None)
+        if smaller is None:
+            if last_success < 0:
                 break
+            position, last_success = 0, -1
+            continue
+        tries -= 1
+        if fails(write_yaml(smaller)):
+            tree, last_success = smaller, position
         else:
-            return write_yaml(tree)
+            position += 1
+    return write_yaml(tree)
 
 
 def reduce_start(start: Start, fails: Callable[[Start], bool]) -> Start:

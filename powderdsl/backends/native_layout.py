@@ -1,0 +1,68 @@
+"""Where a program's slots, streams, parameters and fixed planes lie in a native context."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from powderdsl.ir.ops import Node, Program, nodes_of
+
+
+@dataclass
+class Layout:
+    """Where slots, streams, parameters and fixed planes lie in a context."""
+
+    planes: dict[str, int] = field(default_factory=dict)
+    reals: dict[str, int] = field(default_factory=dict)
+    streams: dict[str, int] = field(default_factory=dict)
+    param_planes: dict[tuple[str, str, int], int] = field(default_factory=dict)
+    param_reals: dict[str, int] = field(default_factory=dict)
+    step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
+    fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
+    reach: int = 1
+
+
+def layout_of(program: Program) -> Layout:
+    """The layout of a program on planes."""
+    layout = Layout()
+    for slot in program.slots:
+        table = layout.reals if slot.type.name == "real" else layout.planes
+        table[slot.name] = len(table)
+    for i, (name, _, _) in enumerate(program.streams):
+        layout.streams[name] = i
+    for pass_ in program.passes:
+        for node in nodes_of(pass_):
+            _place(node, layout)
+    return layout
+
+
+def _place(node: Node, layout: Layout) -> None:
+    attr = node.attr
+    match node.op:
+        case "param" if node.type.name == "real":
+            number(layout.param_reals, attr[0])  # type: ignore[index]
+        case "param":
+            number(layout.param_planes, param_key(node))
+        case "coordinate" if attr[0] == "step":  # type: ignore[index]
+            number(layout.step_planes, (attr[1], attr[2]))  # type: ignore[index]
+        case "coordinate":
+            number(layout.fixed, (0 if attr[0] == "row" else 1, attr[1], attr[2]))  # type: ignore[index]
+        case "inside":
+            number(layout.fixed, (2, attr[0], attr[1]))  # type: ignore[index]
+        case "shift" | "swap" | "arrive" if node.type.name == "real":
+            layout.reach = max(layout.reach, abs(attr[1]))  # type: ignore[index]
+
+
+def number(table: dict, key: object) -> int:  # type: ignore[type-arg]
+    """The position of a key, given on first use."""
+    return int(table.setdefault(key, len(table)))
+
+
+def param_key(node: Node) -> tuple[str, str, int]:
+    """Name, view and bit of a parameter's plane."""
+    name, view, *bit = node.attr  # type: ignore[misc]
+    return name, view, bit[0] if bit else 0
+
+
+def literal(value: float) -> str:
+    """A float32 constant, exactly."""
+    return f"{value.hex()}f"

@@ -1,0 +1,427 @@
+"""One pass as C++: moment after moment, each skipped where its masks are empty; values live as long as they are needed."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+from powderdsl.backends.native_layout import Layout
+from powderdsl.backends.native_loops import ANCHORS, DRAWS, Loop, is_clean, is_uniform, prerequisites
+from powderdsl.backends.native_sweeps import RECOMPUTE, Sweep, quiet, real_cost, rows_read, sweep_needs
+from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, walk
+
+_VARIABLE = re.compile(r"\b[pf][0-9]+\b")
+
+
+@dataclass
+class Block:
+    """Statements of a scope, each one string; variables they define are released after their last use."""
+
+    statements: list[str] = field(default_factory=list)
+    defined: list[str] = field(default_factory=list)
+
+    def text(self, kept: set[str]) -> str:
+        """The statements with releases. `kept` outlive the block."""
+        last: dict[str, int] = {}
+        for i, statement in enumerate(self.statements):
+            for name in _VARIABLE.findall(statement):
+                last[name] = i
+        lines = []
+        own = set(self.defined) - kept
+        for i, statement in enumerate(self.statements):
+            lines.append(statement)
+            lines += [f"give(c, {name});" for name in sorted(own) if last.get(name) == i]
+        return "\n".join(lines)
+
+
+class PassWriter:
+    """Writes `static void pass_N(Context& c)`."""
+
+    def __init__(self, pass_: PassGraph, number: int, layout: Layout):
+        self.pass_, self.number, self.layout = pass_, number, layout
+        self.planes: dict[int, str] = {}
+        self.fields: dict[int, str] = {}
+        self.block = Block()
+        self.targets: dict[tuple[int, int, int], str] = {}
+        self.count = 0
+        nodes = list({id(n): n for _, root in pass_.outputs for n in walk(root)}.values())
+        self.alive = {id(n) for n in nodes}
+        self.all_comparisons = [n for n in nodes if n.op in ("eq", "lt", "le")]
+        nothing = lambda node: node.op == "input"  # noqa: E731
+        sources = [n.args[0] for n in nodes if n.op == "shift" and n.type == REAL]
+        self.stored = {id(n) for n in sources if n.op != "input" and real_cost(n, nothing) > RECOMPUTE}
+        self.slot_of = {id(n): str(n.attr) for n in nodes if n.op == "input"}
+
+    def source(self) -> str:
+        current: dict[str, Node] = {}
+        for step in self.pass_.moments:
+            self.moment(step, current)
+            current.update(step.writes)
+        self.finish()
+        kept: set[str] = set()
+        body = self.block.text(kept)
+        return f"// pass {self.number}\nOUTLINE void pass_{self.number}(Context& c) {{\nconst int words = c.g.words, height = c.g.height, width = c.g.width; (void)words; (void)height; (void)width;\n{body}\n}}"
+
+    # Variables
+
+    def fresh(self, prefix: str) -> str:
+        self.count += 1
+        name = f"{prefix}{self.count}"
+        self.block.defined.append(name)
+        return name
+
+    def have(self, node: Node) -> bool:
+        return id(node) in self.planes or id(node) in self.fields
+
+    def have_input(self, node: Node) -> None:
+        """Slots that the pass reads: borrowed from the context."""
+        if node.op != "input" or self.have(node):
+            return
+        if node.type == REAL:
+            self.fields[id(node)] = name = self.fresh("f")
+            self.block.statements.append(f"Field* {name} = keep(c.real[{self.layout.reals[str(node.attr)]}]);")
+        else:
+            self.planes[id(node)] = name = self.fresh("p")
+            self.block.statements.append(f"Plane* {name} = keep(c.slot[{self.layout.planes[str(node.attr)]}]);")
+
+    def inputs(self, nodes: list[Node]) -> None:
+        for node in nodes:
+            for inner in walk(node):
+                self.have_input(inner)
+
+    # Moments
+
+    def moment(self, step: Step, current: dict[str, Node]) -> None:
+        writes = [(slot, node) for slot, node in step.writes if id(node) in self.alive and node.type != REAL and not self.have(node)]
+        guards = [guard for guard in step.guards if guard.op != "const"]
+        if not writes:
+            return
+        self.comparisons(guards)
+        unknown = [node for slot, node in writes if slot not in current and slot not in self.layout.planes]
+        if unknown:  # a scratch field's first write: what it held is not in a plane
+            self.inputs(unknown)
+            self.ensure(unknown)
+            writes = [(slot, node) for slot, node in writes if not self.have(node)]
+            if not writes:
+                return
+        if not guards or any(g.op == "const" for g in step.guards) or any(is_uniform(g) for g in guards):
+            self.inputs([node for _, node in writes])
+            self.ensure([node for _, node in writes])
+            return
+        self.inputs([*guards, *(node for _, node in writes)])
+        condition = self.guards(guards)
+        olds = {}
+        for slot, node in writes:
+            old = current.get(slot)
+            olds[id(node)] = self.old(slot, old)
+        names = {id(node): self.fresh("p") for _, node in writes}
+        outer = (self.planes, self.fields, self.block)
+        self.planes, self.fields, self.block = dict(self.planes), dict(self.fields), Block()
+        self.ensure([node for _, node in writes])
+        inner_names = {id(node): self.planes[id(node)] for _, node in writes}
+        for key, name in names.items():
+            self.block.statements.append(f"{name} = keep({inner_names[key]});")
+        text = self.block.text(set())
+        self.planes, self.fields, self.block = outer
+        declared = ", ".join(f"*{name}" for name in dict.fromkeys(names.values()))
+        otherwise = " ".join(f"{name} = keep({olds[key]});" for key, name in names.items())
+        self.block.statements.append(f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}")
+        self.planes.update(names)
+
+    def comparisons(self, guards: list[Node]) -> None:
+        """Comparisons of reals that masks ask for, outside any branch, with all others that can be had in one sweep."""
+        asked = [n for guard in guards for n in walk(guard) if n.op in ("eq", "lt", "le") and not self.have(n)]
+        if not asked:
+            return
+        self.inputs(asked)
+        self.ensure([need for node in asked for need in self.direct_needs(node)])
+        others = [n for n in self.all_comparisons if not self.have(n) and n not in asked]
+        self.inputs([n for n in others if not self.direct_needs_unless_input(n)])
+        ready = [n for n in others if not self.direct_needs(n) and all(self.have(i) for i in walk(n) if i.op == "input")]
+        self.ensure([*asked, *ready])
+
+    def direct_needs_unless_input(self, node: Node) -> list[Node]:
+        return [need for need in self.direct_needs(node) if need.op != "input"]
+
+    def old(self, slot: str, node: Node | None) -> str:
+        """The plane that holds a slot's value before the moment."""
+        if node is None:
+            return self.input_plane(slot)
+        if not self.have(node):
+            if node.op == "const" and not node.attr:
+                return "c.nothing"
+            self.inputs([node])
+            self.ensure([node])
+        return self.planes[id(node)]
+
+    def input_plane(self, slot: str) -> str:
+        for node_id, name in self.planes.items():
+            if self.slot_of.get(node_id) == slot:
+                return name
+        name = self.fresh("p")
+        self.block.statements.append(f"Plane* {name} = keep(c.slot[{self.layout.planes[slot]}]);")
+        return name
+
+    def guards(self, guards: list[Node]) -> str:
+        """Masks of a moment in planes: first what is cheap, and the rest only where that leaves something."""
+        guards = list({id(g): g for g in guards}.values())
+        open_guards = [g for g in guards if not self.have(g)]
+        self.ensure([g for g in open_guards if g.op in ANCHORS])
+        open_guards = [g for g in open_guards if not self.have(g)]
+        staged = [(g, *self.split(g)) for g in open_guards]
+        if not any(rest for _, _, rest in staged) or not all(cheap for _, cheap, _ in staged):
+            self.ensure(open_guards)
+            return " || ".join(f"!{self.planes[id(g)]}->zero" for g in guards)
+        candidates = {id(g): self.fresh("p") for g, _, rest in staged if rest}
+        loop = Loop(self.planes, self.layout)
+        outputs = []
+        for guard, cheap, rest in staged:
+            parts = [loop.value(part) for part in cheap]
+            name = candidates[id(guard)] if rest else self.fresh("p")
+            if not rest:
+                self.planes[id(guard)] = name
+            clean = any(is_clean(part, self.have) for part in cheap)
+            outputs.append((name, " & ".join(parts) if clean else " & ".join([*parts, "valid"])))
+        self.emit_loop(loop, outputs)
+        condition = " || ".join(f"!{name}->zero" for name in (*candidates.values(), *(self.planes[id(g)] for g in guards if self.have(g))))
+        rest_guards = [(g, rest) for g, _, rest in staged if rest]
+        names = {id(g): self.fresh("p") for g, _ in rest_guards}
+        outer = (self.planes, self.fields, self.block)
+        self.planes, self.fields, self.block = dict(self.planes), dict(self.fields), Block()
+        self.ensure([need for _, rest in rest_guards for part in rest for need in self.needs(part)])
+        lines = []
+        loop = Loop(self.planes, self.layout)
+        for guard, rest in rest_guards:
+            candidate = candidates[id(guard)]
+            inner = loop.inner()
+            wanted = f"w{names[id(guard)]}"
+            value = wanted
+            for part in sorted(rest, key=lambda part: part.op in DRAWS):
+                if part.op in DRAWS and not inner.have(part):
+                    expression = inner.draw(part, value)
+                else:
+                    expression = f"{value} & {inner.value(part)}"
+                inner.counter[0] += 1
+                value = f"t{inner.counter[0]}"
+                inner.lines.append(f"const V {value} = {expression};")
+            body = " ".join(inner.lines)
+            target = names[id(guard)]
+            lines.append(
+                f"const V {wanted} = {candidate}->data[i]; V g{target} = splat(0);\n"
+                f"if (any({wanted})) {{ {body} g{target} = {value}; }}\n{target}->data[i] = g{target}; a{target} |= g{target};"
+            )
+        takes = " ".join(f"{name} = take(c); V a{name} = splat(0);" for name in names.values())
+        ends = " ".join(f"{name}->zero = !any(a{name});" for name in names.values())
+        self.block.statements.append(
+            f"{takes}\nfor (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) {{ const V valid = c.valid(w); (void)valid;\n"
+            + "\n".join(lines) + f"\n}}\n{ends}"
+        )  # fmt: skip
+        text = self.block.text(set())
+        self.planes, self.fields, self.block = outer
+        declared = ", ".join(f"*{name}" for name in names.values())
+        otherwise = " ".join(f"{name} = keep(c.nothing);" for name in names.values())
+        self.block.statements.append(f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}")
+        self.planes.update(names)
+        return " || ".join(f"!{self.planes[id(g)]}->zero" for g in guards)
+
+    def split(self, guard: Node) -> tuple[list[Node], list[Node]]:
+        """Conjuncts that one loop can compute from what is there, and those that take more."""
+        cheap, rest = [], []
+        for part in _conjuncts(guard, self.have):
+            free = not prerequisites(part, self.have) and part.op not in ANCHORS
+            draws = any(n.op in DRAWS for n in walk(part)) and not self.have(part)
+            (cheap if free and not draws else rest).append(part)
+        return cheap, rest
+
+    def needs(self, node: Node) -> list[Node]:
+        return [node] if node.op in ANCHORS and not self.have(node) else prerequisites(node, self.have)
+
+    # Values in planes
+
+    def ensure(self, nodes: list[Node]) -> None:
+        """Put nodes into planes or fields, with everything they need before them."""
+        wanted = [node for node in dict.fromkeys(nodes) if not self.have(node) and not (is_uniform(node) and node.type == REAL)]
+        if not wanted:
+            return
+        before: list[Node] = []
+        for node in wanted:
+            before += self.direct_needs(node)
+        before = [node for node in dict.fromkeys(before) if not self.have(node)]
+        if before:
+            self.ensure(before)
+            self.ensure(wanted)
+            return
+        reals = [n for n in wanted if n.type == REAL or n.op in ("eq", "lt", "le")]
+        # What neighbours will be asked for later is stored while it is computed anyway.
+        reals += [i for n in reals for i in walk(n) if id(i) in self.stored and not self.have(i) and i not in reals]
+        reals = list(dict.fromkeys(reals))
+        moves = [n for n in wanted if n.op in ("swap", "arrive") and n.type == FLAG]
+        loops = [n for n in wanted if n not in reals and n not in moves]
+        if reals:
+            self.sweep(reals)
+        if loops:
+            self.loop(loops)
+        for node in moves:
+            self.movement(node)
+
+    def direct_needs(self, node: Node) -> list[Node]:
+        if node.type == REAL or node.op in ("eq", "lt", "le"):
+            flags, reals = sweep_needs(node, self.have)
+            return [*(f for f in flags if f.op != "param"), *reals]
+        if node.op in ("swap", "arrive"):
+            content, movers, rest = node.args
+            return [arg for arg in (content, movers, rest) if not self.have(arg)]
+        return prerequisites(node, self.have)
+
+    def target_plane(self, movers: Node, dy: int, dx: int) -> str:
+        """Movers seen from their targets: shared by all planes that move."""
+        key = (id(movers), dy, dx)
+        if self.targets.get(key) not in self.block.defined:
+            name = self.fresh("p")
+            self.block.statements.append(f"Plane* {name} = shifted(c, {self.planes[id(movers)]}, {-dy}, {-dx});")
+            self.targets[key] = name
+        return self.targets[key]
+
+    def movement(self, node: Node) -> None:
+        content, movers, rest = node.args
+        dy, dx = node.attr  # type: ignore[misc]
+        target = self.target_plane(movers, dy, dx)
+        name = self.fresh("p")
+        a, m, b = (self.planes[id(arg)] for arg in (content, movers, rest))
+        if node.op == "swap":
+            call = f"swap_plane(c, {a}, {m}, {target}, {b}, {dy}, {dx})"
+        else:
+            call = f"arrive_plane(c, {a}, {target}, {b}, {dy}, {dx})"
+        self.block.statements.append(f"Plane* {name} = {call};")
+        self.planes[id(node)] = name
+
+    def loop(self, nodes: list[Node]) -> None:
+        rest = []
+        for node in nodes:
+            call = self.simple(node)
+            if call:
+                name = self.fresh("p")
+                self.block.statements.append(f"Plane* {name} = {call};")
+                self.planes[id(node)] = name
+            else:
+                rest.append(node)
+        if rest:
+            loop = Loop(self.planes, self.layout)
+            outputs = [(self.fresh("p"), loop.clean(node)) for node in rest]
+            self.emit_loop(loop, outputs)
+            for node, (name, _) in zip(rest, outputs, strict=True):
+                self.planes[id(node)] = name
+
+    def simple(self, node: Node) -> str | None:
+        """Whole-plane operations that see at once when there is nothing to do."""
+        if node.op == "shift" and node.attr[2] and self.have(node.args[0]):  # type: ignore[index]
+            dy, dx, _ = node.attr  # type: ignore[misc]
+            return f"shifted(c, {self.planes[id(node.args[0])]}, {dy}, {dx})"
+        if node.op == "and":
+            for kept, gone in (node.args, node.args[::-1]):
+                if gone.op == "not" and self.have(gone.args[0]) and self.have(kept):
+                    return f"cleared(c, {self.planes[id(kept)]}, {self.planes[id(gone.args[0])]})"
+        if node.op == "or" and all(self.have(arg) for arg in node.args):
+            return f"joined(c, {self.planes[id(node.args[0])]}, {self.planes[id(node.args[1])]})"
+        if node.op == "const" and not node.attr:
+            return "keep(c.nothing)"
+        return None
+
+    def emit_loop(self, loop: Loop, outputs: list[tuple[str, str]]) -> None:
+        takes = " ".join(f"Plane* {name} = take(c); V a{name} = splat(0);" for name, _ in outputs)
+        stores = "\n".join(f"{{ const V o = {value}; {name}->data[i] = o; a{name} |= o; }}" for name, value in outputs)
+        ends = " ".join(f"{name}->zero = !any(a{name});" for name, _ in outputs)
+        body = "\n".join(loop.lines)
+        self.block.statements.append(
+            f"{takes}\nfor (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) {{ const V valid = c.valid(w); (void)valid;\n"
+            f"{body}\n{stores}\n}}\n{ends}"
+        )
+
+    # Reals
+
+    def sweep(self, nodes: list[Node]) -> None:
+        """Compute reals and comparisons for each world, row by row; rows where nothing is going on are skipped."""
+        values, masks, _ = quiet(nodes, self.have)
+        sweep = Sweep(self.planes, self.fields, self.layout)
+        outputs = []
+        for node in nodes:
+            if node.type == REAL:
+                name = self.fresh("f")
+                outputs.append((node, name, sweep.value(node)))
+            else:
+                name = self.fresh("p")
+                a, b = (sweep.value(arg) for arg in node.args)
+                operator = {"eq": "==", "lt": "<", "le": "<="}[node.op]
+                outputs.append((node, name, f"bits_of({a} {operator} {b})"))
+        takes, row_start, stores, word_end, row_end, quiet_row = [], [], [], [], [], []
+        for position, (node, name, value) in enumerate(outputs):
+            if node.type == REAL:
+                takes.append(f"Field* {name} = take_field(c);")
+                row_start.append(f"float* o{name} = {name}->data + ((size_t)l * height + y) * c.g.stride + HALO; u32 n{name} = 0;")
+                stores.append(f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= bits_of(o != splatf(0)) & inside; }}")
+                row_end.append(f"finish_row(c, o{name}); {name}->live[l * height + y] = n{name} != 0;")
+                quiet_row.append(f"{name}->live[l * height + y] = 0;")
+            else:
+                takes.append(f"Plane* {name} = take(c); u64 a{name} = 0;")
+                row_start.append(f"u64 u{name} = 0;")
+                stores.append(f"u{name} |= (u64)({value}) << (x & 63);")
+                word_end.append(f"((u64*){name}->data)[(y * words + w) * LANES + l] = u{name} & c.valid(w)[l]; a{name} |= u{name} & c.valid(w)[l]; u{name} = 0;")
+                rest = bool(values[position]) if values else False
+                quiet_row.append(f"for (int w = 0; w < words; w++) {{ const u64 q = {'c.valid(w)[l]' if rest else '0'}; ((u64*){name}->data)[(y * words + w) * LANES + l] = q; a{name} |= q; }}")
+        ends = " ".join(f"{name}->zero = !a{name};" for node, name, _ in outputs if node.type != REAL)
+        pads = " ".join(
+            f"for (int l = c.lanes; l < LANES; l++) for (int i = 0; i < height * words; i++) ((u64*){name}->data)[i * LANES + l] = 0;"
+            if node.type != REAL else f"for (int l = c.lanes; l < LANES; l++) memset({name}->live + l * height, 0, height);"
+            for node, name, _ in outputs
+        )  # fmt: skip
+        rows = " ".join(f"const float* {name} = {call};" for call, name in sweep.rows.items())
+        words = " ".join(f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];" for plane, name in sweep.words.items())
+        check = ""
+        if values is not None:
+            busy = [self.busy(node, dy, wraps) for node, dy, wraps in rows_read(nodes, self.have)]
+            gates = [f"((const u64*){self.planes[id(m)]}->data)[(y * words + w) * LANES + l]" for m in masks if m.op != "param"]
+            scan = f"for (int w = 0; w < words; w++) some |= {' | '.join(gates)};" if gates else ""
+            fixed = "true" if any(m.op == "param" for m in masks) else " || ".join(busy) or "false"
+            check = f"{{ u64 some = ({fixed}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet_row)} continue; }} }}"
+        body = "\n".join(sweep.lines)
+        self.block.statements.append(
+            f"{' '.join(takes)}\n{pads}\nfor (int l = 0; l < c.lanes; l++) for (int y = 0; y < height; y++) {{\n{check}\n{rows} {' '.join(row_start)}\n"
+            f"for (int w = 0; w < words; w++) {{ {words}\nfor (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {{\n"
+            f"const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;\n{body}\n"
+            + "\n".join(stores) + f"\n}}\n{' '.join(word_end)} }}\n{' '.join(row_end)}\n}}\n{ends}"
+        )  # fmt: skip
+        for node, name, _ in outputs:
+            (self.fields if node.type == REAL else self.planes)[id(node)] = name
+
+    def busy(self, node: Node, dy: int, wraps: bool) -> str:
+        name = self.fields[id(node)]
+        if dy == 0:
+            return f"{name}->live[l * height + y]"
+        if wraps:
+            return f"{name}->live[l * height + c.row(y + {dy}) / words]"
+        return f"(y + {dy} >= 0 && y + {dy} < height && {name}->live[l * height + y + {dy}])"
+
+    def finish(self) -> None:
+        """Leave the outputs in the context's slots."""
+        self.inputs([node for _, node in self.pass_.outputs])
+        self.ensure([node for _, node in self.pass_.outputs])
+        lines = []
+        for slot, node in self.pass_.outputs:
+            if node.type == REAL:
+                number = self.layout.reals[slot]
+                lines.append(f"Field* r{number} = keep({self.fields[id(node)]});")
+            else:
+                number = self.layout.planes[slot]
+                lines.append(f"Plane* s{number} = keep({self.planes[id(node)]});")
+        for slot, node in self.pass_.outputs:
+            kind, table, prefix = ("real", self.layout.reals, "r") if node.type == REAL else ("slot", self.layout.planes, "s")
+            lines.append(f"give(c, c.{kind}[{table[slot]}]); c.{kind}[{table[slot]}] = {prefix}{table[slot]};")
+        self.block.statements.append("\n".join(lines))
+
+
+def _conjuncts(node: Node, have) -> list[Node]:  # type: ignore[no-untyped-def]
+    if node.op != "and" or have(node):
+        return [node]
+    return [part for arg in node.args for part in _conjuncts(arg, have)]
+
+

@@ -1,0 +1,357 @@
+// The library that generated code builds on. One group = LANES worlds side by side: lane l of every vector is world l.
+// A plane is one bit a cell: 64 columns in a word, a vector holds the same word of all worlds of the group.
+// Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <functional>
+#include <mutex>
+#include <thread>
+#include <vector>
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+typedef uint64_t u64;
+typedef uint32_t u32;
+constexpr int LANES = 8, CHUNK = 16, HALO = 16;
+typedef u64 V __attribute__((vector_size(64), may_alias));
+typedef u32 U __attribute__((vector_size(64), may_alias));
+typedef float F __attribute__((vector_size(64), may_alias));
+typedef float Fu __attribute__((vector_size(64), may_alias, aligned(4)));
+typedef int32_t I __attribute__((vector_size(64), may_alias));
+#define ALWAYS static inline __attribute__((always_inline))
+#define OUTLINE static __attribute__((noinline))
+
+ALWAYS V splat(u64 x) { return V{x, x, x, x, x, x, x, x}; }
+ALWAYS F splatf(float x) { return F{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+ALWAYS U splatu(u32 x) { return U{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+ALWAYS bool any(V a) {
+#if defined(__AVX512F__)
+  return _mm512_test_epi64_mask((__m512i)a, (__m512i)a) != 0;
+#else
+  u64 r = 0;
+  for (int i = 0; i < LANES; i++) r |= a[i];
+  return r != 0;
+#endif
+}
+ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }
+
+// Sixteen flags as bits 0..15, and back as a choice between two vectors.
+ALWAYS u32 bits_of(I m) {
+#if defined(__AVX512DQ__)
+  return _mm512_movepi32_mask((__m512i)m);
+#elif defined(__AVX2__)
+  __m256i lo, hi;
+  memcpy(&lo, &m, 32);
+  memcpy(&hi, (char*)&m + 32, 32);
+  return (u32)_mm256_movemask_ps((__m256)lo) | (u32)_mm256_movemask_ps((__m256)hi) << 8;
+#else
+  u32 r = 0;
+  for (int i = 0; i < CHUNK; i++) r |= (u32)(m[i] & 1) << i;
+  return r;
+#endif
+}
+ALWAYS F blend(u32 bits, F yes, F no) {
+#if defined(__AVX512F__)
+  return (F)_mm512_mask_blend_ps((__mmask16)bits, (__m512)no, (__m512)yes);
+#else
+  const I one = {1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768};
+  I chosen = ((I)splatu(bits) & one) != 0;
+  return (F)(((I)yes & chosen) | ((I)no & ~chosen));
+#endif
+}
+ALWAYS F choose(I m, F yes, F no) { return (F)(((I)yes & m) | ((I)no & ~m)); }
+ALWAYS F root(F a) {
+#if defined(__AVX512F__)
+  return (F)_mm512_sqrt_ps((__m512)a);
+#else
+  F r;
+  for (int i = 0; i < CHUNK; i++) r[i] = __builtin_sqrtf(a[i]);
+  return r;
+#endif
+}
+ALWAYS F magnitude(F a) { return (F)((I)a & (I)splatu(0x7fffffff)); }
+ALWAYS F divide(F a, F b) { return choose(b == 0.0f, splatf(0), a / b); }
+ALWAYS F smaller(F a, F b) { return choose(a < b, a, choose(a != a, a, b)); }
+ALWAYS F larger(F a, F b) { return choose(a > b, a, choose(a != a, a, b)); }
+ALWAYS F settle(F x, float lo, float hi, float snap) {
+  x = choose(x == x, x, splatf(0));
+  x = choose(x < lo, splatf(lo), x);
+  x = choose(x > hi, splatf(hi), x);
+  return choose(magnitude(x) < snap, splatf(0), x);
+}
+
+struct Plane {
+  V* data;
+  int refs;
+  bool zero;  // known to hold nothing
+};
+struct Field {
+  float* data;    // [LANES][height][stride], column 0 at HALO
+  uint8_t* live;  // [LANES][height]: rows that are not all zero; others are not to be read
+  int refs;
+};
+
+struct Grid {
+  int height, width, words, stride;
+  int cells() const { return height * words; }
+};
+
+// Everything one thread needs to run groups: buffers, row tables, keys.
+struct Context {
+  Grid g;
+  V valid_last;
+  std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16
+  int turn[2 * HALO + 1];    // dx mod width, for rotations
+  std::vector<Plane*> planes, all_planes;
+  std::vector<Field*> fields, all_fields;
+  Plane* nothing;
+  V* nothing_row;
+  float* zeros;
+  U k0[STREAMS + 1], k1[STREAMS + 1];
+  V step_bits[STEP_PLANES + 1];
+  V param_bits[PARAM_PLANES + 1];
+  float param_real[PARAM_REALS + 1][LANES];
+  Plane* slot[SLOTS + 1];
+  Field* real[REALS + 1];
+  std::vector<V*> fixed;  // planes of coordinates and insides, made once
+  int lanes;
+
+  V valid(int w) const { return w == g.words - 1 ? valid_last : splat(~0ull); }
+  int row(int y) const { return wrapped[y + HALO]; }
+};
+
+template <class T> static T* aligned(size_t count) {
+  size_t bytes = (count * sizeof(T) + 127) / 64 * 64;
+  void* p = aligned_alloc(64, bytes);
+  if (!p) abort();
+  memset(p, 0, bytes);
+  return (T*)p;
+}
+static Plane* new_plane(const Grid& g) { return new Plane{aligned<V>(g.cells()), 0, true}; }
+static Field* new_field(const Grid& g) {
+  return new Field{aligned<float>((size_t)LANES * g.height * g.stride + CHUNK), aligned<uint8_t>(LANES * g.height), 0};
+}
+static void drop(Plane* p) { free(p->data); delete p; }
+static void drop(Field* f) { free(f->data); free(f->live); delete f; }
+
+ALWAYS Plane* take(Context& c) {
+  Plane* p;
+  if (c.planes.empty()) {
+    p = new_plane(c.g);
+  } else {
+    p = c.planes.back();
+    c.planes.pop_back();
+  }
+  p->refs = 1;
+  return p;
+}
+ALWAYS Plane* keep(Plane* p) { p->refs++; return p; }
+ALWAYS void give(Context& c, Plane* p) {
+  if (--p->refs == 0) c.planes.push_back(p);
+}
+ALWAYS Field* take_field(Context& c) {
+  Field* f;
+  if (c.fields.empty()) {
+    f = new_field(c.g);
+  } else {
+    f = c.fields.back();
+    c.fields.pop_back();
+  }
+  f->refs = 1;
+  return f;
+}
+ALWAYS Field* keep(Field* f) { f->refs++; return f; }
+ALWAYS void give(Context& c, Field* f) {
+  if (--f->refs == 0) c.fields.push_back(f);
+}
+
+// Columns: the value at the column dx to the right, wrapping or with nothing beyond the edge.
+OUTLINE V columns_far(const Context& c, const V* row, int w, int dx, bool wraps) {
+  int n = c.g.words, rest = c.g.width - 64 * (n - 1);
+  auto word = [&](int i) -> V {  // words of the endless row: the last is continued by the first
+    if (i < 0) {
+      if (!wraps) return splat(0);
+      return rest == 64 ? row[n - 1] : (row[n - 1] << (64 - rest)) | (row[n - 2] >> rest);
+    }
+    if (i < n - 1) return row[i];
+    if (!wraps) return i == n - 1 ? row[i] : splat(0);
+    if (rest == 64) return i == n - 1 ? row[i] : row[0];
+    return i == n - 1 ? row[i] | (row[0] << rest) : (row[0] >> (64 - rest)) | (row[1] << rest);
+  };
+  V r = dx > 0 ? (word(w) >> dx) | (word(w + 1) << (64 - dx)) : (row[w] << -dx) | (word(w - 1) >> (64 + dx));
+  return r & c.valid(w);
+}
+ALWAYS V columns(const Context& c, const V* row, int w, int dx) {
+  if (__builtin_expect(c.g.words != 1, 0)) return columns_far(c, row, w, dx, true);
+  int by = c.turn[dx + HALO];
+  V x = row[0];
+  return by ? ((x >> by) | (x << (c.g.width - by))) & c.valid_last : x;
+}
+ALWAYS V columns_zero(const Context& c, const V* row, int w, int dx) {
+  if (__builtin_expect(c.g.words != 1, 0)) return columns_far(c, row, w, dx, false);
+  return dx > 0 ? row[0] >> dx : (row[0] << -dx) & c.valid_last;
+}
+ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
+  return y >= 0 && y < c.g.height ? p->data + y * c.g.words : c.nothing_row;
+}
+
+// Draws: bit j of 32 columns is one hash; two make a word.
+ALWAYS V draw_plane(const Context& c, int stream, int y, int w, int j) {
+  u32 across = (c.g.width + 31) / 32;
+  u32 n = ((u32)y * across + 2 * w) * 32 + j;
+  const U half = {0, 32, 0, 32, 0, 32, 0, 32, 0, 32, 0, 32, 0, 32, 0, 32};
+  U h = (splatu(n) + half) * 0x9E3779B1u + c.k0[stream];
+  h ^= h >> 16;
+  h *= 0x7FEB352Du;
+  h ^= h >> 15;
+  h = (h + c.k1[stream]) * 0x846CA68Bu;
+  h ^= h >> 16;
+  return (V)h;
+}
+// Which of the wanted cells draw below a constant; stops when all are decided.
+OUTLINE V draw_below(const Context& c, int stream, int y, int w, V wanted, int bits, u64 limit) {
+  V below = splat(0), open = wanted;
+  int last = bits - __builtin_ctzll(limit);
+  for (int j = 0; j < last; j++) {
+    V p = draw_plane(c, stream, y, w, j);
+    if (limit >> (bits - 1 - j) & 1) {
+      below |= open & ~p;
+      open &= p;
+    } else {
+      open &= ~p;
+    }
+    if (!any(open)) break;
+  }
+  return below;
+}
+// The same with a limit given plane by plane, most significant (the carry) first.
+OUTLINE V draw_below_planes(const Context& c, int stream, int y, int w, V wanted, int bits, const V* limit) {
+  V below = wanted & limit[0], open = wanted & ~limit[0];
+  for (int j = 0; j < bits && any(open); j++) {
+    V p = draw_plane(c, stream, y, w, j), t = limit[1 + j];
+    below |= open & t & ~p;
+    open &= ~(t ^ p);
+  }
+  return below;
+}
+// A draw of one world's cell as float32.
+OUTLINE float draw_cell(const Context& c, int stream, int lane, int y, int x, int bits) {
+  double value = 0;
+  for (int j = 0; j < bits; j++) {
+    V p = draw_plane(c, stream, y, x / 64, j);
+    value = 2 * value + (double)(p[lane] >> (x % 64) & 1);
+  }
+  double scale = 1;
+  for (int j = 0; j < bits; j++) scale *= 2;
+  return (float)((value + 0.5) / scale);
+}
+
+// Movements on whole planes.
+OUTLINE Plane* shifted(Context& c, const Plane* p, int dy, int dx) {
+  if (p->zero) return keep(c.nothing);
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int y = 0; y < c.g.height; y++) {
+    const V* from = p->data + c.row(y + dy);
+    for (int w = 0; w < c.g.words; w++) {
+      V x = dx ? columns(c, from, w, dx) : from[w];
+      some |= x;
+      r->data[y * c.g.words + w] = x;
+    }
+  }
+  r->zero = !any(some);
+  return r;
+}
+// Movers (and `targets`, the same seen from the other side) exchange what they hold.
+OUTLINE Plane* swap_plane(Context& c, Plane* content, const Plane* movers, const Plane* targets, Plane* rest, int dy, int dx) {
+  if (content->zero && rest->zero) return keep(rest);
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int y = 0; y < c.g.height; y++) {
+    const V *down = content->data + c.row(y + dy), *up = content->data + c.row(y - dy);
+    for (int w = 0; w < c.g.words; w++) {
+      int i = y * c.g.words + w;
+      V there = dx ? columns(c, down, w, dx) : down[w], back = dx ? columns(c, up, w, -dx) : up[w];
+      V x = mux(movers->data[i], there, mux(targets->data[i], back, rest->data[i]));
+      some |= x;
+      r->data[i] = x;
+    }
+  }
+  r->zero = !any(some);
+  return r;
+}
+OUTLINE Plane* arrive_plane(Context& c, Plane* content, const Plane* targets, Plane* rest, int dy, int dx) {
+  if (targets->zero || (content->zero && rest->zero)) return keep(rest);
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int y = 0; y < c.g.height; y++) {
+    const V* up = content->data + c.row(y - dy);
+    for (int w = 0; w < c.g.words; w++) {
+      int i = y * c.g.words + w;
+      V back = dx ? columns(c, up, w, -dx) : up[w];
+      V x = mux(targets->data[i], back, rest->data[i]);
+      some |= x;
+      r->data[i] = x;
+    }
+  }
+  r->zero = !any(some);
+  return r;
+}
+OUTLINE Plane* cleared(Context& c, Plane* old, const Plane* where) {  // old and not where
+  if (old->zero || where->zero) return keep(old);
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int i = 0, n = c.g.cells(); i < n; i++) some |= r->data[i] = old->data[i] & ~where->data[i];
+  r->zero = !any(some);
+  return r;
+}
+OUTLINE Plane* joined(Context& c, Plane* old, Plane* where) {  // old or where
+  if (where->zero) return keep(old);
+  if (old->zero) return keep(where);
+  Plane* r = take(c);
+  for (int i = 0, n = c.g.cells(); i < n; i++) r->data[i] = old->data[i] | where->data[i];
+  r->zero = false;
+  return r;
+}
+
+// Real rows.
+ALWAYS const float* real_row(const Context& c, const Field* f, int lane, int y) {
+  return f->live[lane * c.g.height + y] ? f->data + ((size_t)lane * c.g.height + y) * c.g.stride + HALO : c.zeros + HALO;
+}
+ALWAYS const float* real_row_wrapped(const Context& c, const Field* f, int lane, int y) {
+  return real_row(c, f, lane, c.row(y) / c.g.words);
+}
+ALWAYS const float* real_row_or_nothing(const Context& c, const Field* f, int lane, int y) {
+  return y >= 0 && y < c.g.height ? real_row(c, f, lane, y) : c.zeros + HALO;
+}
+ALWAYS F inside_columns(F value, int x, int dx, int width) {
+  const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+  I at = lane + (x + dx);
+  return (F)((I)value & (at >= 0) & (at < width));
+}
+ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
+// After the chunks of a row: nothing beyond the width, then the halo.
+ALWAYS void finish_row(const Context& c, float* row) {
+  int w = c.g.width, reach = REACH;
+  for (int i = 0; i < reach; i++) row[w + i] = row[i % w];
+  for (int i = 1; i <= reach; i++) row[-i] = row[(w - i % w) % w];
+}
+
+// Keys
+static inline u32 mix(u32 x) {
+  x ^= x >> 16;
+  x *= 0x7FEB352Du;
+  x ^= x >> 15;
+  x *= 0x846CA68Bu;
+  return x ^ (x >> 16);
+}
+static u32 key(u64 seed, u64 index, u64 step, u32 stream, u32 start) {
+  u32 k = start;
+  for (u32 part : {(u32)seed, (u32)(seed >> 32), (u32)index, (u32)step, stream}) k = mix(k + part);
+  return k;
+}

@@ -1,0 +1,55 @@
+"""IR on planes -> C++ for a whole program: moments guarded by their masks, planes in loops, reals in row sweeps."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+from powderdsl.backends.native_layout import Layout, layout_of, literal
+from powderdsl.backends.native_passes import PassWriter
+from powderdsl.ir.ops import Program
+
+GENERATOR_VERSION = 1
+"""Part of every cache key: raise it when generated code changes meaning."""
+
+SNAP = 2.0**-20
+
+
+def native_source(program: Program) -> tuple[str, Layout]:
+    """The whole translation unit, and its layout."""
+    layout = layout_of(program)
+    passes = [PassWriter(p, i, layout).source() for i, p in enumerate(program.passes)]
+    calls = "\n".join(f"  pass_{i}(c);" for i in range(len(program.passes)))
+    resets = [(slot, layout.planes.get(slot.name), layout.reals.get(slot.name)) for slot in program.slots if slot.resets]
+    reset_planes = [f"{{{plane}, {int(slot.default)}}}" for slot, plane, _ in resets if plane is not None]
+    reset_reals = [f"{{{real}, {literal(float(slot.default))}}}" for slot, _, real in resets if real is not None]
+    step_table = [f"{{{a}, {b}}}" for a, b in layout.step_planes]
+    fixed = [f"{{{k}, {a}, {b}}}" for k, a, b in layout.fixed]
+    idents = [f"{ident}u" for _, ident, _ in program.streams]
+    head = "\n".join([
+        f"// {len(program.passes)} passes, generated; version {GENERATOR_VERSION}",
+        f"#define STREAMS {len(layout.streams)}",
+        f"#define STEP_PLANES {len(layout.step_planes)}",
+        f"#define PARAM_PLANES {len(layout.param_planes)}",
+        f"#define PARAM_REALS {len(layout.param_reals)}",
+        f"#define SLOTS {len(layout.planes)}",
+        f"#define REALS {len(layout.reals)}",
+        f"#define REACH {layout.reach}",
+        f"#define SNAP {literal(SNAP)}",
+    ])  # fmt: skip
+    tables = "\n".join([
+        "struct ResetPlane { int slot; bool value; };",
+        "struct ResetReal { int slot; float value; };",
+        "struct FixedPlane { int kind, a, b; };",
+        "struct StepPlane { u64 a; int b; };",
+        f"static const std::vector<ResetPlane> RESET_PLANES = {{{', '.join(reset_planes)}}};",
+        f"static const std::vector<ResetReal> RESET_REALS = {{{', '.join(reset_reals)}}};",
+        f"static const std::vector<FixedPlane> FIXED = {{{', '.join(fixed)}}};",
+        f"static const std::vector<StepPlane> STEP_TABLE = {{{', '.join(step_table)}}};",
+        f"static const std::vector<u32> STREAM_IDENT = {{{', '.join(idents)}}};",
+    ])  # fmt: skip
+    folder = files("powderdsl.backends")
+    runtime = (folder / "native_runtime.hpp").read_text(encoding="utf-8")
+    driver = (folder / "native_driver.hpp").read_text(encoding="utf-8")
+    body = "\n\n".join(passes)
+    step = f"static void run_passes(Context& c) {{\n{calls}\n}}"
+    return "\n".join([head, runtime, tables, body, step, driver]), layout

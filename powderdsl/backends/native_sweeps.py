@@ -1,0 +1,255 @@
+"""Reals as C++: sweeps over the rows of each world that compute float planes, and flags that compare them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from powderdsl.backends.native_layout import Layout, literal
+from powderdsl.ir.ops import REAL, Node, walk
+
+RECOMPUTE = 2
+_INFIX = {"add": "+", "sub": "-", "mul": "*"}
+_COMPARE = {"eq": "==", "lt": "<", "le": "<="}
+
+
+def real_cost(node: Node, have: Callable[[Node], bool]) -> int:
+    """Operations that computing a real at a neighbour takes; large if it cannot be done there."""
+    if have(node) or node.op in ("const", "param"):
+        return 0
+    if node.op in _INFIX or node.op == "neg":
+        return 1 + sum(real_cost(arg, have) for arg in node.args)
+    if node.op == "shift" and node.attr[2]:  # type: ignore[index]
+        return real_cost(node.args[0], have)
+    return 100
+
+
+def sweep_needs(node: Node, have: Callable[[Node], bool]) -> tuple[list[Node], list[Node]]:
+    """Flags and reals that must stand in planes before a sweep can compute this node."""
+    flags: dict[int, Node] = {}
+    reals: dict[int, Node] = {}
+    seen: set[int] = set()
+    stack = [node]
+    while stack:
+        top = stack.pop()
+        if id(top) in seen or (top is not node and have(top)):
+            continue
+        seen.add(id(top))
+        if top.type != REAL and top is not node:
+            flags[id(top)] = top
+        elif top.op == "shift":
+            source = top.args[0]
+            if have(source):
+                continue
+            if top.attr[2] and real_cost(source, have) <= RECOMPUTE:  # type: ignore[index]
+                stack.append(source)
+            else:
+                reals[id(source)] = source
+        else:
+            stack.extend(top.args)
+    return list(flags.values()), list(reals.values())
+
+
+class Sweep:
+    """The statements that compute some reals and comparisons chunk by chunk."""
+
+    def __init__(self, planes: dict[int, str], fields: dict[int, str], layout: Layout):
+        self.planes, self.fields, self.layout = planes, fields, layout
+        self.lines: list[str] = []
+        self.memo: dict[tuple[int, int, int], str] = {}
+        self.rows: dict[str, str] = {}
+        self.words: dict[str, str] = {}
+        self.used: set[str] = set()
+        self.counter = [0]
+
+    def have(self, node: Node) -> bool:
+        return id(node) in self.fields or id(node) in self.planes
+
+    def inner(self) -> Sweep:
+        nested = Sweep(self.planes, self.fields, self.layout)
+        nested.memo, nested.counter = dict(self.memo), self.counter
+        nested.rows, nested.words, nested.used = self.rows, self.words, self.used
+        return nested
+
+    def row(self, field: str, dy: int, wraps: bool = True) -> str:
+        """The pointer to a field's row, set up once a row."""
+        self.used.add(field)
+        call = f"real_row_wrapped(c, {field}, l, y + {dy})" if wraps else f"real_row_or_nothing(c, {field}, l, y + {dy})"
+        if wraps and dy == 0:
+            call = f"real_row(c, {field}, l, y)"
+        return self.rows.setdefault(call, f"r{len(self.rows)}")
+
+    def mask(self, node: Node) -> str:
+        """Sixteen bits of a flag's plane."""
+        if node.op == "param":
+            from powderdsl.backends.native_layout import param_key
+
+            return f"(u32)(c.param_bits[{self.layout.param_planes[param_key(node)]}][l] & 0xffff)"
+        plane = self.planes[id(node)]
+        self.used.add(plane)
+        word = self.words.setdefault(plane, f"m{len(self.words)}")
+        return f"(u32)({word} >> (x & 63) & 0xffff)"
+
+    def temporary(self, expression: str) -> str:
+        self.counter[0] += 1
+        name = f"v{self.counter[0]}"
+        self.lines.append(f"const F {name} = {expression};")
+        return name
+
+    def value(self, node: Node, dy: int = 0, dx: int = 0) -> str:
+        """The name of the node's chunk at the neighbour (dy, dx)."""
+        if node.op == "const":
+            return f"splatf({literal(float(node.attr))})"  # type: ignore[arg-type]
+        key = (id(node), dy, dx)
+        if key not in self.memo:
+            self.memo[key] = self.compute(node, dy, dx)
+        return self.memo[key]
+
+    def compute(self, node: Node, dy: int, dx: int) -> str:
+        if id(node) in self.fields:
+            return self.temporary(f"load({self.row(self.fields[id(node)], dy)}, x + {dx})")
+        args = node.args
+        if node.op == "select":
+            return self.select(node)
+        match node.op:
+            case "param":
+                return self.temporary(f"splatf(c.param_real[{self.layout.param_reals[node.attr[0]]}][l])")  # type: ignore[index]
+            case "draw":
+                stream, bits = node.attr  # type: ignore[misc]
+                self.counter[0] += 1
+                name = f"d{self.counter[0]}"
+                number = self.layout.streams[stream]
+                cell = f"draw_cell(c, {number}, l, y, std::min(x + i, width - 1), {bits})"
+                self.lines.append(f"F {name}; for (int i = 0; i < CHUNK; i++) {name}[i] = {cell};")
+                return name
+            case "shift":
+                sy, sx, wraps = node.attr  # type: ignore[misc]
+                if wraps:
+                    return self.value(args[0], dy + sy, dx + sx)
+                assert dy == dx == 0
+                row = self.row(self.fields[id(args[0])], sy, wraps=False)
+                loaded = f"load({row}, x + {sx})"
+                return self.temporary(f"inside_columns({loaded}, x, {sx}, width)" if sx else loaded)
+        values = [self.value(arg, dy, dx) for arg in args]
+        match node.op:
+            case "add" | "sub" | "mul":
+                return self.temporary(f"{values[0]} {_INFIX[node.op]} {values[1]}")
+            case "div":
+                divisor = args[1]
+                if divisor.op == "const" and divisor.attr:
+                    return self.temporary(f"{values[0]} / {values[1]}")
+                return self.temporary(f"divide({values[0]}, {values[1]})")
+            case "neg":
+                return self.temporary(f"-{values[0]}")
+            case "abs":
+                return self.temporary(f"magnitude({values[0]})")
+            case "min":
+                return self.temporary(f"smaller({values[0]}, {values[1]})")
+            case "max":
+                return self.temporary(f"larger({values[0]}, {values[1]})")
+            case "sqrt":
+                return self.temporary(f"root({values[0]})")
+            case "settle":
+                lo, hi = node.attr  # type: ignore[misc]
+                return self.temporary(f"settle({values[0]}, {literal(lo)}, {literal(hi)}, SNAP)")
+        raise AssertionError(f"no native sweep for {node.op}")
+
+    def select(self, node: Node) -> str:
+        """Where no cell of the chunk is chosen, nothing of the first choice is computed."""
+        mask, yes, no = node.args
+        otherwise = self.value(no)
+        self.counter[0] += 1
+        name = f"v{self.counter[0]}"
+        bits = f"b{self.counter[0]}"
+        nested = self.inner()
+        chosen = nested.value(yes)
+        self.lines.append(f"F {name} = {otherwise};")
+        body = " ".join([*nested.lines, f"{name} = blend({bits}, {chosen}, {name});"])
+        self.lines.append(f"if (const u32 {bits} = {self.mask(mask)}) {{ {body} }}")
+        return name
+
+
+def quiet(nodes: list[Node], have: Callable[[Node], bool]) -> tuple[list[float | bool] | None, list[Node], list[Node]]:
+    """What the nodes are where all reals are zero and no mask holds; which masks and rows decide that it is so.
+
+    The values are None if parameters or draws enter, so that no row may be skipped.
+    """
+    memo: dict[int, object] = {}
+    masks: dict[int, Node] = {}
+    sources: dict[int, Node] = {}
+
+    def visit(node: Node):  # type: ignore[no-untyped-def]
+        if id(node) in memo:
+            return memo[id(node)]
+        if node.type == REAL and have(node) and node not in nodes:
+            sources[id(node)] = node
+            result: object = np.float32(0)
+        elif node.op == "const":
+            result = np.float32(node.attr)  # type: ignore[arg-type]
+        elif node.op == "select":
+            masks[id(node.args[0])] = node.args[0]
+            result = visit(node.args[2])
+        elif node.op == "shift":
+            source = node.args[0]
+            result = visit(source)
+            if not node.attr[2] and result:  # type: ignore[index]
+                raise LookupError
+        elif node.op in ("param", "draw"):
+            raise LookupError
+        else:
+            values = [visit(arg) for arg in node.args]
+            result = _QUIET[node.op](node, *values)
+        memo[id(node)] = result
+        return result
+
+    with np.errstate(all="ignore"):
+        try:
+            found = [visit(node) for node in nodes]
+        except LookupError:
+            return None, [], []
+    if any(isinstance(v, np.floating) and v != 0 for v in found):
+        return None, [], []
+    return found, list(masks.values()), list(sources.values())
+
+
+_QUIET: dict[str, Callable] = {  # type: ignore[type-arg]
+    "add": lambda n, a, b: a + b,
+    "sub": lambda n, a, b: a - b,
+    "mul": lambda n, a, b: a * b,
+    "div": lambda n, a, b: np.float32(0) if b == 0 else a / b,
+    "neg": lambda n, a: -a,
+    "abs": lambda n, a: abs(a),
+    "min": lambda n, a, b: np.minimum(a, b),
+    "max": lambda n, a, b: np.maximum(a, b),
+    "sqrt": lambda n, a: np.sqrt(a),
+    "settle": lambda n, a: np.float32(min(max(a, n.attr[0]), n.attr[1])) if a == a else np.float32(0),
+    "eq": lambda n, a, b: bool(a == b),
+    "lt": lambda n, a, b: bool(a < b),
+    "le": lambda n, a, b: bool(a <= b),
+}
+
+
+def rows_read(nodes: list[Node], have: Callable[[Node], bool]) -> list[tuple[Node, int, bool]]:
+    """Fields and row offsets that the nodes read where no mask holds: (field, rows down, wraps)."""
+    found: dict[tuple[int, int, bool], tuple[Node, int, bool]] = {}
+
+    def visit(node: Node, dy: int, wraps: bool) -> None:
+        if node.type == REAL and have(node) and node not in nodes:
+            found[id(node), dy, wraps] = (node, dy, wraps)
+        elif node.op == "shift":
+            visit(node.args[0], dy + node.attr[0], node.attr[2])  # type: ignore[index]
+        elif node.op == "select":
+            visit(node.args[2], dy, wraps)
+        else:
+            for arg in node.args:
+                visit(arg, dy, wraps)
+
+    for node in nodes:
+        for arg in node.args if node.type != REAL else (node,):
+            visit(arg, 0, True)
+    return list(found.values())
+
+
+def reads_real(node: Node) -> bool:
+    return any(inner.type == REAL for inner in walk(node))

@@ -1,0 +1,136 @@
+"""The native backend behind the common signature: worlds stay packed between calls, arrays are made when asked for."""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from powderdsl.backends.native_build import build, load_library
+from powderdsl.backends.native_source import native_source
+from powderdsl.backends.torch_dense import Clock, Kernels
+from powderdsl.ir.gates import width as planes_of
+from powderdsl.ir.ops import Program, SlotType
+
+
+class PackedState(Mapping[str, Tensor]):
+    """A batch's state in native memory. Slots are unpacked into tensors one by one, when they are first read."""
+
+    def __init__(self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]):
+        self.program, self.handle, self.like = program, handle, like
+        self._tensors: dict[str, Tensor] = {}
+        weakref.finalize(self, program.library.pd_free, handle)
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._tensors:
+            self._tensors[name] = self.program.unpack(self, name)
+        return self._tensors[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.like)
+
+    def __len__(self) -> int:
+        return len(self.like)
+
+
+class NativeProgram:
+    """A program as compiled C++.
+
+    Args:
+        program: the numeric program, whose slots are the state's.
+        planes: the same program from `ir.bits.lower_bits`.
+
+    Raises:
+        native_build.NoCompiler: there is no C++ compiler, or it failed.
+    """
+
+    def __init__(self, program: Program, planes: Program, threads: int = 1):
+        source, self.layout = native_source(planes)
+        self.library = load_library(build(source))
+        self.threads = threads
+        self._slots: dict[str, SlotType] = {slot.name: slot for slot in program.slots}
+        self._kinds = dict(program.params)
+
+    def run(
+        self,
+        state: Mapping[str, Tensor],
+        clock: Clock,
+        steps: int,
+        params: Mapping[str, Tensor],
+        draws: Mapping[str, Tensor],
+        passes: frozenset[str] | None,
+    ) -> Mapping[str, Tensor]:
+        """The state `steps` later. Given draws and chosen passes are for other backends."""
+        assert not draws and passes is None
+        seed, index, start = (part.contiguous() for part in clock)
+        batch = len(seed)
+        if isinstance(state, PackedState) and state.program is self:
+            handle = self.library.pd_copy(state.handle)
+            like = state.like
+        else:
+            handle, like = self._pack(state)
+        planes, reals = self._parameters(params, batch)
+        packed = PackedState(self, handle, like)
+        self.library.pd_run(
+            handle, steps, self.threads, _address(seed), _address(index), _address(start), _address(planes), _address(reals)
+        )
+        return packed
+
+    def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
+        """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
+        view = Kernels.param_view
+        planes = torch.zeros(max(1, len(self.layout.param_planes)), batch, dtype=torch.uint8)
+        for (name, how, bit), number in self.layout.param_planes.items():
+            kind = self._kinds[name] if how == "value" else how
+            value = view(params[name], kind).to(torch.int64)
+            planes[number] = ((value >> bit) & 1).to(torch.uint8)
+        reals = torch.zeros(max(1, len(self.layout.param_reals)), batch, dtype=torch.float32)
+        for name, number in self.layout.param_reals.items():
+            reals[number] = params[name].to(torch.float32)
+        return planes, reals
+
+    def _pack(self, state: Mapping[str, Tensor]) -> tuple[int, dict[str, tuple[torch.dtype, tuple[int, ...]]]]:
+        batch, height, width = state["element"].shape
+        handle = self.library.pd_new(batch, height, width)
+        like = {}
+        for name, value in state.items():
+            value = value.contiguous()
+            like[name] = (value.dtype, tuple(value.shape))
+            if value.dtype == torch.float32:
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
+                for i, part in enumerate(parts):
+                    first = value[:, i] if value.ndim == 4 else value
+                    self.library.pd_load_real(handle, self.layout.reals[part], _address(first), value.stride(0))
+            else:
+                slot, bits, _ = self._where(name)
+                self.library.pd_load(handle, slot, bits, value.element_size(), _address(value))
+        return handle, like
+
+    def _where(self, name: str) -> tuple[int, int, bool]:
+        """First plane, number of planes, and whether the last is a sign."""
+        type = self._slots[name].type
+        if type.name == "flag":
+            return self.layout.planes[name], 1, False
+        bits, signed = planes_of(type.lo, type.hi)
+        return self.layout.planes[f"{name}:0"], bits, signed
+
+    def unpack(self, state: PackedState, name: str) -> Tensor:
+        """One slot as a tensor in its storage dtype."""
+        dtype, shape = state.like[name]
+        value = torch.empty(shape, dtype=dtype)
+        if dtype == torch.float32:
+            parts = (f"{name}.row", f"{name}.column") if len(shape) == 4 else (name,)
+            for i, part in enumerate(parts):
+                first = value[:, i] if len(shape) == 4 else value
+                self.library.pd_store_real(state.handle, self.layout.reals[part], _address(first), value.stride(0))
+        else:
+            slot, bits, signed = self._where(name)
+            self.library.pd_store(state.handle, slot, bits, int(signed), value.element_size(), _address(value))
+        return value
+
+
+def _address(tensor: Tensor) -> ctypes.c_void_p:
+    return ctypes.c_void_p(tensor.data_ptr())

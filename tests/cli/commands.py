@@ -1,0 +1,56 @@
+"""Running the command line in tests."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from click.testing import CliRunner, Result
+
+from powderdsl.cli import main
+
+ROOT = Path(__file__).resolve().parents[2]
+
+PACK = """\
+pack: grit
+about: A powder for tests.
+needs: core
+params: {vanish: 20%}
+elements:
+  grit: {id: 200, density: 4, gravity: yes, color: "#123456", glyph: G, tags: powder}
+passes:
+  grit:
+    after: flow
+    do: grit -> empty if count(grit) == 1 and interact < vanish
+"""
+"""A pack without a mistake, for tests to change."""
+
+
+def powderdsl(*arguments: object, **environment: str) -> Result:
+    """Run in this process. `stdout`, `stderr` and `exit_code` say what came of it."""
+    result = CliRunner().invoke(main, [str(word) for word in arguments], env=environment)
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    assert "Traceback" not in result.output
+    return result
+
+
+def process(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run as a user does, in a process of its own."""
+    return subprocess.run(
+        command_line(*arguments),
+        env=environment_with(**environment),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def command_line(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "powderdsl", *(str(word) for word in arguments)]
+
+
+def environment_with(**changes: str) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), **changes}

@@ -1,0 +1,116 @@
+"""`powderdsl check`."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.cli.commands import PACK, powderdsl
+
+
+@pytest.fixture
+def pack(tmp_path, monkeypatch):
+    """Writes a changed PACK; the name to check it under."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(old: str = "", new: str = "", name: str = "grit.yaml") -> str:
+        assert old in PACK
+        (tmp_path / name).write_text(PACK.replace(old, new) if old else PACK)
+        return f"core+{name}"
+
+    return write
+
+
+def test_a_clean_ruleset_is_one_line():
+    result = powderdsl("check", "powderworld")
+    assert result.exit_code == 0
+    assert result.stdout == "powderworld: 14 elements, 12 passes, no errors\n"
+    assert result.stderr == ""
+
+
+def test_all_errors_come_at_once(pack):
+    result = powderdsl("check", pack("count(grit) == 1 and interact < vanish", "count(grid) == vanis"))
+    assert result.exit_code == 2
+    assert "error[PD301]" in result.stdout
+    assert "grit.yaml:10" in result.stdout
+    assert "^" in result.stdout
+    assert "powderdsl explain PD301" in result.stdout
+    assert result.stdout.splitlines()[-1].startswith("core+grit.yaml: ")
+
+
+def test_warnings_are_errors_only_on_request(pack):
+    rules = pack("do: ", "do: grit -> empty if grit and not grit\n    then: ")
+    result = powderdsl("check", rules)
+    assert result.exit_code == 0
+    assert "warning[PD503]" in result.stdout
+    assert ", no errors, " in result.stdout
+    assert powderdsl("check", rules, "--warnings-as-errors").exit_code == 1
+    assert powderdsl("check", rules, "nope", "--warnings-as-errors").exit_code == 2
+
+
+def test_notes_are_shown_on_request(pack):
+    rules = pack()
+    quiet, loud = powderdsl("check", rules), powderdsl("check", rules, "--notes")
+    assert "note[" not in quiet.stdout
+    assert "(--notes shows them)" in quiet.stdout
+    assert "note[PD504]" in loud.stdout
+    assert "(--notes shows them)" not in loud.stdout
+    assert quiet.exit_code == loud.exit_code == 0
+
+
+def test_the_short_format_has_one_line_each(pack):
+    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "--format", "short")
+    assert result.exit_code == 2
+    first, *_, last = result.stdout.splitlines()
+    assert first.startswith("grit.yaml:4:18: error[PD40")
+    assert last == "core+grit.yaml: 1 error"
+
+
+def test_json_is_one_list(pack):
+    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "nope", "--format", "json")
+    assert result.exit_code == 2
+    found = json.loads(result.stdout)
+    assert {one["severity"] for one in found} == {"error"}
+    assert found[-1]["code"] == "PD304"
+    assert found[0]["primary"]["span"]["start"] == {"line": 4, "column": 18}
+
+
+def test_json_of_clean_rules_is_empty():
+    assert json.loads(powderdsl("check", "powderworld", "--format", "json").stdout) == []
+
+
+def test_several_rulesets_are_checked_one_by_one(pack):
+    result = powderdsl("check", "powderworld", pack(), "nope")
+    assert result.exit_code == 2
+    assert "powderworld: 14 elements" in result.stdout
+    assert "core+grit: 3 elements" in result.stdout
+    assert "nope: 1 error" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        (b"", "PD107"),
+        (b"pack: [", "PD103"),
+        (b"\xff\xfe", "PD101"),
+        (b"pack: x\npack: y\n", "PD104"),
+        (b"- 1\n", "PD107"),
+        (b"pack: &a x\nabout: *a\n", "PD105"),
+        (b"[" * 1000, "PD106"),
+        (b"pack: x\nunknown: y\n", "PD108"),
+    ],
+)
+def test_broken_files_are_diagnostics(tmp_path, content, code):
+    path = tmp_path / "broken.yaml"
+    path.write_bytes(content)
+    result = powderdsl("check", path)
+    assert result.exit_code == 2
+    assert code in result.stdout
+
+
+def test_files_that_are_not_there(tmp_path):
+    assert "PD101" in powderdsl("check", tmp_path / "none.yaml").stdout
+    assert powderdsl("check", tmp_path).exit_code == 2
+    assert powderdsl("check", "").exit_code == 2
+    assert powderdsl("check", "core+").exit_code == 2

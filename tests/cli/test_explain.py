@@ -1,0 +1,50 @@
+"""`powderdsl explain`."""
+
+from __future__ import annotations
+
+import pytest
+
+from powderdsl.diagnostics import CODES
+from powderdsl.diagnostics.explain import find_code, page, similar
+from tests.cli.commands import powderdsl
+
+
+def test_without_a_code_all_are_listed():
+    result = powderdsl("explain")
+    assert result.exit_code == 0
+    assert [line.split()[0] for line in result.stdout.splitlines()] == list(CODES)
+
+
+@pytest.mark.parametrize("word", ["PD301", "pd301", "301", "unknown-name", "Unknown_Name", "[PD301]"])
+def test_codes_and_slugs_are_accepted(word):
+    assert find_code(word) is CODES["PD301"]
+    result = powderdsl("explain", word)
+    assert result.exit_code == 0
+    assert "PD301" in result.stdout
+    assert "\x1b" not in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [("unknown-nam", "unknown-name"), ("PD399", "PD301"), ("pass-cicle", "pass-cycle"), ("PD3", "PD301")],
+)
+def test_unknown_codes_get_a_suggestion(word, meant):
+    assert meant in similar(word)
+    result = powderdsl("explain", word)
+    assert result.exit_code == 2
+    assert meant in result.stderr
+    assert result.stdout == ""
+
+
+@pytest.mark.parametrize("word", ["", "zzzzzzzz", "PD", "\N{SNOWMAN}"])
+def test_anything_else_gets_the_list(word):
+    result = powderdsl("explain", word)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: no code")
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_every_code_has_a_text(code):
+    text = page(CODES[code])
+    assert code in text
+    assert text.endswith("\n")

@@ -1,0 +1,197 @@
+"""`powderdsl new` and `powderdsl test`: packs and the tests that stand in them."""
+
+from __future__ import annotations
+
+import pytest
+
+import powderdsl as package
+from powderdsl.pack_tests import SEEDS, run_examples
+from tests.cli.commands import PACK, powderdsl
+
+TESTS = """\
+tests:
+  - two grains fall side by side:
+      given: |
+        . . . .
+        . G G .
+        . . . .
+        # # # #
+      after: 3 steps
+      always: [grit or empty or wall]
+      expect: |
+        . . . .
+        ? ? ? ?
+        . x x .
+        # # # #
+      legend: {x: grit}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run_tests(text: str, folder):
+    (folder / "grit.yaml").write_text(PACK + text)
+    return powderdsl("test", "core+grit.yaml")
+
+
+# new
+
+
+@pytest.mark.parametrize("name", ["salt", "Salt2", "x", "a_name_of_exactly_forty_characters_xxxxx"])
+def test_a_new_pack_checks_runs_and_passes_its_test(folder, name):
+    result = powderdsl("new", name)
+    assert result.exit_code == 0
+    assert f"core+{name}.yaml" in result.stdout
+    assert [path.name for path in folder.iterdir()] == [f"{name}.yaml"]
+    rules = f"core+{name}.yaml"
+    assert powderdsl("check", rules).exit_code == 0
+    tested = powderdsl("test", rules)
+    assert tested.exit_code == 0
+    assert f"ok    {name}: " in tested.stdout
+
+
+def test_new_elements_have_free_ids_and_colours_of_their_own(folder):
+    for name in ("salt", "pepper", "chalk"):
+        assert powderdsl("new", name).exit_code == 0
+    everything = package.load("powderworld", "salt.yaml", "pepper.yaml", "chalk.yaml")
+    assert [element.name for element in everything.elements[-3:]] == ["salt", "pepper", "chalk"]
+    assert len({element.color for element in everything.elements}) == len(everything.elements)
+
+
+def test_new_works_beside_files_that_are_broken(folder):
+    (folder / "broken.yaml").write_text("pack: [")
+    (folder / "other.yaml").write_bytes(b"\xff")
+    assert powderdsl("new", "salt").exit_code == 0
+
+
+def test_new_writes_elsewhere(folder):
+    (folder / "packs").mkdir()
+    assert powderdsl("new", "salt", "--dir", "packs").exit_code == 0
+    assert (folder / "packs" / "salt.yaml").exists()
+
+
+def test_new_never_overwrites(folder):
+    (folder / "salt.yaml").write_text("precious")
+    (folder / "link.yaml").symlink_to("nowhere")
+    for name in ("salt", "link"):
+        result = powderdsl("new", name)
+        assert result.exit_code == 2
+        assert "exists already" in result.stderr
+    assert (folder / "salt.yaml").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("", "9", "a b", "a-b", "../a", "salt.yaml", "x" * 41, "é"),
+        *("if", "count", "above", "powder", "core", "sand", "wood", "interact", "vanish", "powderworld"),
+    ],
+)
+def test_names_that_a_pack_cannot_have(folder, name):
+    result = powderdsl("new", name)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: ")
+    assert list(folder.iterdir()) == []
+
+
+def test_a_folder_must_be_there(folder):
+    result = powderdsl("new", "salt", "--dir", "nowhere")
+    assert result.exit_code == 2
+    assert "PD613" in result.stderr
+
+
+# test
+
+
+def test_tests_that_pass(folder):
+    result = run_tests(TESTS, folder)
+    assert result.exit_code == 0, result.stdout
+    assert "ok    grit: two grains fall side by side\n" in result.stdout
+    assert result.stdout.endswith("all passed\n")
+
+
+def test_what_is_not_as_expected_is_shown(folder):
+    result = run_tests(TESTS.replace(". x x .", ". x . ."), folder)
+    assert result.exit_code == 1
+    place = "grit.yaml:12: row 2, column 2 is `grit`, not `empty` (seed 0, after 3 steps)"
+    assert f"FAIL  grit: two grains fall side by side\n      {place}\n" in result.stdout
+    assert "      given      expected   found\n" in result.stdout
+    assert "      . . . .    . x . .    . G G .\n" in result.stdout
+    assert result.stdout.endswith("1 failed\n")
+
+
+def test_a_condition_that_does_not_always_hold(folder):
+    result = run_tests(TESTS.replace("grit or empty or wall", "empty or wall"), folder)
+    assert result.exit_code == 1
+    assert "`empty or wall` does not hold at row 2, column 1 (seed 0, after 1 step)" in result.stdout
+
+
+def test_a_test_tries_five_seeds_or_its_own(folder):
+    (folder / "grit.yaml").write_text(PACK + TESTS)
+    (folder / "seeded.yaml").write_text(
+        PACK.replace("grit", "seeded").replace("200", "201").replace("#123456", "#123457").replace("G", "S")
+        + TESTS.replace("grit", "seeded").replace("G", "S")
+        + "      seed: 7\n"
+    )
+    results = run_examples(package.load("core", "grit.yaml", "seeded.yaml"))
+    seeds = {result.example.pack: result.seeds for result in results}
+    assert seeds["grit"] == SEEDS
+    assert seeds["seeded"] == (7,)
+
+
+def test_luck_is_not_enough(folder):
+    lonely = """\
+tests:
+  - a lone grain is gone at once:
+      given: |
+        . . .
+        . G .
+        # # #
+      after: 1 step
+      expect: |
+        . . .
+        . . .
+        # # #
+"""
+    result = run_tests(lonely, folder)
+    assert result.exit_code == 1
+    (outcome,) = [r for r in run_examples(package.load("core", "grit.yaml")) if r.example.pack == "grit"]
+    assert not outcome.passed
+    assert outcome.after == ("...", ".G.", "###")
+    certain = package.load("core", "grit.yaml", params={"grit.vanish": 1})
+    assert all(result.passed for result in run_examples(certain) if result.example.pack == "grit")
+
+
+def test_conditions_may_read_fields_draws_and_parameters(folder):
+    conditions = (
+        "always: [momentum in -10..10, interact > 0, count(wall) >= 0, vanish <= 50%, grit or not grit]"
+    )
+    result = run_tests(TESTS.replace("always: [grit or empty or wall]", conditions), folder)
+    assert result.exit_code == 0, result.output
+
+
+def test_both_backends_agree(folder):
+    (folder / "grit.yaml").write_text(PACK + TESTS.replace(". x x .", ". x . ."))
+    rules = package.load("core", "grit.yaml")
+    assert run_examples(rules, backend="torch") == run_examples(rules, backend="reference")
+
+
+def test_no_tests_are_no_failure(folder):
+    result = powderdsl("test", "life")
+    assert result.exit_code == 0
+
+
+def test_the_tests_of_every_shipped_ruleset_pass():
+    result = powderdsl("test", "powderworld")
+    assert result.exit_code == 0, result.stdout
+
+
+def test_rules_that_are_wrong_are_not_tested(folder):
+    result = run_tests(TESTS.replace("G G", "G Z"), folder)
+    assert result.exit_code == 2
+    assert "PD301" in result.stderr
+    assert "^" in result.stderr

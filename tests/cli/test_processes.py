@@ -1,0 +1,167 @@
+"""The command line as processes: how fast it starts, terminals, and Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.cli.commands import command_line, environment_with
+
+START_LIMIT = 1.0
+"""Seconds. Ours is half of that; tests share their machine."""
+
+
+def start_time(*arguments: str) -> float:
+    """Seconds that a command takes: the best of three, so that a busy machine counts less."""
+    times = []
+    for _ in range(3):
+        began = time.perf_counter()
+        subprocess.run(command_line(*arguments), env=environment_with(), check=True, capture_output=True)
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("check", "powderworld"), ("explain", "PD301")])
+def test_commands_that_run_nothing_start_at_once(arguments):
+    assert start_time(*arguments) < START_LIMIT
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unwanted"),
+    [
+        (["--help"], {"torch", "numpy", "rich", "lark", "yaml", "PIL"}),
+        (["explain"], {"torch", "numpy", "rich", "lark", "yaml", "PIL"}),
+        (["check", "powderworld"], {"torch", "numpy", "rich", "PIL"}),
+        (["show", "powderworld"], {"torch", "numpy", "rich", "PIL"}),
+        (["compile", "powderworld", "--emit", "model"], {"torch", "numpy", "rich", "PIL"}),
+        (["compile", "powderworld", "--emit", "ir"], {"torch", "rich", "PIL"}),
+    ],
+)
+def test_commands_import_only_what_they_need(arguments, unwanted):
+    program = (
+        "import sys\nfrom powderdsl.cli import main\n"
+        f"try:\n    main({arguments!r})\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        f"print(sorted({unwanted!r} & sys.modules.keys()), file=sys.stderr)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], env=environment_with(), capture_output=True, text=True, check=True
+    )
+    assert run.stderr.splitlines()[-1] == "[]"
+
+
+def on_terminal(*arguments: str, interrupt: str = "", **environment: str) -> tuple[int, str]:
+    """The exit code, and what a terminal received. Ctrl-C is sent once `interrupt` has been seen."""
+    leader, follower = pty.openpty()
+    running = subprocess.Popen(
+        command_line(*arguments),
+        env=environment_with(TERM="xterm", **environment),
+        stdin=follower,
+        stdout=follower,
+        stderr=follower,
+        start_new_session=True,
+    )
+    os.close(follower)
+    received = b""
+    with os.fdopen(leader, "rb", buffering=0) as terminal:
+        while True:
+            try:
+                piece = terminal.read(65536)
+            except OSError:  # Linux says so when the other end has been closed
+                break
+            if not piece:
+                break
+            received += piece
+            if interrupt and interrupt.encode() in received:
+                interrupt = ""
+                running.send_signal(signal.SIGINT)
+    return running.wait(timeout=60), received.decode()
+
+
+SMALL = ("--backend", "reference", "--size", "8x8")
+
+
+def without_no_color() -> dict[str, str]:
+    return {"NO_COLOR": ""}
+
+
+def test_a_live_view_is_drawn_in_place():
+    status, shown = on_terminal("run", "life", *SMALL, "--steps", "3", "--watch", **without_no_color())
+    assert status == 0
+    assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h") == 1
+    assert re.search(r"life  step 3 of 3", shown)
+    assert "▀" in shown
+
+
+def test_a_live_view_can_be_interrupted():
+    status, shown = on_terminal(
+        "run", "life", *SMALL, "--steps", "1000000", "--watch", interrupt="step 2 ", **without_no_color()
+    )
+    assert status == 130
+    assert shown.rstrip().endswith("\x1b[?25h") or "\x1b[?25h" in shown[-40:]
+    assert "Traceback" not in shown
+
+
+def test_progress_is_shown_on_a_terminal_and_goes(tmp_path):
+    out = tmp_path / "x.npz"
+    status, shown = on_terminal("run", "life", *SMALL, "--steps", "400", "--out", str(out))
+    assert status == 0
+    assert "/400" in shown
+    assert shown.rstrip().endswith(f"-> {out}")
+
+
+def test_no_progress_elsewhere(tmp_path):
+    run = subprocess.run(
+        command_line("run", "life", *SMALL, "--steps", "3", "--out", str(tmp_path / "x.npz")),
+        env=environment_with(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout == ""
+    assert run.stderr.count("\n") == 1
+    assert "\x1b" not in run.stderr
+
+
+def test_diagnostics_are_coloured_on_terminals_only():
+    _, shown = on_terminal("check", "nonsense", **without_no_color())
+    assert "\x1b[31;1m" in shown
+    _, plain = on_terminal("check", "nonsense", NO_COLOR="1")
+    assert "\x1b" not in plain
+
+
+def test_pages_are_laid_out_on_terminals():
+    status, shown = on_terminal("explain", "PD301", **without_no_color())
+    assert status == 0
+    assert "\x1b[" in shown
+    assert "PD301" in shown
+
+
+@pytest.mark.parametrize("name", ["x.gif", "x.mp4"])
+def test_ctrl_c_leaves_nothing_behind(tmp_path, name):
+    if name.endswith("mp4"):
+        pytest.importorskip("imageio_ffmpeg")
+    with subprocess.Popen(
+        command_line("run", "life", *SMALL, "--steps", "100000000", "--out", str(tmp_path / name)),
+        env=environment_with(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as running:
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.iterdir()):
+            assert time.monotonic() < deadline, "no file was begun"
+            assert running.poll() is None, running.stderr.read()
+            time.sleep(0.05)
+        time.sleep(0.2)
+        running.send_signal(signal.SIGINT)
+        _, errors = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []

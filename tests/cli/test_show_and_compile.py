@@ -1,0 +1,195 @@
+"""`powderdsl show` and `powderdsl compile`: rules as tables and as text."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import powderdsl as package
+from powderdsl.compiler import shipped_rules
+from powderdsl.model.reactions import moved_ids, reactions, unchanging_ids
+from powderdsl.model.text import print_model, show_number, show_set
+from tests.cli.commands import PACK, ROOT, powderdsl
+
+RULESETS = ("powderworld", "life", "wireworld", "margolus", "forest_fire", "langtons_ant")
+
+
+@pytest.fixture(autouse=True)
+def _repository(monkeypatch):
+    """Places in shipped files are printed as seen from the repository."""
+    monkeypatch.chdir(ROOT)
+
+
+# show
+
+
+def test_show_lists_elements_reactions_passes_and_parameters():
+    lines = powderdsl("show", "powderworld").stdout.splitlines()
+    tables = [line for line in lines if line and not line.startswith(" ")]
+    assert [line.split()[0] for line in tables[2:]] == ["Elements", "Reactions", "Passes,", "Parameters"]
+    rules = package.load("powderworld")
+    for element in rules.elements:
+        row = next(line for line in lines if line.split()[:2] == [str(element.id), element.name])
+        assert element.color in row
+        assert element.pack in row
+    melting = next(line for line in lines if line.split()[:3] == ["ice", "water", "melt"])
+    assert "ice -> water if count(thaws) > 1 and interact < melt" in melting
+    assert "rules/water.yaml:" in melting
+    assert sum("moments" in line for line in lines) == 1
+    assert any(line.split()[:3] == ["water.melt", "2%", "chance"] for line in lines)
+
+
+def test_show_tells_values_that_were_set():
+    result = powderdsl("show", "powderworld", "--set", "water.melt=12.5%")
+    assert any(line.split()[:2] == ["water.melt", "12.5%"] for line in result.stdout.splitlines())
+
+
+def test_show_says_where_there_is_nothing():
+    lines = powderdsl("show", "core").stdout.splitlines()
+    assert lines[lines.index("Reactions") + 1] == "  none"
+
+
+@pytest.mark.parametrize("name", RULESETS)
+def test_show_as_json(name):
+    result = powderdsl("show", name, "--format", "json")
+    assert result.exit_code == 0
+    data, rules = json.loads(result.stdout), package.load(name)
+    assert [row["name"] for row in data["elements"]] == [element.name for element in rules.elements]
+    assert [row["name"] for row in data["passes"]] == [one.name for one in rules.passes]
+    assert [row["moments"] for row in data["passes"]] == [len(one.moments) for one in rules.passes]
+    assert {row["name"] for row in data["params"]} == {param.name for param in rules.params}
+    for row in data["reactions"]:
+        assert row["from"]
+        assert row["to"]
+        file, line = row["where"].rsplit(":", 1)
+        assert row["rule"].split()[0] in Path(file).read_text().splitlines()[int(line) - 1]
+
+
+# Reactions
+
+
+def names(rules, ids):
+    return {element.name for element in rules.elements if element.id in ids}
+
+
+def test_reactions_know_what_becomes_what():
+    rules = package.load("powderworld")
+    pairs = {
+        (before, after)
+        for one in reactions(rules)
+        for before in names(rules, one.before)
+        for after in names(rules, one.after)
+    }
+    assert ("ice", "water") in pairs
+    assert ("lava", "stone") in pairs
+    assert ("empty", "sand") in pairs  # out of a cloner
+    assert ("wood", "empty") in pairs  # eaten by acid
+    assert ("sand", "water") not in pairs
+    assert ("empty", "wall") in pairs
+    assert "wall" not in {before for before, _ in pairs}
+
+
+def test_what_moves_and_what_stays():
+    rules = package.load("powderworld")
+    assert "wall" not in names(rules, moved_ids(rules))
+    assert names(rules, unchanging_ids(rules)) == {"wall"}
+    assert moved_ids(package.load("life")) == frozenset()
+
+
+# Text
+
+
+@pytest.mark.parametrize("name", shipped_rules())
+def test_every_model_has_a_text(name):
+    try:
+        rules = package.load(name)
+    except package.CompileError:  # a pack that needs others
+        rules = package.load("core", "water", name)
+    text = print_model(rules)
+    assert text == print_model(rules)
+    assert text.endswith("\n")
+    assert not text.endswith("\n\n")
+    assert all(f"\npass {one.name} of {one.pack}  # " in text for one in rules.passes)
+    count = sum(len(moment.rules) for one in rules.passes for moment in one.moments)
+    lines = [
+        line for line in text.splitlines() if line.startswith("    ") and not line.startswith("    let ")
+    ]
+    assert len(lines) == count
+    assert all("# " in line for line in lines)
+
+
+def test_expressions_have_no_more_parentheses_than_they_need(tmp_path):
+    path = tmp_path / "grit.yaml"
+    condition = "(grit or wall) and not (above is wall) and (count(wall) + 1) * 2 - (3 - count(grit)) > 4"
+    path.write_text(PACK.replace("count(grit) == 1", condition))
+    text = print_model(package.load("core", path), ["grit"])
+    assert "(count((element in wall) in box) + 1) * 2 - (3 - count((element in grit) in box))" in text
+    assert "not above.element in wall and " in text
+
+
+def test_numbers_are_printed_exactly():
+    from fractions import Fraction
+
+    assert [show_number(value) for value in (1, 0.5, Fraction(1, 3), Fraction(1, 4), -2.0, 1e20)] == [
+        *("1", "0.5", "1/3", "0.25", "-2", "1e+20"),
+    ]
+
+
+def test_sets_are_printed_the_shorter_way_round():
+    rules = package.load("powderworld")
+    everything = [element.id for element in rules.elements]
+    assert show_set(rules, everything) == "any"
+    assert show_set(rules, everything[1:]) == "any but empty"
+    assert show_set(rules, everything[2:]) == "any but (empty, wall)"
+    assert show_set(rules, everything[:2]) == "(empty, wall)"
+    assert show_set(rules, everything[:1]) == "empty"
+
+
+# compile
+
+
+@pytest.mark.parametrize("stage", ["tree", "model", "ir", "kernels"])
+def test_every_stage_can_be_printed(stage, tmp_path):
+    result = powderdsl("compile", "powderworld", "--emit", stage)
+    assert result.exit_code == 0
+    assert "rules/water.yaml" in result.stdout
+    one = powderdsl("compile", "powderworld", "--emit", stage, "--pass", "melt")
+    assert len(one.stdout) < len(result.stdout) / 5
+    assert "rules/water.yaml" in one.stdout
+    out = tmp_path / "out.txt"
+    assert powderdsl("compile", "powderworld", "--emit", stage, "-o", out).stdout == ""
+    assert out.read_text() == result.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["out.txt"]
+
+
+def test_trees_show_rules_as_parsed():
+    result = powderdsl("compile", "core+water", "--emit", "tree", "--pass", "melt")
+    heading = "rule: ice -> water if count(thaws) > 1 and interact < melt  # rules/water.yaml:"
+    assert heading in result.stdout
+    assert "      transform\n        name ice\n        name water\n        condition\n" in result.stdout
+
+
+def test_trees_can_be_had_of_rules_that_are_wrong(tmp_path):
+    path = tmp_path / "grit.yaml"
+    path.write_text(PACK.replace("-> empty", "-> nothing_known"))
+    assert powderdsl("compile", f"core+{path}", "--emit", "tree").exit_code == 0
+    result = powderdsl("compile", f"core+{path}", "--emit", "model", "-o", tmp_path / "out.txt")
+    assert result.exit_code == 2
+    assert "PD301" in result.stderr
+    assert not (tmp_path / "out.txt").exists()
+
+
+@pytest.mark.parametrize("stage", ["tree", "model", "ir", "kernels"])
+def test_an_unknown_pass_gets_a_suggestion(stage):
+    result = powderdsl("compile", "powderworld", "--emit", stage, "--pass", "mlt")
+    assert result.exit_code == 2
+    assert "no pass `mlt`; did you mean `melt`?" in result.stderr
+
+
+def test_output_that_cannot_be_written(tmp_path):
+    for out in (tmp_path / "none" / "x", tmp_path):
+        result = powderdsl("compile", "core", "--emit", "tree", "-o", out)
+        assert result.exit_code == 2
+        assert "PD613" in result.stderr

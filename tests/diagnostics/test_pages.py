@@ -1,0 +1,278 @@
+"""Every diagnostic code has a page, every page's examples do what the page says, and every code is raised.
+
+A page has a wrong example and, mostly, the mended one:
+
+* ``yaml wrong`` and ``yaml right`` are rule files; a first line ``# with: core`` names packs to load beside them.
+* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, both read with the rules of Powderworld.
+* ``text`` is the message itself, for what no file can show; `SITUATIONS` brings it about.
+
+The text under the caret stands in the example, in a comment ``# ^ text`` below it.
+"""
+
+from __future__ import annotations
+
+import builtins
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import powderdsl
+from powderdsl.compiler import load_with_diagnostics
+from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
+from powderdsl.diagnostics.explain import page
+from powderdsl.diagnostics.render import render_text
+from powderdsl.worlds.ascii import read_ascii
+from powderdsl.worlds.files import replacing
+from powderdsl.worlds.image import read_image
+from powderdsl.worlds.scene import find_scene, load_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ROOT / "powderdsl" / "diagnostics" / "pages"
+GOLDEN = Path(__file__).with_name("golden")
+WITHOUT_COMMENT = {"PD610": "!", "PD611": "..ss."}
+"""The text under the caret where the example has no room for a comment."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """A fenced block of a page: what follows the fence (``yaml wrong``), and its text."""
+
+    info: str
+    text: str
+
+    @property
+    def caret(self) -> str | None:
+        """The text that the page promises under the caret."""
+        found = re.search(r"^.*# .*\^ (.*)$", self.text, re.MULTILINE)
+        return found[1] if found else None
+
+    @property
+    def packs(self) -> list[str]:
+        found = re.match(r"# with: (\S+)\n", self.text)
+        return [found[1]] if found else []
+
+
+def examples(code: str) -> list[Example]:
+    return [Example(*found) for found in re.findall(r"^```(.+)\n((?:.*\n)*?)```$", page(CODES[code]), re.MULTILINE)]
+
+
+def example(code: str, word: str) -> Example | None:
+    """The wrong or the right example of a page; the bare message for ``message``."""
+    for one in examples(code):
+        if word in one.info.split() or (word == "message" and one.info == "text"):
+            return one
+    return None
+
+
+WRONG = {code: one for code in CODES if (one := example(code, "wrong"))}
+RIGHT = {code: one for code in CODES if (one := example(code, "right"))}
+MESSAGES = {code: one for code in CODES if (one := example(code, "message"))}
+
+
+@cache
+def paper_rules():  # type: ignore[no-untyped-def]
+    return powderdsl.load("powderworld")
+
+
+def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
+    """What loading an example says, errors or not. It is loaded as `page.yaml` of the working directory."""
+    path = Path("page.yaml")
+    path.write_text(one.text, encoding="utf-8")
+    try:
+        if "scene" in one.info.split():
+            load_scene(path, paper_rules())
+            return ()
+        if "world" in one.info.split():
+            read_ascii(one.text, paper_rules().elements, name="page.txt")
+            return ()
+        return load_with_diagnostics(*one.packs, path)[1]
+    except CompileError as error:
+        return error.diagnostics
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+# The lock: codes, pages, examples, and the places that raise them
+
+
+def test_every_code_has_a_page_and_every_page_a_code() -> None:
+    assert {path.stem for path in PAGES.glob("*")} == set(CODES)
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_a_page_starts_with_its_code_and_shows_what_is_wrong(code: str) -> None:
+    text = page(CODES[code])
+    assert text.startswith(f"# {code}: {CODES[code].slug}\n\n")
+    assert (code in WRONG) != (code in MESSAGES)
+    assert (code in RIGHT) == (code in WRONG)
+    assert all(len(line) <= 120 or line.startswith(" ") for line in text.splitlines()), "too wide for a terminal"
+
+
+def raised_codes() -> set[str]:
+    """Codes in string literals of the package, besides the table's."""
+    found: set[str] = set()
+    for path in (ROOT / "powderdsl").rglob("*.py"):
+        if path.name != "codes.py":
+            found |= set(re.findall(r'"(PD\d+)"', path.read_text(encoding="utf-8")))
+    return found
+
+
+def test_every_code_is_raised_somewhere_and_every_raised_code_is_in_the_table() -> None:
+    assert raised_codes() == set(CODES)
+
+
+def test_slugs_are_words_and_differ() -> None:
+    slugs = [row.slug for row in CODES.values()]
+    assert len(set(slugs)) == len(slugs)
+    assert all(re.fullmatch(r"[a-z]+(-[a-z]+)*", slug) for slug in slugs)
+
+
+# The examples
+
+
+@pytest.mark.parametrize("code", WRONG)
+def test_a_wrong_example_gives_its_code_and_nothing_else(code: str) -> None:
+    found = diagnostics_of(WRONG[code])
+    if CODES[code].severity is not Severity.NOTE:
+        found = tuple(one for one in found if one.severity is not Severity.NOTE)
+    else:
+        found = tuple(one for one in found if one.code == code or one.severity is not Severity.NOTE)
+    assert [one.code for one in found] == [code]
+    span = found[0].primary.span
+    assert span is not None
+    caret = WITHOUT_COMMENT.get(code) or WRONG[code].caret
+    if caret is not None:
+        assert span.text.split("\n")[0] == caret
+
+
+@pytest.mark.parametrize("code", WRONG)
+def test_a_wrong_example_says_where(code: str) -> None:
+    assert code in WITHOUT_COMMENT or code in {"PD505", "PD507"} or WRONG[code].caret is not None
+
+
+@pytest.mark.parametrize("code", RIGHT)
+def test_a_right_example_has_no_errors_or_warnings(code: str) -> None:
+    found = [render_text(one) for one in diagnostics_of(RIGHT[code]) if one.severity is not Severity.NOTE]
+    assert found == []
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("code", WRONG)
+def test_the_message_of_a_wrong_example(code: str, golden: Callable[[Path, str], None]) -> None:
+    found = [one for one in diagnostics_of(WRONG[code]) if one.code == code]
+    golden(GOLDEN / f"{code}.txt", "\n\n".join(map(render_text, found)) + "\n")
+
+
+# Messages that no file can show
+
+
+def save_a_world_of_more_elements() -> None:
+    full, less = powderdsl.load("powderworld"), powderdsl.load("powderworld-gas")
+    element = full.element("gas")
+    assert element is not None
+    simulator = powderdsl.compile(full, backend="reference")
+    powderdsl.save(simulator.world([[[element.id]]]), "yard.npz")
+    powderdsl.load_world("yard.npz", powderdsl.compile(less, backend="reference"))
+
+
+def read_a_soft_picture() -> None:
+    pixels = np.full((4, 4, 3), (0xF3, 0xC2, 0x3A), dtype=np.uint8)
+    pixels[0, 3] = pixels[1:, 0] = pixels[3] = pixels[2, 1:] = (0xF3, 0xC2, 0x3B)
+    pixels[1, 1] = (0xF3, 0xC2, 0x3B)
+    Image.fromarray(pixels).save("yard.png")
+    read_image("yard.png", paper_rules().elements)
+
+
+def write_a_film_without_the_package() -> None:
+    from powderdsl.media import write_mp4
+
+    imports = builtins.__import__
+
+    def refuse(name, *rest):  # type: ignore[no-untyped-def]
+        if name == "imageio_ffmpeg":
+            raise ImportError(name)
+        return imports(name, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(builtins, "__import__", refuse)
+        write_mp4("yard.mp4", [np.zeros((2, 2, 3), dtype=np.uint8)])
+
+
+def read_a_large_file() -> None:
+    Path("rules").mkdir()
+    Path("rules/everything.yaml").write_bytes(b" " * (4 * (1 << 20) + 1))
+    powderdsl.load("rules/everything.yaml")
+
+
+def read_text_as_a_picture() -> None:
+    Path("yard.png").write_text("no picture", encoding="utf-8")
+    read_image("yard.png", paper_rules().elements)
+
+
+def write_into_no_folder() -> None:
+    with replacing(Path("out/yard.gif")):
+        pass
+
+
+SITUATIONS: dict[str, Callable[[], object]] = {
+    "PD101": lambda: powderdsl.load("rules/snd.yaml"),
+    "PD102": read_a_large_file,
+    "PD601": lambda: find_scene("gardn"),
+    "PD602": read_text_as_a_picture,
+    "PD603": save_a_world_of_more_elements,
+    "PD609": read_a_soft_picture,
+    "PD612": write_a_film_without_the_package,
+    "PD613": write_into_no_folder,
+    "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
+}
+"""How to bring about each message that a page shows."""
+
+SYSTEM_WORDS = re.compile(r"^  = note: .*", re.MULTILINE)
+"""Notes quote other programs, whose words change."""
+
+
+def test_every_message_has_a_situation() -> None:
+    assert set(MESSAGES) == {*SITUATIONS, "PD901"}
+
+
+@pytest.mark.parametrize("code", SITUATIONS)
+def test_a_page_shows_the_message_as_it_is(code: str) -> None:
+    with pytest.raises(CompileError) as caught:
+        SITUATIONS[code]()
+    (found,) = caught.value.diagnostics
+    shown = SYSTEM_WORDS.sub("", MESSAGES[code].text)
+    assert SYSTEM_WORDS.sub("", render_text(found) + "\n") == shown
+    assert ("= note" in MESSAGES[code].text) == bool(found.notes)
+
+
+def test_an_internal_error_reads_as_its_page_says(capsys: pytest.CaptureFixture[str]) -> None:
+    from powderdsl.cli.exits import report_failure
+
+    report_failure(IndexError("list index out of range"))
+    shown = SYSTEM_WORDS.sub("", MESSAGES["PD901"].text)
+    assert SYSTEM_WORDS.sub("", capsys.readouterr().err) == shown
+
+
+# The tests themselves
+
+
+def test_a_wrong_promise_is_noticed() -> None:
+    one = Example("yaml wrong", WRONG["PD301"].text.replace("^ weeed", "^ weed"))
+    (found,) = diagnostics_of(one)
+    assert found.primary.span is not None
+    assert found.primary.span.text != one.caret
+
+
+def test_golden_files_are_those_of_codes() -> None:
+    with suppress(FileNotFoundError):
+        assert {path.stem for path in GOLDEN.iterdir() if not path.name.startswith(".")} == set(WRONG)
