@@ -1,4 +1,6 @@
-"""Tables of README.md and docs/*.md that follow from the package: `python docs/generate.py`, or `--check` to compare.
+"""Tables of README.md and docs/*.md that follow from the package.
+
+`python docs/generate.py` writes them, `--check` names the pages that are stale.
 
 A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is between them is written anew.
 """
@@ -7,7 +9,9 @@ from __future__ import annotations
 
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
@@ -24,8 +28,10 @@ from powderdsl.model.builtins import (
     MAX_OFFSET,
     RESERVED,
 )
+from powderdsl.model.compose import MAX_PASSES
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
+from powderdsl.model.expressions import MAX_ROUNDS, MAX_SET_DEPTH
 from powderdsl.model.schema import KEYS, MAX_NAME, OPEN
 from powderdsl.model.text import show_offset
 from powderdsl.model.types import Kernel
@@ -111,7 +117,7 @@ def kinds() -> str:
 def words() -> str:
     """Every word that no definition may take."""
     listed = sorted(RESERVED | reserved_words() | {"elements"})
-    return ", ".join(f"`{word}`" for word in listed) + ".\n"
+    return textwrap.fill(", ".join(f"`{word}`" for word in listed) + ".", width=120) + "\n"
 
 
 def limits() -> str:
@@ -126,7 +132,10 @@ def limits() -> str:
         ("distance of a neighbour, in cells", MAX_OFFSET),
         ("size of a number", MAX_MAGNITUDE),
         ("modulus of `mod`", 64),
-        ("rounds of one loop", 64),
+        ("rounds of `repeat`, or of one variable's range", 64),
+        ("rounds of one loop over several variables", MAX_ROUNDS),
+        ("sets that are defined by each other, in a row", MAX_SET_DEPTH),
+        ("passes of a ruleset", MAX_PASSES),
         ("moments of a pass", MAX_MOMENTS),
         ("rules of a ruleset, loops unrolled", MAX_RULES),
         ("side of a world in a test", MAX_SIDE),
@@ -152,7 +161,8 @@ def stages() -> str:
 
 
 def commands() -> str:
-    return table(("command", "what it does"), [(f"`powderdsl {name}`", about) for name, (_, about) in COMMANDS.items()])
+    rows = [(f"`powderdsl {name}`", about) for name, (_, about) in COMMANDS.items()]
+    return table(("command", "what it does"), rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -166,7 +176,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "shipped": shipped,
     "stages": stages,
     "commands": commands,
-    **{f"keys {context}": (lambda context=context: keys(context)) for context in KEYS},
+    **{f"keys {context}": partial(keys, context) for context in KEYS},
 }
 """What can stand between markers, by name."""
 

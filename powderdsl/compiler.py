@@ -179,6 +179,8 @@ def read_source(path: Path, reporter: Reporter) -> Source | None:
 
 def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) -> Ruleset:
     """The ruleset with other parameter values, checked against their kinds."""
+    if not isinstance(values, Mapping):
+        raise TypeError(f"params takes a mapping from names to values, found {type(values).__name__}")
     known = {param.name: param for param in ruleset.params}
     found: dict[str, Value] = {}
     for name, value in values.items():
@@ -202,7 +204,10 @@ def param_value(param: Param, value: Any) -> Value:
             value = words[text] if text in words else float(text[:-1]) / 100 if text.endswith("%") else float(text)
         except ValueError:
             raise ValueError(f"`{text}` is not a number") from None
-    number = float(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{value!r} is not a number") from None
     lo, hi = (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
     if not lo <= number <= hi:
         raise ValueError(f"{number:g} lies outside {lo:g}..{hi:g}")
@@ -234,6 +239,8 @@ def compile(ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu") 
     from powderdsl.simulator import Simulator
 
     model = load(ruleset) if isinstance(ruleset, str) else ruleset
+    if not isinstance(model, Ruleset):
+        raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
     if backend not in BACKENDS:
         reporter = Reporter()
         reporter.error("PD701", f"no backend `{backend}`", None, helps=["backends: " + ", ".join(BACKENDS)])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -76,6 +77,7 @@ class Simulator:
         self.device = find_device(device)
         self._slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._program = make_program(ruleset, backend, self.device)
+        self._defaults: tuple[int, dict[str, Tensor]] | None = None
         self._known = torch.zeros(256, dtype=torch.bool, device=self.device)
         self._known[[element.id for element in ruleset.elements]] = True
 
@@ -107,9 +109,7 @@ class Simulator:
         Raises:
             TypeError: ids are no integers. ValueError: wrong shape, or ids that the ruleset does not have.
         """
-        tensor = self._tensor(ids, "ids")
-        if tensor.dtype.is_floating_point or tensor.dtype.is_complex:
-            raise TypeError(f"ids must be integers, found {tensor.dtype}")
+        tensor = self._integers(ids, "ids")
         if tensor.ndim == 2:
             tensor = tensor[None]
         if tensor.ndim != 3 or 0 in tensor.shape:
@@ -154,16 +154,22 @@ class Simulator:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
 
     def _tensor(self, value: Any, name: str) -> Tensor:
+        flags = getattr(value, "flags", None)
+        if getattr(flags, "writeable", True) is False:
+            value = value.copy()  # torch warns of arrays that it could write to and may not
         try:
             return torch.as_tensor(value, device=self.device)
-        except (TypeError, ValueError, RuntimeError) as error:
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
 
+    def _integers(self, value: Any, name: str) -> Tensor:
+        tensor = self._tensor(value, name)
+        if tensor.dtype.is_floating_point or tensor.dtype.is_complex or tensor.dtype == torch.bool:
+            raise TypeError(f"{name} must be integers, found {tensor.dtype}")
+        return tensor
+
     def _numbers(self, value: Any, name: str, batch: int) -> Tensor:
-        try:
-            tensor = torch.as_tensor(list(value) if isinstance(value, range) else value, dtype=torch.int64, device=self.device)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise TypeError(f"{name} must be whole numbers below 2⁶³: {' '.join(str(error).split())}") from None
+        tensor = self._integers(list(value) if isinstance(value, range) else value, name).to(torch.int64)
         if tensor.ndim == 0:
             tensor = tensor.expand(batch)
         if tensor.shape != (batch,) or bool((tensor < 0).any()):
@@ -205,7 +211,8 @@ class Simulator:
         """
         state = dict(world.state)
         if "ids" in fields or "element" in fields:
-            ids = self._shaped(fields.pop("ids", None) if "ids" in fields else fields.pop("element"), "ids", world.shape, False)
+            given = fields.pop("ids", None) if "ids" in fields else fields.pop("element")
+            ids = self._shaped(self._integers(given, "ids"), "ids", world.shape, False)
             self._check_ids(ids, "ids")
             element = ids.to(torch.uint8)
             fresh = self.world(element).state
@@ -237,6 +244,8 @@ class Simulator:
     def _checked(self, slot: Slot, value: Any, ids: Tensor) -> Tensor:
         tensor = self._shaped(value, slot.name, tuple(ids.shape), slot.planes == 2)
         kind = slot.kind
+        if tensor.dtype.is_complex:
+            raise TypeError(f"{slot.name} takes real numbers, found {tensor.dtype}")
         if slot.is_real:
             if not bool(torch.isfinite(tensor).all()):
                 raise ValueError(f"{slot.name} has values that are not finite")
@@ -337,10 +346,18 @@ class Simulator:
         Raises:
             KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
         """
+        if not isinstance(world, World):
+            raise TypeError(f"world must be a World, found {type(world).__name__}")
+        if isinstance(passes, str):
+            raise TypeError(f"passes takes a list of names: [{passes!r}]")
+        for name, given in (("random", random), ("params", params)):
+            if given is not None and not isinstance(given, Mapping):
+                raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
         if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
             raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
-        if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
+        if not isinstance(steps, Integral) or isinstance(steps, bool) or steps < 0:
             raise ValueError(f"steps must be a whole number of 0 or more, found {steps!r}")
+        steps = int(steps)
         unknown = [name for name in passes or () if name not in self.passes]
         if unknown:
             raise KeyError(f"no pass `{unknown[0]}`; {'; '.join(suggest(unknown[0], self.passes, 'passes'))}")
@@ -364,10 +381,20 @@ class Simulator:
             draws[name] = (tensor * float(1 << bits[name])).floor().to(torch.int64)
         return draws
 
+    def _default_params(self, batch: int) -> dict[str, Tensor]:
+        """The defaults as [B] tensors; the same tensors for the same batch size, which programs may rely on."""
+        if self._defaults is None or self._defaults[0] != batch:
+            values = {
+                param.name: torch.full((batch,), float(param.default), dtype=torch.float64, device=self.device)  # type: ignore[arg-type]
+                for param in self.ruleset.params
+            }
+            self._defaults = (batch, values)
+        return self._defaults[1]
+
     def _params(self, params: Mapping[str, Any], batch: int) -> dict[str, Tensor]:
         """All parameters as float64 [B] tensors."""
         known = {param.name: param for param in self.ruleset.params}
-        values = {name: torch.full((batch,), float(param.default), dtype=torch.float64, device=self.device) for name, param in known.items()}  # type: ignore[arg-type]
+        values = dict(self._default_params(batch))
         for name, value in params.items():
             if name not in known:
                 raise KeyError(f"no parameter `{name}`; {'; '.join(suggest(name, known, 'parameters'))}")

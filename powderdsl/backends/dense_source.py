@@ -87,7 +87,8 @@ class _Writer:
             case "mod":
                 return f"torch.remainder({args[0]}, {attr})"
             case "sqrt":
-                return f"torch.sqrt({args[0]})"
+                # torch's float32 square root is not always rounded correctly on CPUs; from float64 it is.
+                return f"torch.sqrt({args[0]}.double()).float()"
             case "to_real":
                 return f"{args[0]}.float()"
             case "settle":

@@ -25,10 +25,12 @@ static Context* new_context(const Grid& g) {
   c->g = g;
   int rest = g.width - 64 * (g.words - 1);
   c->valid_last = splat(rest == 64 ? ~0ull : (1ull << rest) - 1);
-  for (int y = -HALO; y < g.height + HALO; y++) c->wrapped.push_back(((y % g.height) + g.height) % g.height * g.words);
+  for (int y = -HALO; y < g.height + HALO; y++) {
+    c->lines.push_back(((y % g.height) + g.height) % g.height);
+    c->wrapped.push_back(c->lines.back() * g.words);
+  }
   for (int dx = -HALO; dx <= HALO; dx++) c->turn[dx + HALO] = ((dx % g.width) + g.width) % g.width;
-  c->nothing = new_plane(g);
-  c->nothing->refs = 1;
+  c->nothing = new Plane{aligned<V>(g.cells()), 1, true};
   c->nothing_row = aligned<V>(g.words);
   c->zeros = aligned<float>(g.stride + CHUNK);
   for (const FixedPlane& f : FIXED) {
@@ -41,9 +43,9 @@ static Context* new_context(const Grid& g) {
   return c;
 }
 static void free_context(Context* c) {
-  for (Plane* p : c->planes) drop(p);
-  for (Field* f : c->fields) drop(f);
-  drop(c->nothing);
+  for (Plane* p : c->planes) drop(c->g, p);
+  for (Field* f : c->fields) drop(c->g, f);
+  release(c->nothing);
   free(c->nothing_row);
   free(c->zeros);
   for (V* p : c->fixed) free(p);
@@ -76,7 +78,7 @@ static void put_back(Context* c) {
 static void own(Context& c, Plane*& p) {  // a plane of this group alone
   if (p != c.nothing && p->refs == 1) return;
   Plane* copy = take(c);
-  memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
+  if (!p->zero) memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
   copy->zero = p->zero;
   give(c, p);
   p = copy;
@@ -135,7 +137,13 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
     for (int i = 0; i < PARAM_REALS; i++) c.param_real[i][l] = reals[(size_t)i * b.worlds + world];
   }
   Group& group = b.groups[number];
-  for (int i = 0; i < SLOTS; i++) c.slot[i] = group.slot[i];
+  for (int i = 0; i < SLOTS; i++) {
+    c.slot[i] = group.slot[i];
+    if (c.slot[i]->zero) {  // an empty plane of a batch may hold anything
+      give(c, c.slot[i]);
+      c.slot[i] = keep(c.nothing);
+    }
+  }
   for (int i = 0; i < REALS; i++) c.real[i] = group.real[i];
   for (long s = 0; s < steps; s++) {
     begin_step(c, k, first, s);
@@ -245,7 +253,7 @@ template <class T> static void store_values(const Batch& b, int slot, int bits, 
 API void* pd_new(int worlds, int height, int width) {
   Batch* b = new Batch{make_grid(height, width), worlds, std::vector<Group>((worlds + LANES - 1) / LANES)};
   for (Group& group : b->groups) {
-    for (int i = 0; i < SLOTS; i++) group.slot[i] = new_plane(b->g), group.slot[i]->refs = 1;
+    for (int i = 0; i < SLOTS; i++) group.slot[i] = new_plane(b->g), group.slot[i]->refs = 1, group.slot[i]->zero = true;
     for (int i = 0; i < REALS; i++) group.real[i] = new_field(b->g), group.real[i]->refs = 1;
   }
   return b;
@@ -253,8 +261,8 @@ API void* pd_new(int worlds, int height, int width) {
 API void pd_free(void* batch) {
   Batch* b = (Batch*)batch;
   for (Group& group : b->groups) {
-    for (int i = 0; i < SLOTS; i++) drop(group.slot[i]);
-    for (int i = 0; i < REALS; i++) drop(group.real[i]);
+    for (int i = 0; i < SLOTS; i++) drop(b->g, group.slot[i]);
+    for (int i = 0; i < REALS; i++) drop(b->g, group.real[i]);
   }
   delete b;
 }
@@ -331,3 +339,9 @@ API void pd_run(void* batch, int64_t steps, int threads, const u64* seed, const 
   std::lock_guard<std::mutex> hold(pool_use);
   pool().run(count, task);
 }
+#if defined(PROFILE)
+API void pd_profile(double* seconds) {
+  memcpy(seconds, pass_seconds, sizeof(double) * PASSES);
+  memset(pass_seconds, 0, sizeof(pass_seconds));
+}
+#endif

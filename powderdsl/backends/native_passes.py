@@ -7,31 +7,74 @@ from dataclasses import dataclass, field
 
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_loops import ANCHORS, DRAWS, Loop, is_clean, is_uniform, prerequisites
-from powderdsl.backends.native_sweeps import RECOMPUTE, Sweep, quiet, real_cost, rows_read, sweep_needs
+from powderdsl.backends.native_sweeps import Sweep, leading, quiet, rows_read, stored_parts, sweep_needs, unchanged
 from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, walk
 
 _VARIABLE = re.compile(r"\b[pf][0-9]+\b")
 
 
+@dataclass(frozen=True)
+class Lanes:
+    """A sweep: what comes before, the rows of one world `l`, what comes after; and the fields it writes."""
+
+    before: str
+    rows: str
+    after: str
+    fields: tuple[str, ...]
+
+
 @dataclass
 class Block:
-    """Statements of a scope, each one string; variables they define are released after their last use."""
+    """Statements of a scope; variables they define are released after their last use."""
 
-    statements: list[str] = field(default_factory=list)
+    statements: list[str | Lanes] = field(default_factory=list)
     defined: list[str] = field(default_factory=list)
 
-    def text(self, kept: set[str]) -> str:
-        """The statements with releases. `kept` outlive the block."""
+    def text(self) -> str:
+        """The statements with releases."""
+        statements = self._joined()
         last: dict[str, int] = {}
-        for i, statement in enumerate(self.statements):
+        for i, statement in enumerate(statements):
             for name in _VARIABLE.findall(statement):
                 last[name] = i
         lines = []
-        own = set(self.defined) - kept
-        for i, statement in enumerate(self.statements):
+        for i, statement in enumerate(statements):
             lines.append(statement)
-            lines += [f"give(c, {name});" for name in sorted(own) if last.get(name) == i]
+            lines += [f"give(c, {name});" for name in sorted(set(self.defined)) if last.get(name) == i]
         return "\n".join(lines)
+
+    def _joined(self) -> list[str]:
+        """Sweeps that follow each other become one loop over worlds: what one world needs stays in the cache."""
+        result: list[str] = []
+        i = 0
+        while i < len(self.statements):
+            run: list[Lanes] = []
+            while i < len(self.statements) and isinstance(item := self.statements[i], Lanes):
+                run.append(item)
+                i += 1
+            if run:
+                outside = " ".join(_all_text(s) for s in (*self.statements[: i - len(run)], *self.statements[i:]))
+                seen_outside = set(_VARIABLE.findall(outside))
+                result.append(_lane_loop(run, seen_outside))
+            else:
+                result.append(self.statements[i])  # type: ignore[arg-type]
+                i += 1
+        return result
+
+
+def _all_text(statement: str | Lanes) -> str:
+    return statement if isinstance(statement, str) else " ".join((statement.before, statement.rows, statement.after))
+
+
+def _lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
+    """One loop over worlds. Fields that nothing else reads are written over by each world: they need one lane."""
+    written = {name for sweep in run for name in sweep.fields}
+    used = sorted({name for sweep in run for name in _VARIABLE.findall(sweep.rows) if name.startswith("f")})
+    places = " ".join(f"const int l{name} = {'0' if name in written - seen_outside else 'l'};" for name in used)
+    before = "\n".join(sweep.before for sweep in run)
+    rows = "\n".join(f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}" for sweep in run)
+    after = "\n".join(sweep.after for sweep in run)
+    return f"{before}\nfor (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
 
 
 class PassWriter:
@@ -49,7 +92,8 @@ class PassWriter:
         self.all_comparisons = [n for n in nodes if n.op in ("eq", "lt", "le")]
         nothing = lambda node: node.op == "input"  # noqa: E731
         sources = [n.args[0] for n in nodes if n.op == "shift" and n.type == REAL]
-        self.stored = {id(n) for n in sources if n.op != "input" and real_cost(n, nothing) > RECOMPUTE}
+        self.stored = {id(part) for n in sources for part in stored_parts(n, nothing) if part.op != "input"}
+        self.leaders = {id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))}
         self.slot_of = {id(n): str(n.attr) for n in nodes if n.op == "input"}
 
     def source(self) -> str:
@@ -58,8 +102,7 @@ class PassWriter:
             self.moment(step, current)
             current.update(step.writes)
         self.finish()
-        kept: set[str] = set()
-        body = self.block.text(kept)
+        body = self.block.text()
         return f"// pass {self.number}\nOUTLINE void pass_{self.number}(Context& c) {{\nconst int words = c.g.words, height = c.g.height, width = c.g.width; (void)words; (void)height; (void)width;\n{body}\n}}"
 
     # Variables
@@ -121,7 +164,7 @@ class PassWriter:
         inner_names = {id(node): self.planes[id(node)] for _, node in writes}
         for key, name in names.items():
             self.block.statements.append(f"{name} = keep({inner_names[key]});")
-        text = self.block.text(set())
+        text = self.block.text()
         self.planes, self.fields, self.block = outer
         declared = ", ".join(f"*{name}" for name in dict.fromkeys(names.values()))
         otherwise = " ".join(f"{name} = keep({olds[key]});" for key, name in names.items())
@@ -216,7 +259,7 @@ class PassWriter:
             f"{takes}\nfor (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) {{ const V valid = c.valid(w); (void)valid;\n"
             + "\n".join(lines) + f"\n}}\n{ends}"
         )  # fmt: skip
-        text = self.block.text(set())
+        text = self.block.text()
         self.planes, self.fields, self.block = outer
         declared = ", ".join(f"*{name}" for name in names.values())
         otherwise = " ".join(f"{name} = keep(c.nothing);" for name in names.values())
@@ -267,7 +310,7 @@ class PassWriter:
     def direct_needs(self, node: Node) -> list[Node]:
         if node.type == REAL or node.op in ("eq", "lt", "le"):
             flags, reals = sweep_needs(node, self.have)
-            return [*(f for f in flags if f.op != "param"), *reals]
+            return [*flags, *reals]
         if node.op in ("swap", "arrive"):
             content, movers, rest = node.args
             return [arg for arg in (content, movers, rest) if not self.have(arg)]
@@ -341,6 +384,9 @@ class PassWriter:
 
     def sweep(self, nodes: list[Node]) -> None:
         """Compute reals and comparisons for each world, row by row; rows where nothing is going on are skipped."""
+        # A comparison that others are asked only together with comes before them.
+        leaders = {id(leader) for leader in self.leaders.values()}
+        nodes = sorted(nodes, key=lambda n: (n.type != REAL, id(n) not in leaders))
         values, masks, _ = quiet(nodes, self.have)
         sweep = Sweep(self.planes, self.fields, self.layout)
         outputs = []
@@ -350,24 +396,23 @@ class PassWriter:
                 outputs.append((node, name, sweep.value(node)))
             else:
                 name = self.fresh("p")
-                a, b = (sweep.value(arg) for arg in node.args)
-                operator = {"eq": "==", "lt": "<", "le": "<="}[node.op]
-                outputs.append((node, name, f"bits_of({a} {operator} {b})"))
+                outputs.append((node, name, sweep.comparison(node, self.leaders)))
         takes, row_start, stores, word_end, row_end, quiet_row = [], [], [], [], [], []
         for position, (node, name, value) in enumerate(outputs):
             if node.type == REAL:
                 takes.append(f"Field* {name} = take_field(c);")
-                row_start.append(f"float* o{name} = {name}->data + ((size_t)l * height + y) * c.g.stride + HALO; u32 n{name} = 0;")
+                row_start.append(f"float* o{name} = {name}->data + ((size_t)l{name} * height + y) * c.g.stride + HALO; u32 n{name} = 0;")
                 stores.append(f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= bits_of(o != splatf(0)) & inside; }}")
-                row_end.append(f"finish_row(c, o{name}); {name}->live[l * height + y] = n{name} != 0;")
-                quiet_row.append(f"{name}->live[l * height + y] = 0;")
+                row_end.append(f"finish_row(c, o{name}); {name}->live[l{name} * height + y] = n{name} != 0;")
+                quiet_row.append(f"{name}->live[l{name} * height + y] = 0;")
             else:
                 takes.append(f"Plane* {name} = take(c); u64 a{name} = 0;")
                 row_start.append(f"u64 u{name} = 0;")
                 stores.append(f"u{name} |= (u64)({value}) << (x & 63);")
-                word_end.append(f"((u64*){name}->data)[(y * words + w) * LANES + l] = u{name} & c.valid(w)[l]; a{name} |= u{name} & c.valid(w)[l]; u{name} = 0;")
                 rest = bool(values[position]) if values else False
-                quiet_row.append(f"for (int w = 0; w < words; w++) {{ const u64 q = {'c.valid(w)[l]' if rest else '0'}; ((u64*){name}->data)[(y * words + w) * LANES + l] = q; a{name} |= q; }}")
+                word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q; a{name} |= q;"
+                word_end.append(f"{{ const u64 q = u{name} & c.valid(w)[l]; {word} u{name} = 0; }}")
+                quiet_row.append(f"for (int w = 0; w < words; w++) {{ const u64 q = {'c.valid(w)[l]' if rest else '0'}; {word} }}")
         ends = " ".join(f"{name}->zero = !a{name};" for node, name, _ in outputs if node.type != REAL)
         pads = " ".join(
             f"for (int l = c.lanes; l < LANES; l++) for (int i = 0; i < height * words; i++) ((u64*){name}->data)[i * LANES + l] = 0;"
@@ -375,7 +420,8 @@ class PassWriter:
             for node, name, _ in outputs
         )  # fmt: skip
         rows = " ".join(f"const float* {name} = {call};" for call, name in sweep.rows.items())
-        words = " ".join(f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];" for plane, name in sweep.words.items())
+        words = [f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];" for plane, name in sweep.words.items()]
+        words += [f"const u64 {name} = {joined};" for joined, name in sweep.joined.items()]
         check = ""
         if values is not None:
             busy = [self.busy(node, dy, wraps) for node, dy, wraps in rows_read(nodes, self.have)]
@@ -383,23 +429,37 @@ class PassWriter:
             scan = f"for (int w = 0; w < words; w++) some |= {' | '.join(gates)};" if gates else ""
             fixed = "true" if any(m.op == "param" for m in masks) else " || ".join(busy) or "false"
             check = f"{{ u64 some = ({fixed}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet_row)} continue; }} }}"
-        body = "\n".join(sweep.lines)
-        self.block.statements.append(
-            f"{' '.join(takes)}\n{pads}\nfor (int l = 0; l < c.lanes; l++) for (int y = 0; y < height; y++) {{\n{check}\n{rows} {' '.join(row_start)}\n"
-            f"for (int w = 0; w < words; w++) {{ {words}\nfor (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {{\n"
-            f"const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;\n{body}\n"
-            + "\n".join(stores) + f"\n}}\n{' '.join(word_end)} }}\n{' '.join(row_end)}\n}}\n{ends}"
-        )  # fmt: skip
+        body = "\n".join([
+            f"{check}\n{rows} {' '.join(row_start)}",
+            f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
+            "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {",
+            "const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;",
+            *sweep.lines, *stores, "}", " ".join(word_end), "}", " ".join(row_end),
+        ])  # fmt: skip
+        fields = tuple(name for node, name, _ in outputs if node.type == REAL)
+        kept = [unchanged(node) for node in nodes]
+        if all(kept) and all(self.have(base) for base, _ in kept):  # type: ignore[misc]
+            gates = list(dict.fromkeys(f"{self.planes[id(mask)]}->zero" for _, masks in kept for mask in masks))  # type: ignore[misc]
+            declared = " ".join(f"Field* {name};" for name in fields)
+            same = " ".join(f"{name} = keep({self.fields[id(base)]});" for (_, name, _), (base, _) in zip(outputs, kept, strict=True))  # type: ignore[misc]
+            new = " ".join(f"{name} = take_field(c);" for name in fields)
+            scan = " | ".join(f"((const u64*){self.planes[id(m)]}->data)[(y * words + w) * LANES + l]" for m in {id(m): m for _, ms in kept for m in ms}.values())  # type: ignore[misc]
+            copies = " ".join(f"copy_row(c, {name}, {self.fields[id(base)]}, l, y);" for (_, name, _), (base, _) in zip(outputs, kept, strict=True))  # type: ignore[misc]
+            still = f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; if (!some) {{ {copies} continue; }} }}\n"
+            loop = _lane_loop([Lanes(pads, still + body, "", fields)], set(fields))
+            self.block.statements.append(f"{declared}\nif ({' && '.join(gates) or 'true'}) {{ {same} }} else {{ {new}\n{loop}\n}}")
+        else:
+            self.block.statements.append(Lanes(f"{' '.join(takes)}\n{pads}", body, ends, fields))
         for node, name, _ in outputs:
             (self.fields if node.type == REAL else self.planes)[id(node)] = name
 
     def busy(self, node: Node, dy: int, wraps: bool) -> str:
         name = self.fields[id(node)]
         if dy == 0:
-            return f"{name}->live[l * height + y]"
+            return f"{name}->live[l{name} * height + y]"
         if wraps:
-            return f"{name}->live[l * height + c.row(y + {dy}) / words]"
-        return f"(y + {dy} >= 0 && y + {dy} < height && {name}->live[l * height + y + {dy}])"
+            return f"{name}->live[l{name} * height + c.line(y + {dy})]"
+        return f"(y + {dy} >= 0 && y + {dy} < height && {name}->live[l{name} * height + y + {dy}])"
 
     def finish(self) -> None:
         """Leave the outputs in the context's slots."""

@@ -105,7 +105,7 @@ struct Grid {
 struct Context {
   Grid g;
   V valid_last;
-  std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16
+  std::vector<int> wrapped, lines;  // [height + 32]: word offset and number of row y - 16 on the torus
   int turn[2 * HALO + 1];    // dx mod width, for rotations
   std::vector<Plane*> planes, all_planes;
   std::vector<Field*> fields, all_fields;
@@ -123,6 +123,7 @@ struct Context {
 
   V valid(int w) const { return w == g.words - 1 ? valid_last : splat(~0ull); }
   int row(int y) const { return wrapped[y + HALO]; }
+  int line(int y) const { return lines[y + HALO]; }
 };
 
 template <class T> static T* aligned(size_t count) {
@@ -132,12 +133,48 @@ template <class T> static T* aligned(size_t count) {
   memset(p, 0, bytes);
   return (T*)p;
 }
-static Plane* new_plane(const Grid& g) { return new Plane{aligned<V>(g.cells()), 0, true}; }
-static Field* new_field(const Grid& g) {
-  return new Field{aligned<float>((size_t)LANES * g.height * g.stride + CHUNK), aligned<uint8_t>(LANES * g.height), 0};
+// Buffers of batches that are gone are used again: fresh memory from the system costs more than a step.
+template <class T> struct Spare {
+  std::mutex lock;
+  size_t size = 0;
+  std::vector<T*> waiting;
+};
+static Spare<Plane> spare_planes;
+static Spare<Field> spare_fields;
+static void release(Plane* p) { free(p->data); delete p; }
+static void release(Field* f) { free(f->data); free(f->live); delete f; }
+template <class T> static T* reuse(Spare<T>& spare, size_t size) {
+  std::lock_guard<std::mutex> hold(spare.lock);
+  if (spare.size != size) {
+    for (T* t : spare.waiting) release(t);
+    spare.waiting.clear();
+    spare.size = size;
+  }
+  if (spare.waiting.empty()) return nullptr;
+  T* t = spare.waiting.back();
+  spare.waiting.pop_back();
+  return t;
 }
-static void drop(Plane* p) { free(p->data); delete p; }
-static void drop(Field* f) { free(f->data); free(f->live); delete f; }
+template <class T> static void drop(Spare<T>& spare, T* t, size_t size, size_t most) {
+  {
+    std::lock_guard<std::mutex> hold(spare.lock);
+    if (spare.size == size && spare.waiting.size() < most) return spare.waiting.push_back(t);
+  }
+  release(t);
+}
+constexpr size_t SPARE_BYTES = 1 << 28;  // at most this much waits, of each kind
+static size_t plane_size(const Grid& g) { return sizeof(V) * g.cells(); }
+static size_t field_size(const Grid& g) { return sizeof(float) * LANES * g.height * g.stride; }
+static Plane* new_plane(const Grid& g) {  // what it holds is not defined
+  Plane* p = reuse(spare_planes, plane_size(g));
+  return p ? p : new Plane{aligned<V>(g.cells()), 0, true};
+}
+static Field* new_field(const Grid& g) {
+  Field* f = reuse(spare_fields, field_size(g) + g.height);
+  return f ? f : new Field{aligned<float>((size_t)LANES * g.height * g.stride + CHUNK), aligned<uint8_t>(LANES * g.height), 0};
+}
+static void drop(const Grid& g, Plane* p) { drop(spare_planes, p, plane_size(g), SPARE_BYTES / plane_size(g)); }
+static void drop(const Grid& g, Field* f) { drop(spare_fields, f, field_size(g) + g.height, SPARE_BYTES / field_size(g)); }
 
 ALWAYS Plane* take(Context& c) {
   Plane* p;
@@ -324,7 +361,7 @@ ALWAYS const float* real_row(const Context& c, const Field* f, int lane, int y) 
   return f->live[lane * c.g.height + y] ? f->data + ((size_t)lane * c.g.height + y) * c.g.stride + HALO : c.zeros + HALO;
 }
 ALWAYS const float* real_row_wrapped(const Context& c, const Field* f, int lane, int y) {
-  return real_row(c, f, lane, c.row(y) / c.g.words);
+  return real_row(c, f, lane, c.line(y));
 }
 ALWAYS const float* real_row_or_nothing(const Context& c, const Field* f, int lane, int y) {
   return y >= 0 && y < c.g.height ? real_row(c, f, lane, y) : c.zeros + HALO;
@@ -337,10 +374,37 @@ ALWAYS F inside_columns(F value, int x, int dx, int width) {
 ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
 // After the chunks of a row: nothing beyond the width, then the halo.
 ALWAYS void finish_row(const Context& c, float* row) {
-  int w = c.g.width, reach = REACH;
-  for (int i = 0; i < reach; i++) row[w + i] = row[i % w];
-  for (int i = 1; i <= reach; i++) row[-i] = row[(w - i % w) % w];
+  int w = c.g.width;
+  if (__builtin_expect(w >= REACH, 1)) {
+    for (int i = 0; i < REACH; i++) row[w + i] = row[i];
+    for (int i = 1; i <= REACH; i++) row[-i] = row[w - i];
+  } else {
+    for (int i = 0; i < REACH; i++) row[w + i] = row[i % w];
+    for (int i = 1; i <= REACH; i++) row[-i] = row[(w - i % w) % w];
+  }
 }
+
+ALWAYS void copy_row(const Context& c, Field* to, const Field* from, int lane, int y) {
+  size_t at = lane * (size_t)c.g.height + y;
+  to->live[at] = from->live[at];
+  if (from->live[at]) memcpy(to->data + at * c.g.stride, from->data + at * c.g.stride, sizeof(float) * c.g.stride);
+}
+
+// Seconds spent in each pass, measured only in libraries that are built to be profiled.
+#if defined(PROFILE)
+#include <ctime>
+static double pass_seconds[PASSES + 1];
+static double thread_seconds() {
+  timespec t;
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+  return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+#define START double tick = thread_seconds()
+#define TICK(i) do { double now = thread_seconds(); pass_seconds[i] += now - tick; tick = now; } while (0)
+#else
+#define START
+#define TICK(i)
+#endif
 
 // Keys
 static inline u32 mix(u32 x) {

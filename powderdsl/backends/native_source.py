@@ -18,7 +18,7 @@ def native_source(program: Program) -> tuple[str, Layout]:
     """The whole translation unit, and its layout."""
     layout = layout_of(program)
     passes = [PassWriter(p, i, layout).source() for i, p in enumerate(program.passes)]
-    calls = "\n".join(f"  pass_{i}(c);" for i in range(len(program.passes)))
+    calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
     resets = [(slot, layout.planes.get(slot.name), layout.reals.get(slot.name)) for slot in program.slots if slot.resets]
     reset_planes = [f"{{{plane}, {int(slot.default)}}}" for slot, plane, _ in resets if plane is not None]
     reset_reals = [f"{{{real}, {literal(float(slot.default))}}}" for slot, _, real in resets if real is not None]
@@ -35,6 +35,7 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"#define REALS {len(layout.reals)}",
         f"#define REACH {layout.reach}",
         f"#define SNAP {literal(SNAP)}",
+        f"#define PASSES {len(program.passes)}",
     ])  # fmt: skip
     tables = "\n".join([
         "struct ResetPlane { int slot; bool value; };",
@@ -51,5 +52,5 @@ def native_source(program: Program) -> tuple[str, Layout]:
     runtime = (folder / "native_runtime.hpp").read_text(encoding="utf-8")
     driver = (folder / "native_driver.hpp").read_text(encoding="utf-8")
     body = "\n\n".join(passes)
-    step = f"static void run_passes(Context& c) {{\n{calls}\n}}"
+    step = f"static void run_passes(Context& c) {{\n  START;\n{calls}\n}}"
     return "\n".join([head, runtime, tables, body, step, driver]), layout

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from powderdsl.backends.native_layout import Layout, literal
-from powderdsl.ir.ops import REAL, Node, walk
+from powderdsl.backends.native_layout import Layout, literal, param_key
+from powderdsl.ir.ops import REAL, Node, PassGraph, walk
 
 RECOMPUTE = 2
 _INFIX = {"add": "+", "sub": "-", "mul": "*"}
@@ -37,15 +37,20 @@ def sweep_needs(node: Node, have: Callable[[Node], bool]) -> tuple[list[Node], l
             continue
         seen.add(id(top))
         if top.type != REAL and top is not node:
+            if top.op == "param":
+                continue
             flags[id(top)] = top
         elif top.op == "shift":
             source = top.args[0]
             if have(source):
                 continue
-            if top.attr[2] and real_cost(source, have) <= RECOMPUTE:  # type: ignore[index]
-                stack.append(source)
-            else:
+            if not top.attr[2]:  # type: ignore[index]
                 reals[id(source)] = source
+                continue
+            parts = stored_parts(source, have)
+            reals |= {id(part): part for part in parts}
+            if not parts:
+                stack.append(source)
         else:
             stack.extend(top.args)
     return list(flags.values()), list(reals.values())
@@ -60,6 +65,8 @@ class Sweep:
         self.memo: dict[tuple[int, int, int], str] = {}
         self.rows: dict[str, str] = {}
         self.words: dict[str, str] = {}
+        self.joined: dict[str, str] = {}
+        self.flags: dict[int, str] = {}
         self.used: set[str] = set()
         self.counter = [0]
 
@@ -69,27 +76,28 @@ class Sweep:
     def inner(self) -> Sweep:
         nested = Sweep(self.planes, self.fields, self.layout)
         nested.memo, nested.counter = dict(self.memo), self.counter
-        nested.rows, nested.words, nested.used = self.rows, self.words, self.used
+        nested.rows, nested.words, nested.used, nested.joined = self.rows, self.words, self.used, self.joined
         return nested
 
     def row(self, field: str, dy: int, wraps: bool = True) -> str:
         """The pointer to a field's row, set up once a row."""
         self.used.add(field)
-        call = f"real_row_wrapped(c, {field}, l, y + {dy})" if wraps else f"real_row_or_nothing(c, {field}, l, y + {dy})"
+        call = f"real_row_wrapped(c, {field}, l{field}, y + {dy})" if wraps else f"real_row_or_nothing(c, {field}, l{field}, y + {dy})"
         if wraps and dy == 0:
-            call = f"real_row(c, {field}, l, y)"
+            call = f"real_row(c, {field}, l{field}, y)"
         return self.rows.setdefault(call, f"r{len(self.rows)}")
+
+    def word(self, node: Node) -> str:
+        """The word of a flag's plane, read once a row and word."""
+        if node.op == "param":
+            return f"c.param_bits[{self.layout.param_planes[param_key(node)]}][l]"
+        plane = self.planes[id(node)]
+        self.used.add(plane)
+        return self.words.setdefault(plane, f"m{len(self.words)}")
 
     def mask(self, node: Node) -> str:
         """Sixteen bits of a flag's plane."""
-        if node.op == "param":
-            from powderdsl.backends.native_layout import param_key
-
-            return f"(u32)(c.param_bits[{self.layout.param_planes[param_key(node)]}][l] & 0xffff)"
-        plane = self.planes[id(node)]
-        self.used.add(plane)
-        word = self.words.setdefault(plane, f"m{len(self.words)}")
-        return f"(u32)({word} >> (x & 63) & 0xffff)"
+        return f"(u32)({self.word(node)} >> (x & 63) & 0xffff)"
 
     def temporary(self, expression: str) -> str:
         self.counter[0] += 1
@@ -155,19 +163,95 @@ class Sweep:
                 return self.temporary(f"settle({values[0]}, {literal(lo)}, {literal(hi)}, SNAP)")
         raise AssertionError(f"no native sweep for {node.op}")
 
+    def comparison(self, node: Node, leaders: dict[int, Node]) -> str:
+        """Sixteen bits of a comparison; nothing is computed where the comparison that leads it fails everywhere."""
+        leader = leaders.get(id(node))
+        known = self.flags.get(id(leader)) if leader is not None else None
+        block = self.inner() if known else self
+        a, b = (block.value(arg) for arg in node.args)
+        bits = f"bits_of({a} {_COMPARE[node.op]} {b})"
+        self.counter[0] += 1
+        name = f"b{self.counter[0]}"
+        if known:
+            self.lines.append(f"u32 {name} = 0; if ({known}) {{ {' '.join(block.lines)} {name} = {bits}; }}")
+        else:
+            self.lines.append(f"const u32 {name} = {bits};")
+        self.flags[id(node)] = name
+        return name
+
     def select(self, node: Node) -> str:
-        """Where no cell of the chunk is chosen, nothing of the first choice is computed."""
-        mask, yes, no = node.args
-        otherwise = self.value(no)
+        """Choices laid over each other. Where no cell of the chunk is chosen, nothing of a choice is computed."""
+        chain = [node]
+        while (inner := chain[-1].args[2]).op == "select" and not self.have(inner) and (id(inner), 0, 0) not in self.memo:
+            chain.append(inner)
+        base = self.value(chain[-1].args[2])
         self.counter[0] += 1
         name = f"v{self.counter[0]}"
-        bits = f"b{self.counter[0]}"
-        nested = self.inner()
-        chosen = nested.value(yes)
-        self.lines.append(f"F {name} = {otherwise};")
-        body = " ".join([*nested.lines, f"{name} = blend({bits}, {chosen}, {name});"])
-        self.lines.append(f"if (const u32 {bits} = {self.mask(mask)}) {{ {body} }}")
+        self.lines.append(f"F {name} = {base};")
+        block = self.inner()
+        for choice in reversed(chain):
+            mask, yes, no = choice.args
+            block.memo[id(no), 0, 0] = name
+            nested = block.inner()
+            chosen = nested.value(yes)
+            self.counter[0] += 1
+            bits = f"b{self.counter[0]}"
+            body = " ".join([*nested.lines, f"{name} = blend({bits}, {chosen}, {name});"])
+            block.lines.append(f"if (const u32 {bits} = {self.mask(mask)}) {{ {body} }}")
+        lines = "\n".join(block.lines)
+        if len(chain) > 2:
+            words = " | ".join(dict.fromkeys(self.word(choice.args[0]) for choice in chain))
+            joined = self.joined.setdefault(words, f"j{len(self.joined)}")
+            lines = f"if ({joined} >> (x & 63) & 0xffff) {{\n{lines}\n}}"
+        self.lines.append(lines)
         return name
+
+
+def leading(node: Node, comparisons: list[Node], pass_: PassGraph) -> Node | None:
+    """A comparison that everything which asks for `node` also asks for: where it fails, `node` may be anything."""
+    for leader in comparisons:
+        if leader is not node and leader.args != node.args and all(_covered(root, node, leader) for _, root in pass_.outputs):
+            return leader
+    return None
+
+
+def _covered(root: Node, node: Node, leader: Node) -> bool:
+    """Whether each way from the root to the node leads through a conjunction with the leader."""
+    seen: set[int] = set()
+    stack = [root]
+    while stack:
+        top = stack.pop()
+        if id(top) in seen:
+            continue
+        seen.add(id(top))
+        if top is node:
+            return False
+        if top.op == "and":
+            parts = conjuncts(top)
+            if any(part is leader for part in parts):
+                stack.append(leader)  # the other parts are asked together with it
+                continue
+        stack.extend(top.args)
+    return True
+
+
+def conjuncts(node: Node) -> list[Node]:
+    """The parts of nested conjunctions."""
+    if node.op != "and":
+        return [node]
+    return [part for arg in node.args for part in conjuncts(arg)]
+
+
+def stored_parts(source: Node, have: Callable[[Node], bool]) -> list[Node]:
+    """What must be stored so that a real can be computed at a neighbour: itself, or the costly things in it."""
+    if real_cost(source, have) <= RECOMPUTE:
+        return []
+    if source.op in _INFIX or source.op == "neg":
+        parts = [part for arg in source.args for part in stored_parts(arg, have)]
+        ids = {id(part) for part in parts}
+        if real_cost(source, lambda node: have(node) or id(node) in ids) <= RECOMPUTE:
+            return parts
+    return [source]
 
 
 def quiet(nodes: list[Node], have: Callable[[Node], bool]) -> tuple[list[float | bool] | None, list[Node], list[Node]]:
@@ -228,6 +312,18 @@ _QUIET: dict[str, Callable] = {  # type: ignore[type-arg]
     "lt": lambda n, a, b: bool(a < b),
     "le": lambda n, a, b: bool(a <= b),
 }
+
+
+def unchanged(node: Node) -> tuple[Node, list[Node]] | None:
+    """For a settled slot under choices: the slot it was, and the masks without which it still is (it was settled)."""
+    masks = []
+    if node.op != "settle":
+        return None
+    node = node.args[0]
+    while node.op == "select":
+        masks.append(node.args[0])
+        node = node.args[2]
+    return (node, masks) if node.op == "input" and all(mask.op != "param" for mask in masks) else None
 
 
 def rows_read(nodes: list[Node], have: Callable[[Node], bool]) -> list[tuple[Node, int, bool]]:

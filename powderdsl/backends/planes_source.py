@@ -86,7 +86,8 @@ class _Writer:
             case "min" | "max":
                 self.emit(node, f"torch.{node.op}imum({self.name(args[0])}, {self.name(args[1])})")
             case "sqrt":
-                self.emit(node, f"torch.sqrt({self.name(args[0])})")
+                # torch's float32 square root is not always rounded correctly on CPUs; from float64 it is.
+                self.emit(node, f"torch.sqrt({self.name(args[0])}.double()).float()")
             case "settle":
                 self.emit(node, f"k.settle({self.name(args[0])}, {attr[0]!r}, {attr[1]!r})")  # type: ignore[index]
             case "select" if real:

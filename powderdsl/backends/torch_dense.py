@@ -231,8 +231,8 @@ def compiled(source: str, name: str, constants: Mapping[str, object], device: to
     namespace: dict[str, object] = {"torch": torch}
     for key, value in constants.items():
         dtype = torch.bool if isinstance(value, bool) else torch.float32 if isinstance(value, float) else torch.int32
-        if isinstance(value, tuple):
-            dtype = torch.int32
+        if dtype == torch.int32 and max(value if isinstance(value, tuple) else (value,)) >= 1 << 31:  # type: ignore[type-var]
+            dtype = torch.int64  # thresholds of draws of 32 bits
         namespace[key] = torch.tensor(value, dtype=dtype, device=device)
     exec(compile(source, filename, "exec"), namespace)
     function: PassFunction = namespace[name]  # type: ignore[assignment]

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import check_writable, load_rules, rules_argument, set_option
+from powderdsl.cli.options import backend_option, check_writable, load_rules, rules_argument, set_option
 from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.packs import Block, PackDecl, PassDecl
 from powderdsl.model.text import one_line, place_of, print_model
 from powderdsl.syntax.ast import Syntax
+
+if TYPE_CHECKING:
+    from powderdsl.ir.ops import Program
 
 STAGES = ("tree", "model", "ir", "kernels")
 
@@ -27,16 +31,19 @@ STAGES = ("tree", "model", "ir", "kernels")
     required=True,
     help="tree: rules as parsed; model: checked, loops unrolled; ir: optimised; kernels: what runs.",
 )
+@backend_option("auto", "Whose kernels are printed.")
 @click.option("--pass", "pass_name", metavar="NAME", help="Only this pass of the rules.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), metavar="FILE", help="Where to write it.")
 @set_option
 def command(
-    rules: str, stage: str, pass_name: str | None, out: Path | None, settings: dict[str, str]
+    rules: str, stage: str, backend: str, pass_name: str | None, out: Path | None, settings: dict[str, str]
 ) -> None:
     """Print what a stage of the compiler makes of rules."""
     if out is not None:
         check_writable(out)
-    text = _tree(rules, pass_name) if stage == "tree" else _checked(rules, stage, pass_name, settings)
+    text = (
+        _tree(rules, pass_name) if stage == "tree" else _checked(rules, stage, backend, pass_name, settings)
+    )
     if out is None:
         click.echo(text, nl=not text.endswith("\n"))
         return
@@ -46,7 +53,7 @@ def command(
         temporary.write_text(text if text.endswith("\n") else text + "\n", encoding="utf-8")
 
 
-def _checked(rules: str, stage: str, pass_name: str | None, settings: dict[str, str]) -> str:
+def _checked(rules: str, stage: str, backend: str, pass_name: str | None, settings: dict[str, str]) -> str:
     """The stages from the checked model on."""
     ruleset = load_rules(rules, settings)
     if pass_name is not None:
@@ -58,9 +65,29 @@ def _checked(rules: str, stage: str, pass_name: str | None, settings: dict[str, 
         from powderdsl.ir.text import print_program
 
         return print_program(program, pass_name)
-    from powderdsl.backends.torch_dense import kernel_source
+    return _kernels(program, backend, pass_name)
 
-    return kernel_source(program, pass_name)
+
+def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
+    """The generated source of a backend."""
+    from powderdsl.ir.bits import lower_bits
+
+    match backend:
+        case "reference":
+            raise BadInput("the reference backend runs the checked model: it has no kernels")
+        case "dense":
+            from powderdsl.backends.torch_dense import kernel_source
+
+            return kernel_source(program, pass_name)
+        case "native":
+            from powderdsl.backends.native_source import native_source
+
+            if pass_name is not None:
+                raise BadInput("native source is one text: --pass does not go with it")
+            return native_source(lower_bits(program))[0]
+    from powderdsl.backends.torch_planes import planes_kernel_source
+
+    return planes_kernel_source(lower_bits(program), pass_name)
 
 
 def _check_pass(name: str, known: Sequence[str]) -> None:

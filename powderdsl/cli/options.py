@@ -85,13 +85,13 @@ def set_option(function: Decorated) -> Decorated:
     )(function)
 
 
-def backend_option(default: str) -> Callable[[Decorated], Decorated]:
+def backend_option(default: str, about: str = "What runs the rules.") -> Callable[[Decorated], Decorated]:
     return click.option(
         "--backend",
         type=click.Choice(BACKENDS),
         default=default,
         show_default=True,
-        help="What runs the rules.",
+        help=about,
     )
 
 

@@ -29,7 +29,7 @@ SUFFIXES = (".png", ".gif", ".mp4", ".npz")
 MOST_PICTURES = 64
 """How many worlds of a batch a picture shows."""
 
-SMALL_BATCH = 1 << 18
+SMALL_BATCH = 1 << 20
 """Cells of a batch up to which one thread is as fast as several: handing out work has a price."""
 
 

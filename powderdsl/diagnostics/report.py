@@ -82,6 +82,8 @@ class Reporter:
         Raises:
             CompileError: with everything so far, when there are MAX_ERRORS errors.
         """
+        if span is not None and span.end <= span.start:
+            span = Span(span.source, span.start, span.start + 1)  # something to underline
         diagnostic = Diagnostic(code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps))
         if diagnostic in self._found:
             return
@@ -113,6 +115,7 @@ class Reporter:
 
 def suggest(word: str, candidates: Iterable[str], kind: str = "") -> tuple[str, ...]:
     """Help lines for an unknown word: the close match, or the whole list when it is short."""
+    word = str(word)  # whoever calls the Python API may have given anything
     known = sorted(set(candidates) - {word})
     if len(known) > MAX_CANDIDATES:
         known = [name for name in known if name[:1] == word[:1]][:MAX_CANDIDATES]

@@ -348,8 +348,24 @@ class _PassBits:
         if modulus & (modulus - 1) == 0:
             return Bits(tuple(self.gates.bit(value, i) if i < modulus.bit_length() - 1 else self.gates.no for i in range(count)), signed)
         inner = node.args[0].type
+        if len(value.planes) > MAX_TABLE_BITS // 2:
+            return self.gates.fit(self._remainder(value, modulus), 0, modulus - 1)
         planes = tuple(self._function(value, inner.lo, inner.hi, lambda v, i=i: v % modulus >> i & 1) for i in range(count))
         return Bits(planes, signed)
+
+    def _remainder(self, value: Bits, modulus: int) -> Bits:
+        """Long division: bit by bit from the highest, twice the remainder so far plus the bit, less the modulus if it fits."""
+        gates = self.gates
+        bits = list(reversed(value.planes))
+        rest = gates.constant(0)
+        if value.signed:  # the sign bit counts as minus one
+            rest = gates.select(bits.pop(0), gates.constant(modulus - 1), rest, 0, modulus - 1)
+        for bit in bits:
+            doubled = Bits((bit, *rest.planes))
+            smaller = gates.lt(doubled, gates.constant(modulus))
+            reduced = gates.sub(doubled, gates.constant(modulus), -modulus, modulus - 1)
+            rest = gates.select(smaller, doubled, reduced, 0, modulus - 1)
+        return rest
 
     def _to_real(self, argument: Node) -> Node:
         """A number from its planes: exact, since whole numbers stay below 2^24."""

@@ -58,7 +58,8 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     for child in syntax.children:
         value = typer.evaluate(child, scope)
         if not isinstance(value, Number) or value.value.denominator != 1:
-            raise typer.fail("PD405", "`at` takes two whole constants", child.span, "not a whole constant")
+            cure = "where it varies, loop over the values: `any(… for n in 0..3)`"
+            raise typer.fail("PD405", "`at` takes two whole constants", child.span, "not a whole constant", (cure,))
         steps.append(int(value.value))
     place = Place(typer.offset((steps[0], steps[1]), syntax.span))
     return typer.turn(place, scope)

@@ -23,6 +23,8 @@ from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
 
 
+MAX_PASSES = 200
+
 T = TypeVar("T")
 
 
@@ -265,6 +267,10 @@ def _order_passes(packs: Sequence[PackDecl], reporter: Reporter) -> tuple[Named[
                 )
             else:
                 passes[name] = Named(pack.name.text, decl)
+    if len(passes) > MAX_PASSES:
+        last = list(passes.values())[MAX_PASSES].decl.name.span
+        reporter.error("PD508", f"{len(passes):,} passes", last, f"the limit is {MAX_PASSES}", helps=["load fewer packs"])
+        return tuple(passes.values())
     earlier: dict[str, dict[str, Span]] = {name: {} for name in passes}
     for name, named in passes.items():
         for scalars, is_after in ((named.decl.after, True), (named.decl.before, False)):

@@ -344,7 +344,7 @@ class Elaborator:
         if isinstance(operand, SetOf):
             cure = f"write `{syntax.text} := … where {before.span.text}`"
             raise self.typer.wrong(operand, "a neighbour before the dot", before.span, cure)
-        if isinstance(operand, Expr) and operand.kind == VEC2:
+        if isinstance(operand, Expr) and operand.kind.name == "vec2":
             cure = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
             raise self.typer.fail("PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", (cure,))
         return self.typer.place(operand, before.span)

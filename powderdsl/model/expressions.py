@@ -77,10 +77,10 @@ class Typer(Coercer):
         """Tags and sets without elements that the rule asks for."""
         self.set_definitions: dict[str, tuple[str, Syntax]] = {}
         self.resolving: list[str] = []
-        self._unknown: dict[tuple[str, bool], dict[Span, None]] = {}
+        self._unknown: dict[tuple[str, bool], dict[Span, Scope]] = {}
+        self._sets_too_deep = False
         self._work = self._rule_start = 0
         self._rule_span: Span | None = None
-        self._cures: dict[tuple[str, bool], tuple[str, ...]] = {}
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """What the syntax stands for. Raises Poisoned after reporting, Asleep if it hangs on an absent name."""
@@ -111,15 +111,13 @@ class Typer(Coercer):
             return found
         if self.symbols.is_declared(name, scope.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
+        self._unknown.setdefault((name, after_dot), {})[span] = scope
+        raise Poisoned
+
+    def _cure(self, name: str, scope: Scope, after_dot: bool) -> tuple[str, ...]:
         known = self.symbols.names(after_dot=after_dot)
         if not after_dot:
             known += [*scope.locals, *FUNCTIONS]
-        key = (name, after_dot)
-        self._unknown.setdefault(key, {})[span] = None
-        self._cures[key] = self._cure(name, known)
-        raise Poisoned
-
-    def _cure(self, name: str, known: list[str]) -> tuple[str, ...]:
         elsewhere = [qualified for qualified in self.symbols.params if qualified.endswith(f".{name}")]
         if elsewhere:
             return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)
@@ -130,14 +128,15 @@ class Typer(Coercer):
 
     def report_unknown(self) -> None:
         """Report every unknown name that came up: one diagnostic a name, however often it is used."""
-        for key, places in self._unknown.items():
+        for (name, after_dot), places in self._unknown.items():
             first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
             labels = [Label(span, "and here") for span in others[:4]]
             notes = [f"and in {len(others) - 4} more places"] if len(others) > 4 else []
-            label = "no loaded pack has such a field or property" if key[1] else "no loaded pack defines it"
+            label = "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
             self.reporter.error(
-                "PD301", f"unknown name `{key[0]}`", first, label, secondary=labels, notes=notes, helps=self._cures[key]
-            )
+                "PD301", f"unknown name `{name}`", first, label, secondary=labels, notes=notes,
+                helps=self._cure(name, places[first], after_dot),
+            )  # fmt: skip
         self._unknown.clear()
 
     def find(self, name: str, span: Span, scope: Scope) -> Operand | None:
@@ -174,7 +173,15 @@ class Typer(Coercer):
             path = " -> ".join(f"`{other}`" for other in [*self.resolving[self.resolving.index(name) :], name])
             raise self.fail("PD307", f"the set `{name}` is defined by itself", span, path, ("list elements or tags",))
         if len(self.resolving) >= MAX_SET_DEPTH:
-            raise self.fail("PD508", f"more than {MAX_SET_DEPTH} sets that hang on each other", span, "too many in a row")
+            for waiting in self.resolving:
+                self.symbols.constants[waiting] = Broken()
+            if self._sets_too_deep:
+                raise Poisoned
+            self._sets_too_deep = True
+            raise self.fail(
+                "PD508", f"more than {MAX_SET_DEPTH} sets that hang on each other", span, "too many in a row",
+                ("list elements or tags",),
+            )  # fmt: skip
         pack, syntax = self.set_definitions[name]
         self.resolving.append(name)
         try:

@@ -274,7 +274,7 @@ class Coercer:
             case _:
                 value = self.whole(operand, span)
         if value.op == "const" and isinstance(value.value, (int, float)) and not kind.lo <= value.value <= kind.hi:
-            raise self.fail("PD402", f"{value.value:g} lies outside {kind}", span, f"the range is {kind.lo:g}..{kind.hi:g}")
+            raise self.fail("PD402", f"{value.value:g} lies outside {kind}", span, f"the range is {kind.lo:g}..{kind.hi:g}", ("write a number in this range, or widen it where it is declared",))
         return value
 
     def direction(self, operand: Operand, span: Span) -> Expr:

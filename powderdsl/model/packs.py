@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from powderdsl.diagnostics import Label, Reporter, Source, Span
+from powderdsl.diagnostics import Label, Reporter, Source
 from powderdsl.model.schema import KEYS, Reader, first_line
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_yaml
-
-MAX_PASSES = 200
 
 
 @dataclass(frozen=True)
@@ -306,12 +304,8 @@ class _PackReader(Reader):
         entries = self.mapping(node, "element", f"the element `{key.text}`")
         color = self.scalar(entries, "color")
         if color is not None and not re.fullmatch(r"#[0-9A-Fa-f]{6}", color.text):
-            rest = self._comment_after(color)
-            helps = ['put quotes around it: color: "#RRGGBB"']
-            if rest is not None:
-                self.reporter.error("PD110", "a colour that YAML takes for a comment", rest, "a comment", helps=helps)
-            else:
-                self.reporter.error("PD110", f"`{color.text}` is not a colour", color.span, 'expected "#RRGGBB"', helps=helps)
+            helps = ['six hexadecimal digits in quotes: color: "#RRGGBB"']
+            self.reporter.error("PD110", f"`{color.text}` is not a colour", color.span, 'expected "#RRGGBB"', helps=helps)
             color = None
         glyph = self.scalar(entries, "glyph")
         if glyph is not None and not (len(glyph.text) == 1 and "!" <= glyph.text <= "~" and glyph.text != "?"):
@@ -322,16 +316,6 @@ class _PackReader(Reader):
             glyph.text if glyph else "", self.text(entries, "about"), self.words(entries.get("tags", (None, None))[1]),
             self.open_values(entries, "element"), self.choice(entries, "override", ("yes", "no", "true", "false")) in ("yes", "true"),
         )
-
-    def _comment_after(self, value: Scalar) -> Span | None:
-        """The comment that stands where a value should, if there is one."""
-        text = self.source.text
-        end = text.find("\n", value.span.start)
-        line = text[value.span.start : end if end >= 0 else len(text)]
-        if value.text or not line.lstrip().startswith("#"):
-            return None
-        start = value.span.start + line.index("#")
-        return Span(self.source, start, start + len(line[line.index("#") :].rstrip()))
 
     def also(self, key: Scalar, node: Node) -> AlsoDecl:
         if isinstance(node, (Sequence, Scalar)):

@@ -113,6 +113,9 @@ KEYS: dict[str, dict[str, Key]] = {
 OPEN = {"element": "a property", "also": "a property", "property": "an element"}
 """Mappings that take further keys, and what those name."""
 
+VALUES = ("word", "number", "flag", "line")
+"""Shapes of which there is no empty value."""
+
 PREFIXES = {"pass": ("for ", "repeat "), "block": ("for ", "repeat ")}
 """Keys that are read as lines: `for side in (left, right)`, `repeat 2`."""
 
@@ -154,10 +157,13 @@ class Reader:
         for key, value in node.entries:
             prefixed = key.text.startswith(PREFIXES.get(context, ())) and bool(PREFIXES.get(context))
             misspelt = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
-            if key.text in known or prefixed or (context in OPEN and not misspelt):
+            row = known.get(key.text)
+            if row and row.shape in VALUES and isinstance(value, Scalar) and value.style == "plain" and not value.text:
+                self._no_value(key, value, row)
+            elif row or prefixed or (context in OPEN and not misspelt):
                 entries[key.text] = (key, value)
-                if key.text in known:
-                    self._check_shape(known[key.text], key, value)
+                if row:
+                    self._check_shape(row, key, value)
             else:
                 missing -= set(misspelt)  # a key that is there under a wrong name is one mistake
                 self.reporter.error(
@@ -171,6 +177,20 @@ class Reader:
                 f"`{name}` is missing", helps=[f"`{name}`: {known[name].about}"],
             )  # fmt: skip
         return entries
+
+    def _no_value(self, key: Scalar, value: Scalar, row: Key) -> None:
+        """Report a key without a value, or one whose value YAML takes for a comment."""
+        text = value.span.source.text
+        end = text.find("\n", key.span.end)
+        line = text[key.span.end : end if end >= 0 else len(text)]
+        if line.lstrip(": ").startswith("#"):
+            start = key.span.end + line.index("#")
+            comment = Span(key.span.source, start, key.span.end + len(line.rstrip()))
+            cure = f'put quotes around it: {key.text}: "{comment.text}"'
+            self.reporter.error("PD109", f"`{key.text}` has no value", comment, "a comment, to YAML", helps=[cure])
+            return
+        cure = f"`{key.text}`: {row.about}"
+        self.reporter.error("PD109", f"`{key.text}` has no value", key.span, "nothing stands after it", helps=[cure])
 
     def _key_help(self, word: str, context: str, what: str) -> tuple[str, ...]:
         """The cure for an unknown key: what it should be called, where it belongs, or that it is a rule."""
@@ -195,7 +215,8 @@ class Reader:
         if node is None or (isinstance(node, Scalar) and node.text == ""):
             return
         if not isinstance(node, Mapping):
-            self.shape(node, f"a mapping of {what}")
+            noun = what.split(" ", 1)[-1]
+            self.shape(node, f"a mapping with an entry for each {noun}", "write `NAME: …`, each on a line of its own")
             return
         for key, value in node.entries:
             if self.name(key, what):

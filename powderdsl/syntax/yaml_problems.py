@@ -51,7 +51,7 @@ class Place:
 
     @property
     def same_line(self) -> bool:
-        return "\n" not in self.text[self.since : self.at].rstrip()
+        return "\n" not in self.text[self.since : self.at]
 
     def span(self, start: int, length: int = 1) -> Span:
         # At the end of the file there is nothing to underline but what stands last.
@@ -136,7 +136,7 @@ def _unclosed(place: Place) -> Problem:
             Label(place.span(place.since), "opened here"),
         )  # fmt: skip
     opened = place.span(place.since)
-    if place.same_line and place.at < len(place.text.rstrip()):
+    if place.same_line and place.at < len(place.text):
         return Problem(f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, Label(opened, "opened here"))
     return Problem(f"a `{opener}` that is never closed", opened, "not closed", f"write the `{closer}`")
 

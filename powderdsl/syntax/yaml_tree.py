@@ -132,7 +132,7 @@ class _Builder:
         if depth > MAX_DEPTH or self.nodes > MAX_NODES:
             what = f"nested more than {MAX_DEPTH} deep" if depth > MAX_DEPTH else f"of more than {MAX_NODES:,} values"
             start = event.start_mark.index
-            self.reporter.error("PD106", f"document {what}", Span(self.source, start, start + 1))
+            self.reporter.error("PD106", f"document {what}", Span(self.source, start, start + 1), "here it is too much")
             raise _Abort
         if isinstance(event, yaml.AliasEvent):
             self._forbid(event, f"the alias `*{event.anchor}`", "write the value out: rule files have no anchors")

@@ -185,7 +185,8 @@ def test_no_tests_are_no_failure(folder):
     assert result.exit_code == 0
 
 
-def test_the_tests_of_every_shipped_ruleset_pass():
+@pytest.mark.slow
+def test_the_tests_in_the_shipped_packs_pass():
     result = powderdsl("test", "powderworld")
     assert result.exit_code == 0, result.stdout
 

@@ -164,6 +164,22 @@ def test_every_stage_can_be_printed(stage, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out.txt"]
 
 
+@pytest.mark.parametrize("backend", ["torch", "dense", "native"])
+def test_every_backend_shows_its_kernels(backend):
+    result = powderdsl("compile", "life", "--emit", "kernels", "--backend", backend)
+    assert result.exit_code == 0
+    assert len(result.stdout.splitlines()) > 10
+
+
+@pytest.mark.parametrize("arguments", [("--backend", "reference"), ("--backend", "native", "--pass", "step")])
+def test_kernels_that_are_not_there(arguments):
+    name = package.load("life").passes[0].name
+    arguments = [name if word == "step" else word for word in arguments]
+    result = powderdsl("compile", "life", "--emit", "kernels", *arguments)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: ")
+
+
 def test_trees_show_rules_as_parsed():
     result = powderdsl("compile", "core+water", "--emit", "tree", "--pass", "melt")
     heading = "rule: ice -> water if count(thaws) > 1 and interact < melt  # rules/water.yaml:"

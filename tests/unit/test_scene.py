@@ -356,7 +356,7 @@ def test_a_bad_statement(line, code, under):
         ("scene: a\nsize: [8, 8]\nfill: empty\nfill: wall\n", "PD104", "fill"),
         ("scene: a\nsize: [8, 8]\nfill: empty\ndraw: frame wall\n", "PD107", "frame wall"),
         ("scene: a\nsize: [8, 8]\nfill: empty\ndraw: {a: b}\n", "PD107", "{a: b}"),
-        ("scene: a\nsize: [8, 8]\nfill: &x empty\n", "PD105", "&x empty"),
+        ("scene: a\nsize: [8, 8]\nfill: &x empty\n", "PD105", "&x"),
         ("scenes: a\n", "PD107", "a"),
         ("scenes:\n  - frame wall\n", "PD107", "frame wall"),
         ("scenes: []\nscene: a\n", "PD108", "scene"),
