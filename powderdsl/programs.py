@@ -85,13 +85,17 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device) -> Runnab
     from powderdsl.backends.torch_dense import DenseProgram
     from powderdsl.backends.torch_planes import PlanesProgram
     from powderdsl.compiler import lower
-    from powderdsl.ir.bits import lower_bits
+    from powderdsl.ir.bits import NotBits, lower_bits
 
     program = lower(ruleset)
     if backend == "dense":
         return DenseProgram(program, device)
+    try:
+        planes = lower_bits(program)
+    except NotBits:  # cells carry everything
+        return DenseProgram(program, device)
     if backend == "native":
         from powderdsl.backends.torch_native import NativeProgram
 
-        return NativeProgram(program, lower_bits(program))
-    return PlanesProgram(program, lower_bits(program), device)
+        return NativeProgram(program, planes)
+    return PlanesProgram(program, planes, device)

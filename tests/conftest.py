@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-# Before torch is imported anywhere: tests run in several processes, and small tensors gain nothing from threads.
+# Before torch is imported anywhere: tests run in several processes; small tensors gain nothing from threads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 

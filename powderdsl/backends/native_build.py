@@ -19,7 +19,7 @@ import platformdirs
 
 FLAGS = (
     "-std=c++17", "-O2", "-march=native", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math",
-    "-fno-strict-aliasing", "-shared", "-fPIC", "-pthread", "-fvisibility=hidden", "-w",
+    "-fno-strict-aliasing", "-fno-gcse", "-fno-tree-pre", "-shared", "-fPIC", "-pthread", "-fvisibility=hidden", "-w",
 )  # fmt: skip
 """No contraction: a·b + c is rounded twice on every machine, so that all backends agree bit for bit."""
 

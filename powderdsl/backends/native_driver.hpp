@@ -31,6 +31,9 @@ static Context* new_context(const Grid& g) {
   }
   for (int dx = -HALO; dx <= HALO; dx++) c->turn[dx + HALO] = ((dx % g.width) + g.width) % g.width;
   c->nothing = new Plane{aligned<V>(g.cells()), 1, true};
+  c->everything = new Plane{aligned<V>(g.cells()), 1, false};
+  for (int i = 0; i < g.cells(); i++) c->everything->data[i] = c->valid(i % g.words);
+  c->calm = new Field{nullptr, aligned<uint8_t>(LANES * g.height), 1, true};
   c->nothing_row = aligned<V>(g.words);
   c->zeros = aligned<float>(g.stride + CHUNK);
   for (const FixedPlane& f : FIXED) {
@@ -46,6 +49,8 @@ static void free_context(Context* c) {
   for (Plane* p : c->planes) drop(c->g, p);
   for (Field* f : c->fields) drop(c->g, f);
   release(c->nothing);
+  release(c->everything);
+  release(c->calm);
   free(c->nothing_row);
   free(c->zeros);
   for (V* p : c->fixed) free(p);
@@ -76,7 +81,7 @@ static void put_back(Context* c) {
 }
 
 static void own(Context& c, Plane*& p) {  // a plane of this group alone
-  if (p != c.nothing && p->refs == 1) return;
+  if (p != c.nothing && p != c.everything && p->refs == 1) return;
   Plane* copy = take(c);
   if (!p->zero) memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
   copy->zero = p->zero;
@@ -84,29 +89,29 @@ static void own(Context& c, Plane*& p) {  // a plane of this group alone
   p = copy;
 }
 static void own(Context& c, Field*& f) {
-  if (f->refs == 1) return;
+  if (f != c.calm && f->refs == 1) return;
   Field* copy = take_field(c);
-  memcpy(copy->data, f->data, sizeof(float) * LANES * c.g.height * c.g.stride);
+  if (!f->still) memcpy(copy->data, f->data, sizeof(float) * LANES * c.g.height * c.g.stride);
   memcpy(copy->live, f->live, LANES * c.g.height);
+  copy->still = f->still;
   give(c, f);
   f = copy;
 }
 static void reset_slots(Context& c) {
   for (const ResetPlane& r : RESET_PLANES) {
     give(c, c.slot[r.slot]);
-    if (!r.value) {
-      c.slot[r.slot] = keep(c.nothing);
-      continue;
-    }
-    Plane* p = c.slot[r.slot] = take(c);
-    for (int i = 0; i < c.g.cells(); i++) p->data[i] = c.valid(i % c.g.words);
-    p->zero = false;
+    c.slot[r.slot] = keep(r.value ? c.everything : c.nothing);
   }
   for (const ResetReal& r : RESET_REALS) {
     give(c, c.real[r.slot]);
+    if (r.value == 0) {
+      c.real[r.slot] = keep(c.calm);
+      continue;
+    }
     Field* f = c.real[r.slot] = take_field(c);
-    memset(f->live, r.value != 0, LANES * c.g.height);
-    if (r.value != 0) std::fill(f->data, f->data + (size_t)LANES * c.g.height * c.g.stride, r.value);
+    memset(f->live, 1, LANES * c.g.height);
+    f->still = false;
+    std::fill(f->data, f->data + (size_t)LANES * c.g.height * c.g.stride, r.value);
   }
 }
 struct Clocks {
@@ -280,6 +285,7 @@ API void* pd_copy(const void* batch) {
       const Field* from = a->groups[n].real[i];
       Field* to = b->groups[n].real[i];
       memcpy(to->live, from->live, LANES * a->g.height);
+      to->still = from->still;
       for (int r = 0; r < LANES * a->g.height; r++)
         if (from->live[r]) memcpy(to->data + (size_t)r * a->g.stride, from->data + (size_t)r * a->g.stride, sizeof(float) * a->g.stride);
     }
@@ -301,6 +307,10 @@ API void pd_store(const void* batch, int slot, int bits, int negative, int item,
 API void pd_load_real(void* batch, int slot, const float* data, int64_t world_stride) {
   Batch& b = *(Batch*)batch;
   Context* c = borrow(b.g);
+  for (Group& group : b.groups) {
+    group.real[slot]->still = true;
+    memset(group.real[slot]->live, 0, LANES * b.g.height);
+  }
   for (int world = 0; world < b.worlds; world++) {
     Field* f = b.groups[world / LANES].real[slot];
     for (int y = 0; y < b.g.height; y++) {
@@ -308,6 +318,7 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
       float* row = f->data + (size_t)r * b.g.stride + HALO;
       memcpy(row, data + world * world_stride + (int64_t)y * b.g.width, sizeof(float) * b.g.width);
       f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
+      if (f->live[r]) f->still = false;
       finish_row(*c, row);
     }
   }

@@ -202,3 +202,20 @@ def prerequisites(node: Node, have: Callable[[Node], bool]) -> list[Node]:
 
     visit(node, True)
     return list(found.values())
+
+
+def zero_with(node: Node, planes: dict[int, str]) -> frozenset[str] | None:
+    """Planes such that if all of them are empty, the value is too; None if none are known."""
+    if id(node) in planes:
+        return frozenset({planes[id(node)]})
+    if node.op == "const":
+        return None if node.attr else frozenset()
+    if node.op == "shift":
+        return zero_with(node.args[0], planes)
+    if node.op == "and":
+        found = [names for arg in node.args if (names := zero_with(arg, planes)) is not None]
+        return min(found, key=len, default=None)
+    if node.op in ("or", "xor", "select"):
+        parts = [zero_with(arg, planes) for arg in node.args[node.op == "select" :]]
+        return None if any(part is None for part in parts) else frozenset().union(*(part or () for part in parts))
+    return None

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from powderdsl.backends.native_layout import Layout
-from powderdsl.backends.native_loops import ANCHORS, DRAWS, Loop, is_clean, is_uniform, prerequisites
+from powderdsl.backends.native_loops import ANCHORS, DRAWS, Loop, is_clean, is_uniform, prerequisites, zero_with
 from powderdsl.backends.native_sweeps import Sweep, leading, quiet, rows_read, stored_parts, sweep_needs, unchanged
 from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, walk
 
@@ -15,12 +15,19 @@ _VARIABLE = re.compile(r"\b[pf][0-9]+\b")
 
 @dataclass(frozen=True)
 class Lanes:
-    """A sweep: what comes before, the rows of one world `l`, what comes after; and the fields it writes."""
+    """A sweep: what it writes, the rows of one world `l`, and what tells that nothing at all is going on."""
 
+    outputs: tuple[tuple[str, bool], ...]
+    """Names of fields (f…) and planes (p…), and what a flag is in cells where all reals are zero."""
     before: str
     rows: str
     after: str
-    fields: tuple[str, ...]
+    asked: tuple[str, ...] | None
+    """Conditions under which all outputs are quiet, besides outputs of sweeps in the same loop; None: never."""
+
+    @property
+    def fields(self) -> set[str]:
+        return {name for name, _ in self.outputs if name.startswith("f")}
 
 
 @dataclass
@@ -74,7 +81,16 @@ def _lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
     before = "\n".join(sweep.before for sweep in run)
     rows = "\n".join(f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}" for sweep in run)
     after = "\n".join(sweep.after for sweep in run)
-    return f"{before}\nfor (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
+    loop = f"{before}\nfor (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
+    outputs = [output for sweep in run for output in sweep.outputs]
+    declared = " ".join(f"{'Field' if name.startswith('f') else 'Plane'}* {name};" for name, _ in outputs)
+    if any(sweep.asked is None for sweep in run):
+        return f"{declared}\n{loop}"
+    asked = dict.fromkeys(c for sweep in run for c in sweep.asked or () if not set(_VARIABLE.findall(c)) & written)
+    quiet_values = " ".join(
+        f"{name} = keep(c.{'calm' if name.startswith('f') else 'everything' if value else 'nothing'});" for name, value in outputs
+    )
+    return f"{declared}\nif ({' && '.join(asked) or 'true'}) {{ {quiet_values} }} else {{\n{loop}\n}}"
 
 
 class PassWriter:
@@ -351,7 +367,7 @@ class PassWriter:
         if rest:
             loop = Loop(self.planes, self.layout)
             outputs = [(self.fresh("p"), loop.clean(node)) for node in rest]
-            self.emit_loop(loop, outputs)
+            self.emit_loop(loop, outputs, [zero_with(node, self.planes) for node in rest])
             for node, (name, _) in zip(rest, outputs, strict=True):
                 self.planes[id(node)] = name
 
@@ -370,14 +386,21 @@ class PassWriter:
             return "keep(c.nothing)"
         return None
 
-    def emit_loop(self, loop: Loop, outputs: list[tuple[str, str]]) -> None:
-        takes = " ".join(f"Plane* {name} = take(c); V a{name} = splat(0);" for name, _ in outputs)
+    def emit_loop(self, loop: Loop, outputs: list[tuple[str, str]], empty: list[frozenset[str] | None] | None = None) -> None:
+        """A loop that fills planes. `empty`: planes of which it is known that if they are empty, so is the output."""
+        takes = " ".join(f"{name} = take(c); V a{name} = splat(0);" for name, _ in outputs)
+        declared = "Plane " + ", ".join(f"*{name}" for name, _ in outputs) + ";\n"
+        nothing = ""
+        if empty and all(names is not None for names in empty):
+            asked = " && ".join(sorted({f"{name}->zero" for names in empty for name in names or ()})) or "true"
+            nothing = f"if ({asked}) {{ {' '.join(f'{name} = keep(c.nothing);' for name, _ in outputs)} }} else "
         stores = "\n".join(f"{{ const V o = {value}; {name}->data[i] = o; a{name} |= o; }}" for name, value in outputs)
         ends = " ".join(f"{name}->zero = !any(a{name});" for name, _ in outputs)
         body = "\n".join(loop.lines)
         self.block.statements.append(
-            f"{takes}\nfor (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) {{ const V valid = c.valid(w); (void)valid;\n"
-            f"{body}\n{stores}\n}}\n{ends}"
+            f"{declared}{nothing}{{\n{takes}\n"
+            "for (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) { const V valid = c.valid(w); (void)valid;\n"
+            f"{body}\n{stores}\n}}\n{ends}\n}}"
         )
 
     # Reals
@@ -389,6 +412,7 @@ class PassWriter:
         nodes = sorted(nodes, key=lambda n: (n.type != REAL, id(n) not in leaders))
         values, masks, _ = quiet(nodes, self.have)
         sweep = Sweep(self.planes, self.fields, self.layout)
+        sweep.wanted = [n for n in dict.fromkeys(i for node in nodes if node.type == REAL for i in walk(node)) if n.op == "select" and n.type == REAL]
         outputs = []
         for node in nodes:
             if node.type == REAL:
@@ -400,20 +424,20 @@ class PassWriter:
         takes, row_start, stores, word_end, row_end, quiet_row = [], [], [], [], [], []
         for position, (node, name, value) in enumerate(outputs):
             if node.type == REAL:
-                takes.append(f"Field* {name} = take_field(c);")
+                takes.append(f"{name} = take_field(c); bool some{name} = false;")
                 row_start.append(f"float* o{name} = {name}->data + ((size_t)l{name} * height + y) * c.g.stride + HALO; u32 n{name} = 0;")
                 stores.append(f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= bits_of(o != splatf(0)) & inside; }}")
-                row_end.append(f"finish_row(c, o{name}); {name}->live[l{name} * height + y] = n{name} != 0;")
+                row_end.append(f"finish_row(c, o{name}); {name}->live[l{name} * height + y] = n{name} != 0; some{name} |= n{name} != 0;")
                 quiet_row.append(f"{name}->live[l{name} * height + y] = 0;")
             else:
-                takes.append(f"Plane* {name} = take(c); u64 a{name} = 0;")
+                takes.append(f"{name} = take(c); u64 a{name} = 0;")
                 row_start.append(f"u64 u{name} = 0;")
                 stores.append(f"u{name} |= (u64)({value}) << (x & 63);")
                 rest = bool(values[position]) if values else False
                 word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q; a{name} |= q;"
                 word_end.append(f"{{ const u64 q = u{name} & c.valid(w)[l]; {word} u{name} = 0; }}")
                 quiet_row.append(f"for (int w = 0; w < words; w++) {{ const u64 q = {'c.valid(w)[l]' if rest else '0'}; {word} }}")
-        ends = " ".join(f"{name}->zero = !a{name};" for node, name, _ in outputs if node.type != REAL)
+        ends = " ".join(f"{name}->zero = !a{name};" if node.type != REAL else f"{name}->still = !some{name};" for node, name, _ in outputs)
         pads = " ".join(
             f"for (int l = c.lanes; l < LANES; l++) for (int i = 0; i < height * words; i++) ((u64*){name}->data)[i * LANES + l] = 0;"
             if node.type != REAL else f"for (int l = c.lanes; l < LANES; l++) memset({name}->live + l * height, 0, height);"
@@ -423,12 +447,17 @@ class PassWriter:
         words = [f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];" for plane, name in sweep.words.items()]
         words += [f"const u64 {name} = {joined};" for joined, name in sweep.joined.items()]
         check = ""
+        asked: tuple[str, ...] | None = None
         if values is not None:
-            busy = [self.busy(node, dy, wraps) for node, dy, wraps in rows_read(nodes, self.have)]
+            read = rows_read(nodes, self.have)
+            busy = [self.busy(node, dy, wraps) for node, dy, wraps in read]
             gates = [f"((const u64*){self.planes[id(m)]}->data)[(y * words + w) * LANES + l]" for m in masks if m.op != "param"]
             scan = f"for (int w = 0; w < words; w++) some |= {' | '.join(gates)};" if gates else ""
             fixed = "true" if any(m.op == "param" for m in masks) else " || ".join(busy) or "false"
             check = f"{{ u64 some = ({fixed}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet_row)} continue; }} }}"
+            if not any(m.op == "param" for m in masks):
+                still = [f"{self.fields[id(node)]}->still" for node, _, _ in read]
+                asked = (*still, *(f"{self.planes[id(m)]}->zero" for m in masks))
         body = "\n".join([
             f"{check}\n{rows} {' '.join(row_start)}",
             f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
@@ -436,22 +465,27 @@ class PassWriter:
             "const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;",
             *sweep.lines, *stores, "}", " ".join(word_end), "}", " ".join(row_end),
         ])  # fmt: skip
-        fields = tuple(name for node, name, _ in outputs if node.type == REAL)
+        written = tuple((name, bool(values[i]) if values else False) for i, (_, name, _) in enumerate(outputs))
         kept = [unchanged(node) for node in nodes]
         if all(kept) and all(self.have(base) for base, _ in kept):  # type: ignore[misc]
-            gates = list(dict.fromkeys(f"{self.planes[id(mask)]}->zero" for _, masks in kept for mask in masks))  # type: ignore[misc]
-            declared = " ".join(f"Field* {name};" for name in fields)
-            same = " ".join(f"{name} = keep({self.fields[id(base)]});" for (_, name, _), (base, _) in zip(outputs, kept, strict=True))  # type: ignore[misc]
-            new = " ".join(f"{name} = take_field(c);" for name in fields)
-            scan = " | ".join(f"((const u64*){self.planes[id(m)]}->data)[(y * words + w) * LANES + l]" for m in {id(m): m for _, ms in kept for m in ms}.values())  # type: ignore[misc]
-            copies = " ".join(f"copy_row(c, {name}, {self.fields[id(base)]}, l, y);" for (_, name, _), (base, _) in zip(outputs, kept, strict=True))  # type: ignore[misc]
-            still = f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; if (!some) {{ {copies} continue; }} }}\n"
-            loop = _lane_loop([Lanes(pads, still + body, "", fields)], set(fields))
-            self.block.statements.append(f"{declared}\nif ({' && '.join(gates) or 'true'}) {{ {same} }} else {{ {new}\n{loop}\n}}")
+            self.changed_rows(outputs, kept, Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, None))  # type: ignore[arg-type]
         else:
-            self.block.statements.append(Lanes(f"{' '.join(takes)}\n{pads}", body, ends, fields))
+            self.block.statements.append(Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, asked))
         for node, name, _ in outputs:
             (self.fields if node.type == REAL else self.planes)[id(node)] = name
+
+    def changed_rows(self, outputs: list[tuple[Node, str, str]], kept: list[tuple[Node, list[Node]]], sweep: Lanes) -> None:
+        """Settled slots under choices stay as they are where no choice holds: whole fields, or row by row."""
+        masks = {id(mask): self.planes[id(mask)] for _, chosen in kept for mask in chosen}.values()
+        scan = " | ".join(f"((const u64*){plane}->data)[(y * words + w) * LANES + l]" for plane in masks)
+        pairs = [(name, self.fields[id(base)]) for (_, name, _), (base, _) in zip(outputs, kept, strict=True)]
+        copies = " ".join(f"some{name} |= copy_row(c, {name}, {base}, l, y);" for name, base in pairs)
+        still = f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; if (!some) {{ {copies} continue; }} }}\n"
+        loop = _lane_loop([replace(sweep, rows=still + sweep.rows)], sweep.fields)
+        declared, _, rest = loop.partition("\n")
+        same = " ".join(f"{name} = keep({base});" for name, base in pairs)
+        empty = " && ".join(f"{plane}->zero" for plane in masks) or "true"
+        self.block.statements.append(f"{declared}\nif ({empty}) {{ {same} }} else {{\n{rest}\n}}")
 
     def busy(self, node: Node, dy: int, wraps: bool) -> str:
         name = self.fields[id(node)]

@@ -94,6 +94,7 @@ struct Field {
   float* data;    // [LANES][height][stride], column 0 at HALO
   uint8_t* live;  // [LANES][height]: rows that are not all zero; others are not to be read
   int refs;
+  bool still;  // known to have no such row
 };
 
 struct Grid {
@@ -109,7 +110,8 @@ struct Context {
   int turn[2 * HALO + 1];    // dx mod width, for rotations
   std::vector<Plane*> planes, all_planes;
   std::vector<Field*> fields, all_fields;
-  Plane* nothing;
+  Plane *nothing, *everything;
+  Field* calm;  // no row of it is live
   V* nothing_row;
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
@@ -171,7 +173,7 @@ static Plane* new_plane(const Grid& g) {  // what it holds is not defined
 }
 static Field* new_field(const Grid& g) {
   Field* f = reuse(spare_fields, field_size(g) + g.height);
-  return f ? f : new Field{aligned<float>((size_t)LANES * g.height * g.stride + CHUNK), aligned<uint8_t>(LANES * g.height), 0};
+  return f ? f : new Field{aligned<float>((size_t)LANES * g.height * g.stride + CHUNK), aligned<uint8_t>(LANES * g.height), 0, true};
 }
 static void drop(const Grid& g, Plane* p) { drop(spare_planes, p, plane_size(g), SPARE_BYTES / plane_size(g)); }
 static void drop(const Grid& g, Field* f) { drop(spare_fields, f, field_size(g) + g.height, SPARE_BYTES / field_size(g)); }
@@ -384,10 +386,11 @@ ALWAYS void finish_row(const Context& c, float* row) {
   }
 }
 
-ALWAYS void copy_row(const Context& c, Field* to, const Field* from, int lane, int y) {
+ALWAYS bool copy_row(const Context& c, Field* to, const Field* from, int lane, int y) {
   size_t at = lane * (size_t)c.g.height + y;
   to->live[at] = from->live[at];
   if (from->live[at]) memcpy(to->data + at * c.g.stride, from->data + at * c.g.stride, sizeof(float) * c.g.stride);
+  return from->live[at];
 }
 
 // Seconds spent in each pass, measured only in libraries that are built to be profiled.

@@ -67,6 +67,8 @@ class Sweep:
         self.words: dict[str, str] = {}
         self.joined: dict[str, str] = {}
         self.flags: dict[int, str] = {}
+        self.wanted: list[Node] = []
+        """Choices that this sweep will compute anyway."""
         self.used: set[str] = set()
         self.counter = [0]
 
@@ -163,6 +165,14 @@ class Sweep:
                 return self.temporary(f"settle({values[0]}, {literal(lo)}, {literal(hi)}, SNAP)")
         raise AssertionError(f"no native sweep for {node.op}")
 
+    def chain(self, node: Node) -> list[Node]:
+        """A choice and those below it in its third argument, the outermost first; empty if it is none."""
+        chain: list[Node] = []
+        while node.op == "select" and not self.have(node) and (id(node), 0, 0) not in self.memo:
+            chain.append(node)
+            node = node.args[2]
+        return chain
+
     def comparison(self, node: Node, leaders: dict[int, Node]) -> str:
         """Sixteen bits of a comparison; nothing is computed where the comparison that leads it fails everywhere."""
         leader = leaders.get(id(node))
@@ -181,23 +191,30 @@ class Sweep:
 
     def select(self, node: Node) -> str:
         """Choices laid over each other. Where no cell of the chunk is chosen, nothing of a choice is computed."""
-        chain = [node]
-        while (inner := chain[-1].args[2]).op == "select" and not self.have(inner) and (id(inner), 0, 0) not in self.memo:
-            chain.append(inner)
-        base = self.value(chain[-1].args[2])
-        self.counter[0] += 1
-        name = f"v{self.counter[0]}"
-        self.lines.append(f"F {name} = {base};")
+        chain = self.chain(node)
+        masks = [choice.args[0] for choice in chain]
+        # Parts of a vector hang on the same masks: they are tested once for both.
+        alike = [self.chain(other) for other in self.wanted if other is not node and (id(other), 0, 0) not in self.memo]
+        chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
+        names = []
+        for one in chains:
+            base = self.value(one[-1].args[2])
+            self.counter[0] += 1
+            names.append(f"v{self.counter[0]}")
+            self.lines.append(f"F {names[-1]} = {base};")
         block = self.inner()
-        for choice in reversed(chain):
-            mask, yes, no = choice.args
-            block.memo[id(no), 0, 0] = name
-            nested = block.inner()
-            chosen = nested.value(yes)
+        for level in reversed(range(len(chain))):
             self.counter[0] += 1
             bits = f"b{self.counter[0]}"
-            body = " ".join([*nested.lines, f"{name} = blend({bits}, {chosen}, {name});"])
-            block.lines.append(f"if (const u32 {bits} = {self.mask(mask)}) {{ {body} }}")
+            nested = block.inner()
+            for one, name in zip(chains, names, strict=True):
+                nested.memo[id(one[level].args[2]), 0, 0] = name  # here only: further on the name holds another value
+            chosen = [nested.value(one[level].args[1]) for one in chains]
+            blends = [f"{name} = blend({bits}, {value}, {name});" for name, value in zip(names, chosen, strict=True)]
+            block.lines.append(f"if (const u32 {bits} = {self.mask(masks[level])}) {{ {' '.join([*nested.lines, *blends])} }}")
+        for one, name in zip(chains[1:], names[1:], strict=True):
+            self.memo[id(one[0]), 0, 0] = name
+        name = names[0]
         lines = "\n".join(block.lines)
         if len(chain) > 2:
             words = " | ".join(dict.fromkeys(self.word(choice.args[0]) for choice in chain))

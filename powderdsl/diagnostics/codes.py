@@ -70,7 +70,7 @@ _ROWS = (
     ("PD502", "write-conflict", _ERROR),
     ("PD503", "rule-never-fires", _WARNING),
     ("PD504", "element-never-appears", _NOTE),
-    ("PD505", "empty-set", _WARNING),
+    ("PD505", "empty-set", _NOTE),
     ("PD506", "rule-asleep", _NOTE),
     ("PD507", "unused-definition", _WARNING),
     ("PD508", "expansion-too-large", _ERROR),

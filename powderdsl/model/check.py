@@ -74,7 +74,9 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
 
 def _facts(symbols: Symbols) -> Facts:
     limited = {name: f.of for name, f in symbols.fields.items() if f.of is not None}
-    return Facts(symbols.ids, symbols.properties, limited, {name: symbols.fields[name].default for name in limited})
+    defaults = {name: symbols.fields[name].default for name in limited}
+    names = {element.id: name for name, element in symbols.composition.elements.items()}
+    return Facts(symbols.ids, symbols.properties, limited, defaults, names)
 
 
 def _params(symbols: Symbols, typer: Typer) -> None:
@@ -239,7 +241,7 @@ def _tagged(element: Element, composition: Composition) -> Element:
 
 
 def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tuple[Stream, ...]:
-    streams = [*symbols.streams.values(), *elaborated.streams]
+    streams = [*symbols.streams.values(), *elaborated.streams.values()]
     by_ident: dict[int, str] = {}
     for stream in streams:
         other = by_ident.setdefault(stream.ident, stream.name)

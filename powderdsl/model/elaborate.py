@@ -70,7 +70,7 @@ class Elaborated:
     """What came of the passes, besides the passes: facts that later checks and stages need."""
 
     passes: list[Pass] = field(default_factory=list)
-    streams: list[Stream] = field(default_factory=list)
+    streams: dict[str, Stream] = field(default_factory=dict)
     overridden: set[str] = field(default_factory=set)
     asleep: dict[Span, str] = field(default_factory=dict)
     empty: dict[Span, str] = field(default_factory=dict)
@@ -103,7 +103,7 @@ class Elaborator:
     def _pass(self, named: Named[PassDecl]) -> Pass:
         decl = named.decl
         self._name, self._pack = decl.name.text, named.pack
-        self._chances = 0
+        self._numbers = {id(rule): number for number, rule in enumerate(_rules_of(decl.block))}
         self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
         self._pending: list[Let] = []
@@ -205,9 +205,12 @@ class Elaborator:
 
     def _moment(self, rules: tuple[Syntax, ...], scope: Scope, label: str, symmetry: str | None, policy: str | None) -> None:
         found: list[Rule] = []
+        self._label = label
         for syntax in rules:
+            copies: list[Rule] = []
             for matrix in ORIENTATIONS[symmetry]:
-                found.extend(rule for rule in self._rule(syntax, replace(scope, orientation=matrix)) if rule not in found)
+                copies.extend(rule for rule in self._rule(syntax, replace(scope, orientation=matrix)) if rule not in copies)
+            found.extend(copies)
         self._rules += len(found)
         if self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
             raise self.typer.fail(
@@ -247,9 +250,10 @@ class Elaborator:
             if clause := syntax.child(kind):
                 parts.append(self.typer.condition(clause.children[0], scope))
         if clause := syntax.child("chance"):
-            self._chances += 1
-            name = f"{self._pack}.{self._name}#{self._chances}"
-            self.result.streams.append(Stream(name, stream_ident(name), 32))
+            # Named by where the rule stands, not by how many were unrolled before it: other packs shift nothing.
+            label = f"[{self._label}]" if self._label else ""
+            name = f"{self._pack}.{self._name}#{self._numbers[id(syntax)]}{label}"
+            self.result.streams[name] = Stream(name, stream_ident(name), 32)
             parts.append(self.typer.chance_draw(name, clause.children[0], scope))
         return conjunction(parts, syntax.span)
 
@@ -364,6 +368,12 @@ class Elaborator:
             vector = Expr("vector", VEC2, parts, span=amount.span)
             rules.append(Assign(name, (dy, dx), "+=", vector, mask, syntax.span))
         return rules
+
+
+def _rules_of(block: Block) -> list[Syntax]:
+    """All rules of a block, in the order they are written."""
+    inner = [rule for child in (*block.blocks, *block.then) for rule in _rules_of(child)]
+    return [*block.rules, *inner]
 
 
 def _show(operand: Operand) -> str:

@@ -35,14 +35,14 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
             helps = (*suggest(name, composition.elements, "elements"), f"if its pack may be absent, write `{name}?`")
             raise typer.fail("PD301", f"unknown element `{name}`", value.span, helps=helps)
         if len(key.text) != 1:
-            raise typer.fail("PD110", "a legend explains single characters", key.span)
+            raise typer.fail("PD110", "a legend explains single characters", key.span, "not one character")
         legend[key.text] = name
     if decl.given is None:
         raise typer.fail("PD109", f"the test `{decl.name}` has no start world", decl.scalar.span, "`given` is missing")
     given = _rows(decl.given, legend, typer, wildcard=False)
     expect = _rows(decl.expect, legend, typer, wildcard=True) if decl.expect else None
     if expect is not None and decl.expect is not None and (len(expect), len(expect[0])) != (len(given), len(given[0])):
-        raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span)
+        raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, f"`given` has {len(given)} rows of {len(given[0])} cells")
     if expect is None and not decl.always:
         raise typer.fail("PD109", f"the test `{decl.name}` checks nothing", decl.scalar.span, "`expect` or `always` is missing")
     always: list[Expr] = [typer.condition(syntax, Scope(pack, {})) for syntax in decl.always]

@@ -239,7 +239,7 @@ class Typer(Coercer):
                 return arithmetic.part(base, syntax.text, syntax.span)
             raise self.fail("PD301", f"a vector has no `{syntax.text}`", word, "not a part of it", helps=("parts of a vector: `.row`, `.column`",))
         if not isinstance(base, Place):
-            raise self.wrong(base, "a neighbour before the dot", base_syntax.span, "such as `below.density`")
+            raise self.wrong(base, "a neighbour before the dot", base_syntax.span, "such as `below.FIELD`")
         value = self.lookup(syntax.text, word, scope, after_dot=True)
         match value:
             case Place():
@@ -422,7 +422,7 @@ class Typer(Coercer):
             raise self.fail("PD301", f"unknown function `{syntax.text}`", name_span, "not a function", suggest(syntax.text, FUNCTIONS, "functions"))
         lo, hi = function.arity
         if not lo <= len(syntax.children) <= hi:
-            raise self.fail("PD406", f"`{syntax.text}` takes {lo if lo == hi else f'{lo} to {hi}'} values, found {len(syntax.children)}", syntax.span, "too few" if len(syntax.children) < lo else "too many", helps=(f"write `{function.signature}`",))
+            raise self.fail("PD406", f"`{syntax.text}` takes {'1 value' if lo == hi == 1 else f'{lo} values' if lo == hi else f'{lo} to {hi} values'}, found {len(syntax.children)}", syntax.span, "too few" if len(syntax.children) < lo else "too many", helps=(f"write `{function.signature}`",))
         return CALLS[syntax.text](self, syntax, scope)
 
     def binary(self, syntax: Syntax, scope: Scope) -> Operand:

@@ -1,17 +1,16 @@
-"""The logic of rules, decided before anything runs: movements that collide, writes that clash, rules that never fire."""
+"""The logic of rules, decided before anything runs: collisions, writes that clash, rules that never fire."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.operands import ELEMENT_HERE, negation
 from powderdsl.model.operands import member as member_of
-from powderdsl.model.satisfy import Facts, satisfiable
+from powderdsl.model.satisfy import Facts, example, satisfiable
 from powderdsl.model.types import (
     Assign,
     Expr,
@@ -41,21 +40,21 @@ class Conflict:
     notes: tuple[str, ...]
     helps: tuple[str, ...]
 
-    def report(self, labels: list[str], reporter: Reporter) -> None:
-        """Report it once, whatever the number of rounds that have it."""
+    def report(self, labels: list[str], example: str, reporter: Reporter) -> None:
+        """Report it once, whatever the number of rounds that have it. `example` is for the first of them."""
         where = f" ({labels[0]})" if labels[0] else ""
-        notes = list(self.notes)
+        notes = [*filter(None, [example]), *self.notes]
         if len(labels) > 1:
             more = "copy" if len(labels) == 2 else "copies"
             notes.append(f"the same in {len(labels) - 1} more {more} of the rule that its loop or symmetry makes")
         one = self.first == self.second
         reporter.error(
-            self.code, self.message + where, head(self.second), "claims two cells" if one else "claims it too",
-            secondary=[] if one else [Label(head(self.first), "claims a cell")], notes=notes, helps=self.helps,
+            self.code, self.message + where, claim(self.second), "two of these can meet" if one else "claims it too",
+            secondary=[] if one else [Label(claim(self.first), "claims a cell")], notes=notes, helps=self.helps,
         )  # fmt: skip
 
 
-def head(span: Span) -> Span:
+def claim(span: Span) -> Span:
     """What a rule does, without its condition: the part of its text to underline."""
     rest = re.search(r",?\s+(if|where|with|then)\b", span.text)
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
@@ -64,10 +63,10 @@ def head(span: Span) -> Span:
 def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, reporter: Reporter) -> None:
     """Report conflicts (errors), rules that never fire or do nothing (warnings), and those that sleep (notes)."""
     relaxed = facts.relaxed()
-    thinkable: set[Span] = set()
+    silent: dict[Span, list[tuple[Expr, dict[str, Expr]]]] = {}
     alive: dict[Span, bool] = {}
     useful: dict[Span, bool] = {}
-    conflicts: dict[Conflict, list[str]] = {}
+    conflicts: dict[Conflict, tuple[str, list[str]]] = {}
     for pass_ in passes:
         for moment in pass_.moments:
             lets = {let.name: let.value for let in moment.lets}
@@ -78,11 +77,11 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
                 useful[rule.span] = useful.get(rule.span, False) or not fires or _changes(rule, facts, lets)
                 if fires:
                     live.append(rule)
-                elif rule.mask is not None and satisfiable(relaxed, [(rule.mask, HERE)], lets):
-                    thinkable.add(rule.span)
+                elif rule.mask is not None:
+                    silent.setdefault(rule.span, []).append((rule.mask, lets))
             if moment.policy == "prove":
-                for conflict in _check_moment(live, facts, lets):
-                    conflicts.setdefault(conflict, []).append(moment.label)
+                for conflict, words in _check_moment(live, facts, lets):
+                    conflicts.setdefault(conflict, (words, []))[1].append(moment.label)
     if facts.budget.is_exhausted:
         busiest = max(passes, key=lambda pass_: sum(len(moment.rules) ** 2 for moment in pass_.moments))
         reporter.error(
@@ -90,14 +89,14 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
             helps=["put rules that need not happen at once under `then:`", "or choose what happens to conflicts: `conflicts: first_wins`"],
         )  # fmt: skip
         return
-    for conflict, labels in conflicts.items():
-        conflict.report(labels, reporter)
+    for conflict, (words, labels) in conflicts.items():
+        conflict.report(labels, words, reporter)
     for span, fires in alive.items():
         if not fires and span in elaborated.asleep:
             _report_sleep(f"`{elaborated.asleep[span]}` is not loaded", span, reporter)
         elif not fires and span in elaborated.empty:
             _report_sleep(f"no element is in `{elaborated.empty[span]}`", span, reporter)
-        elif not fires and span in thinkable:
+        elif not fires and any(satisfiable(relaxed, [(mask, HERE)], lets) for mask, lets in silent.get(span, [])):
             _report_sleep("no loaded element has the properties it asks for", span, reporter)
         elif not fires:
             reporter.report(
@@ -125,29 +124,52 @@ def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
     return True
 
 
-def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Iterator[Conflict]:
-    """The conflicts of one moment: for each rule the first rule before it, or itself, that it collides with."""
+def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Iterator[tuple[Conflict, str]]:
+    """The conflicts of one moment, with an example: for each rule the first one, maybe itself, that it meets."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
     for i, second in enumerate(movers):
         for first in (second, *movers[:i]):
             if facts.budget.is_exhausted:
                 return
-            if any(satisfiable(facts, [(first.mask, HERE), (second.mask, at)], lets) for at in _claims(first, second)):
-                yield _conflict(first, second)
+            questions = [((first.mask, HERE), (second.mask, at)) for at in _claims(first, second)]
+            possible = next((one for one in questions if satisfiable(facts, one, lets)), None)
+            if possible:
+                yield _conflict(first, second), _in_words(facts, possible, lets)
                 break
-    assigns = [rule for rule in rules if isinstance(rule, Assign) and rule.op == ":="]
-    for i, b in enumerate(assigns):
-        for a in assigns[:i]:
-            if a.field != b.field or a.value == b.value:
+    plain = [(rule, rule.mask) for rule in rules if isinstance(rule, Assign)]
+    effects = [(effect, rule.mask) for rule in movers for effect in rule.effects]
+    for assigns in (plain, effects):
+        yield from _check_assigns(assigns, facts, lets)
+
+
+def _check_assigns(
+    assigns: list[tuple[Assign, Expr | None]], facts: Facts, lets: dict[str, Expr]
+) -> Iterator[tuple[Conflict, str]]:
+    """Two `:=` of one field must not meet in a cell with different values."""
+    sets = [(assign, mask) for assign, mask in assigns if assign.op == ":=" and mask is not None]
+    for i, (b, second) in enumerate(sets):
+        for a, first in sets[:i]:
+            if a.field != b.field or a.value == b.value or facts.budget.is_exhausted:
                 continue
-            if facts.budget.is_exhausted:
-                return
             shift = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
-            assert a.mask is not None and b.mask is not None
-            if satisfiable(facts, [(a.mask, HERE), (b.mask, shift)], lets):
+            question = ((first, HERE), (second, shift))
+            if satisfiable(facts, question, lets):
                 message = f"two rules may assign `{a.field}` of one cell in the same moment"
-                yield Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
+                conflict = Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
+                yield conflict, _in_words(facts, question, lets)
                 break
+
+
+_PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the left", (0, 1): "on the right"}
+
+
+def _in_words(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr]) -> str:
+    """What may stand where the conditions hold together, such as `x` here and `y` below."""
+    found = sorted(example(facts, conditions, lets).items())
+    if not 0 < len(found) <= 4:
+        return ""
+    places = [f"`{facts.names[n]}` {_PLACES.get(at) or f'at({at[0]}, {at[1]})'}" for at, n in found if n in facts.names]
+    return "for example with " + " and ".join(filter(None, [", ".join(places[:-1]), places[-1]])) if places else ""
 
 
 def _claims(first: Rule, second: Rule) -> Iterator[Offset]:

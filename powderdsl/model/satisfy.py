@@ -21,8 +21,8 @@ MAX_STEPS = 20_000
 MAX_LET = 150
 """Nodes of a let's value that are looked through; a larger one is taken for free."""
 
-BUDGET = 600_000
-"""Nodes evaluated in all questions about one ruleset: a few seconds. The largest shipped ruleset needs a twentieth of it."""
+BUDGET = 1_000_000
+"""Nodes evaluated in all questions about one ruleset: a few seconds. The largest shipped ruleset needs a thirtieth of it."""
 
 QUESTION = 60
 """What a question costs besides its evaluations."""
@@ -57,6 +57,8 @@ class Facts:
     field_sets: dict[str, frozenset[int]]
     """Fields that exist only on some elements: elsewhere they read their default."""
     field_defaults: dict[str, object]
+    names: dict[int, str] = field(default_factory=dict, compare=False, repr=False)
+    """Names of the elements by id, for examples in messages."""
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
 
 
@@ -80,6 +82,9 @@ class Search:
         self.facts = facts
         self.lets = lets or {}
         self.conditions: list[tuple[Expr, Offset]] = []
+        self._chosen: Assignment = {}
+        self._domains: dict[Key, list[object]] = {}
+        self._steps = 0
         self._opened: dict[str, tuple[Expr, int]] = {}
 
     def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
@@ -143,7 +148,15 @@ class Search:
         rest = [(c, at, keys) for c, at, keys in checks if len(keys) > 1]
         order = sorted({key for _, _, keys in rest for key in keys}, key=lambda key: len(domains[key]))
         self._steps = 0
-        return self._assign(order, 0, domains, rest, {})
+        self._domains = domains
+        return self._assign(order, 0, domains, rest, self._chosen)
+
+    def example(self) -> dict[Offset, int]:
+        """After `possible`: an element for each place that the conditions ask about; nothing if the search gave up."""
+        if self._steps > MAX_STEPS:
+            return {}
+        keys = [key for key in self._domains if key[0] == "element"]
+        return {key[2]: int(str(self._chosen.get(key, self._domains[key][0]))) for key in keys}
 
     def _assign(self, order: list[Key], index: int, domains: dict[Key, list[object]], rest: list, chosen: Assignment) -> bool:  # type: ignore[type-arg]
         if index == len(order):
@@ -221,7 +234,10 @@ class Search:
         return frozenset(found)
 
     def _value(self, node: Expr, at: Offset, chosen: Assignment):  # type: ignore[no-untyped-def]
-        self.facts.budget.spend(1)
+        budget = self.facts.budget  # `spend` written out: this is where the time goes
+        budget.left -= 1
+        if budget.left < 0:
+            raise _Exhausted
         match node.op:
             case "const":
                 return node.value
@@ -303,3 +319,14 @@ def satisfiable(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: d
         return search.possible()
     except _Exhausted:
         return True
+
+
+def example(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr]) -> dict[Offset, int]:
+    """Elements by place with which the conditions hold together, or nothing where none can be told."""
+    try:
+        search = Search(facts, lets)
+        for condition, at in conditions:
+            search.require(condition, at)
+        return search.example() if search.possible() else {}
+    except _Exhausted:
+        return {}

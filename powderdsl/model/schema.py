@@ -208,7 +208,9 @@ class Reader:
     def _check_shape(self, row: Key, key: Scalar, value: Node) -> None:
         wants_scalar = row.shape in ("text", "word", "number", "flag", "line")
         if wants_scalar and not isinstance(value, Scalar):
-            self.shape(value, f"a single value for `{key.text}`", f"`{key.text}`: {row.about}")
+            is_set = row.shape == "line" and isinstance(value, Sequence)
+            cure = "a set is written `(a, b)`" if is_set else f"`{key.text}`: {row.about}"
+            self.shape(value, f"a single value for `{key.text}`", cure)
 
     def named(self, node: Node | None, what: str) -> Iterator[tuple[Scalar, Node]]:
         """Entries of a mapping whose keys are new names; bad names are reported and left out."""
@@ -261,13 +263,13 @@ class Reader:
         value = self.scalar(entries, key)
         if value is None:
             return None
-        if not re.fullmatch(r"-?(0|[1-9][0-9]{0,8})", value.text):
+        if not re.fullmatch(r"-?(0|[1-9][0-9]*)", value.text):
             self.reporter.error(
                 "PD110", f"`{key}` must be a whole number", value.span, "not a whole number",
                 helps=[f"write a number from {lo} to {hi}"],
             )  # fmt: skip
             return None
-        if not lo <= int(value.text) <= hi:
+        if len(value.text) > 12 or not lo <= int(value.text) <= hi:
             self.reporter.error(
                 "PD402", f"`{key}` must lie in {lo}..{hi}", value.span, "out of range",
                 helps=[f"write a number from {lo} to {hi}"],

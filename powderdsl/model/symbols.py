@@ -103,7 +103,7 @@ _KINDS_ELSEWHERE = {
 
 def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
     """A kind as written: ``0..7``, ``flag``, ``element``, ``chance``, ``real(0..1)``, ``vec2(-10..10)``."""
-    helps = ("kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",)
+    helps: tuple[str, ...] = ("kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",)
     if syntax.kind == "range":
         lo, hi = read_bounds(syntax, coercer)
         return integer(lo, hi)
@@ -112,7 +112,7 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
         if plain is not None:
             return plain
         if syntax.text in ("real", "vec2"):
-            raise coercer.fail("PD401", f"`{syntax.text}` needs bounds", syntax.span, helps=(f"write `{syntax.text}(-100..100)`",))
+            raise coercer.fail("PD401", f"`{syntax.text}` needs bounds", syntax.span, "no bounds", helps=(f"write `{syntax.text}(-100..100)`",))
     if syntax.kind == "call" and syntax.text in ("real", "vec2") and len(syntax.children) == 1:
         lo, hi = read_bounds(syntax.children[0], coercer)
         return Kind(syntax.text, lo, hi)

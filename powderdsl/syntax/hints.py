@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Set
 from difflib import get_close_matches
 
@@ -28,7 +29,22 @@ TERMINAL_WORDS = {
 """What each terminal is called in messages; keywords, which are missing here, are called by themselves."""
 
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
-_VALUES = {"NAME", "INTEGER", "DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE", "LPAR", "CHANCE", "ANY", "ALL", "MINUS", "NOT"}
+_VALUES = {
+    "NAME",
+    "INTEGER",
+    "DECIMAL",
+    "PERCENT",
+    "YES",
+    "NO",
+    "TRUE",
+    "FALSE",
+    "LPAR",
+    "CHANCE",
+    "ANY",
+    "ALL",
+    "MINUS",
+    "NOT",
+}
 _OPERATORS = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "__ANON_1"}
 
 _PAIRS = {
@@ -88,14 +104,25 @@ _WORDS = {
 CUT = "inside `{…}` and `[…]` YAML ends a value at a comma: quote it, or give it a line of its own"
 
 
-def character_help(text: str, position: int) -> str:
-    """The cure for a character that no rule contains, or an empty string."""
+def character_help(text: str, position: int, begin: int) -> str:
+    """The cure for a character that no rule contains, or an empty string. The line starts at `begin`."""
+    before = text[begin:position]
+    asks = re.search(r"\b(if|where|chance)\b", before) is not None
+    if text[position] == "=" and text[position : position + 2] == "=>" and asks:
+        return "write `>=`"
+    if text[position] == "=" and re.fullmatch(r"(.*\bthen)?\s*[\w.?]+\s*", before, re.DOTALL) and not asks:
+        return _PAIRS.get(text[position : position + 2], "assign with `:=`")
+    if text[position] == "=" and asks:
+        return _PAIRS.get(text[position : position + 2], "compare with `==`, ask for an element with `is`")
     return _PAIRS.get(text[position : position + 2]) or _CHARACTERS.get(text[position], "")
 
 
 def was_cut(text: str, begin: int, end: int) -> bool:
     """Whether a comma of YAML's `{…}` or `[…]` stands right before or after the line."""
-    return text[end : end + 64].lstrip(" ")[:1] == "," or text[max(begin - 64, 0) : begin].rstrip(" ")[-1:] == ","
+    return (
+        text[end : end + 64].lstrip(" ")[:1] == ","
+        or text[max(begin - 64, 0) : begin].rstrip(" ")[-1:] == ","
+    )
 
 
 def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
@@ -106,8 +133,12 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
     assigns = any(sign in before for sign in (":=", "+=", "-="))
     if (cut and not token) or (cut and not before.strip()):
         return CUT
+    if re.search(r"\n\s*-\s", before):
+        return "an item of a list starts with `- `: this one, or the one before it, lacks it"
     if token in (":=", "+=", "-="):
         return "only a field of this cell, or of a neighbour, can be assigned"
+    if "ELSE" in accepted and re.search(r"\bthen\b", before):
+        return "a choice has two sides: `VALUE if CONDITION else VALUE`"
     if "ELSE" in accepted and assigns and not token:
         return "an assignment says `where`: `field := value where condition`"
     if token == "if" and "WHERE" in accepted:
@@ -126,6 +157,8 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
         return "write the missing `)`"
     if token == "if" and "__ANON_0" in accepted:
         return "say what happens before the `if`: `SET -> ELEMENT if …`"
+    if token == "/" and before.endswith("/"):
+        return "write one `/`"
     if token == "->" and "->" in before:
         return "one line is one rule: put the next one on a line of its own"
     if token.endswith("%") and ("CHANCE" in accepted or before.rstrip().endswith("chance")):

@@ -99,8 +99,8 @@ def _convert(tree: Tree | Token, source: Source, fallback: Span, depth: int) -> 
 def _report_syntax_error(error: UnexpectedInput, source: Source, begin: int, end: int, reporter: Reporter) -> None:
     text = source.text
     if isinstance(error, UnexpectedCharacters):
-        start = error.pos_in_stream or begin
-        cure = character_help(text, start)
+        start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
+        cure = character_help(text, start, begin)
         reporter.error(
             "PD201", f"unexpected character `{text[start]}`", Span(source, start, start + 1), "not part of a rule",
             helps=[cure] if cure else [],
@@ -109,8 +109,8 @@ def _report_syntax_error(error: UnexpectedInput, source: Source, begin: int, end
     assert isinstance(error, UnexpectedToken)
     token = error.token
     at_end = token.type == "$END"
-    start = len(text[:end].rstrip()) if at_end else token.start_pos
-    start = min(max(start, begin), max(len(text) - 1, 0))
+    place = len(text[:end].rstrip()) if at_end or token.start_pos is None else token.start_pos
+    start = min(max(place, begin), max(len(text) - 1, 0))
     stop = start + (1 if at_end else len(token))
     accepted = set(error.accepts or error.expected or ())
     expected = expected_words(accepted)

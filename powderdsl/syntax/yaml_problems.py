@@ -1,7 +1,7 @@
 """What PyYAML complains about, in plain words: where the mistake is, and how to mend it.
 
 PyYAML reports where its scanner gave up, in its own terms. Each row of the table below knows what people
-usually did there. The words of libyaml and of the pure Python parser differ; a row lists both.
+usually did there.
 """
 
 from __future__ import annotations
@@ -66,7 +66,9 @@ class Place:
 
 def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> None:
     """Report what PyYAML raised as PD103."""
-    problem = _character(error, source) if not isinstance(error, yaml.MarkedYAMLError) else _marked(error, source)
+    problem = (
+        _character(error, source) if not isinstance(error, yaml.MarkedYAMLError) else _marked(error, source)
+    )
     reporter.error(
         "PD103",
         f"invalid YAML: {problem.message}",
@@ -83,7 +85,9 @@ def _character(error: yaml.YAMLError, source: Source) -> Problem:
     char = chr(code) if isinstance(code, int) else str(code)
     start = max(source.text.find(char), 0)
     span = Span(source, start, start + 1)
-    return Problem(f"the character U+{ord(char[0]):04X} is not allowed", span, "cannot stand in a text file", "remove it")
+    return Problem(
+        f"the character U+{ord(char[0]):04X} is not allowed", span, "cannot stand in a text file", "remove it"
+    )
 
 
 def _marked(error: yaml.MarkedYAMLError, source: Source) -> Problem:
@@ -103,14 +107,18 @@ def _second_colon(place: Place) -> Problem:
         return Problem("a second `: ` in one line", place.span(place.at), "only a key ends with `:`", QUOTE)
     start = place.at - len(place.before.lstrip())
     return Problem(
-        "a key that cannot stand here", place.span(start, place.at - start), "indented deeper than the line before, or part of it",
+        "a key that cannot stand here",
+        place.span(start, place.at - start),
+        "indented deeper than the line before, or part of it",
         "check the indentation, and that the line before ends as it should: a key with `:`",
-    )  # fmt: skip
+    )
 
 
 def _key(place: Place) -> Problem:
     if place.before.rstrip().endswith(('"', "'")):
-        return Problem("text after a closing quote", place.rest(place.at), "does not belong to the value", QUOTE)
+        return Problem(
+            "text after a closing quote", place.rest(place.at), "does not belong to the value", QUOTE
+        )
     if place.char == ":":
         return Problem("a `:` without a key", place.span(place.at), "a key is missing before it")
     return _indentation(place, "a line that does not line up", "not indented like the keys of this mapping")
@@ -122,7 +130,13 @@ def _item(place: Place) -> Problem:
 
 def _indentation(place: Place, message: str, label: str) -> Problem:
     other = None if place.same_line else Label(place.span(place.since), "which begins here")
-    return Problem(message, place.rest(place.at), label, "indent it like its neighbours, or deeper than its own key", other)
+    return Problem(
+        message,
+        place.rest(place.at),
+        label,
+        "indent it like its neighbours, or deeper than its own key",
+        other,
+    )
 
 
 def _unclosed(place: Place) -> Problem:
@@ -137,7 +151,9 @@ def _unclosed(place: Place) -> Problem:
         )  # fmt: skip
     opened = place.span(place.since)
     if place.same_line and place.at < len(place.text):
-        return Problem(f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, Label(opened, "opened here"))
+        return Problem(
+            f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, Label(opened, "opened here")
+        )
     return Problem(f"a `{opener}` that is never closed", opened, "not closed", f"write the `{closer}`")
 
 
@@ -165,7 +181,12 @@ def _word(text: str, start: int) -> str:
 def _bad_start(place: Place) -> Problem:
     if place.char == "\t":
         return _tab(place)
-    return Problem(f"a value cannot start with `{place.char}`", place.span(place.at), "has a meaning of its own in YAML", QUOTE)
+    return Problem(
+        f"a value cannot start with `{place.char}`",
+        place.span(place.at),
+        "has a meaning of its own in YAML",
+        QUOTE,
+    )
 
 
 def _tab(place: Place) -> Problem:
@@ -175,12 +196,17 @@ def _tab(place: Place) -> Problem:
 def _open_quote(place: Place) -> Problem:
     if place.text[place.since : place.since + 1] not in "\"'":
         return Problem("the file ends too early", place.span(place.at), "something is not finished")
-    return Problem("a quote that is never closed", place.span(place.since), "no closing quote", "write the closing quote")
+    return Problem(
+        "a quote that is never closed", place.span(place.since), "no closing quote", "write the closing quote"
+    )
 
 
 def _escape(place: Place) -> Problem:
     return Problem(
-        "an unknown escape", place.span(place.at, 2), 'in "…" a backslash starts an escape', "use '…' quotes, or no quotes"
+        "an unknown escape",
+        place.span(place.at, 2),
+        'in "…" a backslash starts an escape',
+        "use '…' quotes, or no quotes",
     )
 
 
@@ -192,31 +218,53 @@ def _no_colon(place: Place) -> Problem:
 
 
 def _list_beside_key(place: Place) -> Problem:
-    return Problem("a list on the line of its key", place.span(place.at), "a list starts on the next line", "put `- …` on a line of its own")
+    return Problem(
+        "a list on the line of its key",
+        place.span(place.at),
+        "a list starts on the next line",
+        "put `- …` on a line of its own",
+    )
 
 
 def _nothing(place: Place) -> Problem:
     if place.char in ("}", "]"):
-        return Problem(f"a `{place.char}` that closes nothing", place.span(place.at), "nothing is open, or a value is missing")
-    return Problem("a value is missing", place.span(place.at), "before this", "remove one comma, or write the value")
+        return Problem(
+            f"a `{place.char}` that closes nothing",
+            place.span(place.at),
+            "nothing is open, or a value is missing",
+        )
+    return Problem(
+        "a value is missing", place.span(place.at), "before this", "remove one comma, or write the value"
+    )
 
 
 def _block_header(place: Place) -> Problem:
     char = place.text[place.since : place.since + 1]
-    return Problem(f"text after `{char}`", place.rest(place.at), f"`{char}` starts a block on the next lines", QUOTE)
+    return Problem(
+        f"text after `{char}`", place.rest(place.at), f"`{char}` starts a block on the next lines", QUOTE
+    )
 
 
 def _after_end(place: Place) -> Problem:
-    return Problem("text after the end of the document", place.rest(place.at), "not part of it", "remove it, or the line before it")
+    return Problem(
+        "text after the end of the document",
+        place.rest(place.at),
+        "not part of it",
+        "remove it, or the line before it",
+    )
 
 
 def _directive(place: Place) -> Problem:
-    return Problem("a YAML directive", place.rest(place.since), "a line that starts with `%`", "remove the line")
+    return Problem(
+        "a YAML directive", place.rest(place.since), "a line that starts with `%`", "remove the line"
+    )
 
 
 def _start_of_value(place: Place) -> Problem:
     since = place.span(place.since)
-    return Problem(f"a value cannot start with `{since.text}`", since, "has a meaning of its own in YAML", QUOTE)
+    return Problem(
+        f"a value cannot start with `{since.text}`", since, "has a meaning of its own in YAML", QUOTE
+    )
 
 
 _ROWS: tuple[tuple[tuple[str, ...], Callable[[Place], Problem]], ...] = (
@@ -224,15 +272,15 @@ _ROWS: tuple[tuple[tuple[str, ...], Callable[[Place], Problem]], ...] = (
     (("found a tab character",), _tab),
     (("cannot start any token",), _bad_start),
     (("expected ',' or '}'", "expected ',' or ']'"), _unclosed),
-    (("unexpected end of stream", "unexpected document separator", "unexpected document indicator"), _open_quote),
-    (("unknown escape character", "escape sequence"), _escape),
+    (("unexpected end of stream", "unexpected document indicator"), _open_quote),
+    (("unknown escape character", "did not find expected hexdecimal number", "invalid Unicode"), _escape),
     (("could not find expected ':'",), _no_colon),
     (("sequence entries are not allowed",), _list_beside_key),
-    (("expected comment or line break", "expected a comment or a line break"), _block_header),
-    (("expected '-' indicator", "expected <block end>, but found"), _item),
+    (("expected comment or line break",), _block_header),
+    (("expected '-' indicator",), _item),
     (("did not find expected key",), _key),
-    (("expected node content", "expected the node content"), _nothing),
-    (("expected <document start>", "expected '<document start>'"), _after_end),
+    (("expected node content",), _nothing),
+    (("expected <document start>",), _after_end),
     (("directive", "incompatible YAML document", "tag handle"), _directive),
     (("alphabetic or numeric character", "expected tag URI", "expected whitespace"), _start_of_value),
 )

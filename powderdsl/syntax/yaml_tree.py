@@ -178,7 +178,7 @@ class _Builder:
                 self._fail("PD107", "a key must be a word", key.span, "a list or a mapping", "write a name before the `:`")
             elif key.text == "<<" and key.style == "plain":
                 self._fail("PD105", "the merge key `<<` is not allowed", key.span, "not allowed", "write the entries out")
-            elif start.flow_style and isinstance(value, Scalar) and value.style == "plain" and not value.text:
+            elif self._in_braces(start) and isinstance(value, Scalar) and value.style == "plain" and not value.text:
                 self._no_value(key, first=not seen)
             elif key.text in seen:
                 other = (Label(seen[key.text], "first time here"),)
@@ -197,15 +197,19 @@ class _Builder:
         if self.source.text[key.span.end :].lstrip().startswith(":"):
             label, cure = "nothing stands after its `:`", 'write its value; one with `#` in it needs quotes: "#RRGGBB"'
         elif first:
-            label, cure = "a key without a `:`", "`{…}` holds `key: value` pairs: write this without the braces"
+            label, cure = "a key without a `:`", "`{…}` holds `key: value` pairs; rules stand outside braces"
         else:
             label = "the comma before it ended the value before it"
             cure = "put quotes around a value with a comma, or give it a line of its own, outside `{…}`"
         self._fail("PD107", f"`{key.text}` has no value", key.span, label, cure)
 
+    def _in_braces(self, start) -> bool:  # type: ignore[no-untyped-def]
+        """Whether a collection is written with `{…}` or `[…]`."""
+        return self.source.text[start.start_mark.index : start.start_mark.index + 1] in ("{", "[")
+
     def _collection_span(self, start, end, last: Span | None) -> Span:  # type: ignore[no-untyped-def]
         begin = start.start_mark.index
-        if start.flow_style:
+        if self._in_braces(start):
             return Span(self.source, begin, max(end.end_mark.index, begin + 1))
         # A block collection's end mark runs to the next token; the last child's end is where a reader sees it end.
         return Span(self.source, begin, max(start.end_mark.index, last.end if last else 0, begin + 1))

@@ -13,7 +13,7 @@ from pathlib import Path
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from powderdsl.diagnostics import CompileError, Reporter, Source
+from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.diagnostics.render import render_json, render_short, render_text
 from powderdsl.model.check import check
 from powderdsl.model.packs import PackDecl, RulesetDecl, read_file
@@ -57,14 +57,19 @@ def load(text: str, *others: PackDecl) -> Ruleset | None:
         assert found is not None
         return check([*others, found], None, reporter) if isinstance(found, PackDecl) else None
     except CompileError as error:
-        assert error.diagnostics
-        for one in error.diagnostics:
-            span = one.primary.span
-            assert span is None or 0 <= span.start < max(span.end, 1) <= max(len(span.source.text), 1) + 1
-            assert render_text(one)
-            assert "\n" not in render_short(one)
-        assert render_json(error.diagnostics, utf16=True)
+        printable(error.diagnostics)
         return None
+
+
+def printable(diagnostics: tuple[Diagnostic, ...]) -> None:
+    """Fails unless every diagnostic points into its text and can be printed in all three ways."""
+    assert diagnostics
+    for one in diagnostics:
+        span = one.primary.span
+        assert span is None or 0 <= span.start < max(span.end, 1) <= max(len(span.source.text), 1) + 1
+        assert render_text(one)
+        assert "\n" not in render_short(one)
+    assert render_json(diagnostics, utf16=True)
 
 
 @st.composite

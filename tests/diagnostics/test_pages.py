@@ -2,8 +2,8 @@
 
 A page has a wrong example and, mostly, the mended one:
 
-* ``yaml wrong`` and ``yaml right`` are rule files; a first line ``# with: core`` names packs to load beside them.
-* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, both read with the rules of Powderworld.
+* ``yaml wrong`` and ``yaml right`` are rule files; ``# with: core`` at the top names packs to load with them.
+* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII; both use the rules of the paper.
 * ``text`` is the message itself, for what no file can show; `SITUATIONS` brings it about.
 
 The text under the caret stands in the example, in a comment ``# ^ text`` below it.
@@ -60,7 +60,10 @@ class Example:
 
 
 def examples(code: str) -> list[Example]:
-    return [Example(*found) for found in re.findall(r"^```(.+)\n((?:.*\n)*?)```$", page(CODES[code]), re.MULTILINE)]
+    return [
+        Example(*found)
+        for found in re.findall(r"^```(.+)\n((?:.*\n)*?)```$", page(CODES[code]), re.MULTILINE)
+    ]
 
 
 def example(code: str, word: str) -> Example | None:
@@ -115,7 +118,9 @@ def test_a_page_starts_with_its_code_and_shows_what_is_wrong(code: str) -> None:
     assert text.startswith(f"# {code}: {CODES[code].slug}\n\n")
     assert (code in WRONG) != (code in MESSAGES)
     assert (code in RIGHT) == (code in WRONG)
-    assert all(len(line) <= 120 or line.startswith(" ") for line in text.splitlines()), "too wide for a terminal"
+    assert all(len(line) <= 120 or line.startswith(" ") for line in text.splitlines()), (
+        "too wide for a terminal"
+    )
 
 
 def raised_codes() -> set[str]:

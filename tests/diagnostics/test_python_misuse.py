@@ -1,4 +1,4 @@
-"""Wrong arguments to the Python API: a ValueError, TypeError or KeyError that names the argument, or a CompileError."""
+"""Wrong arguments to the Python API: an error of Python's that names the argument, or a CompileError."""
 
 from __future__ import annotations
 
@@ -158,5 +158,9 @@ def test_values_that_look_odd_and_are_right() -> None:
     sim = simulator()
     ids = np.broadcast_to(np.uint16(0), (1, 2, 2))
     assert sim.world(ids, seed=np.int64(3)).shape == (1, 2, 2)
-    assert sim.step(sim.world([[0, 2]]), steps=np.int32(0), random={}, params={}, passes=[]).shape == (1, 1, 2)
+    assert sim.step(sim.world([[0, 2]]), steps=np.int32(0), random={}, params={}, passes=[]).shape == (
+        1,
+        1,
+        2,
+    )
     assert bool((sim.replace(world(), velocity=(1, 2))["velocity"][:, 1] == 2).all())

@@ -413,7 +413,10 @@ def test_four_balls_at_rest_turn_a_ball_back(backend: str) -> None:
         assert world.ids[0].nonzero().tolist() == [list(place), *rest]
 
 
-@pytest.mark.parametrize(("density", "shape"), [(0.05, (14, 22)), (0.3, (8, 40)), (0.7, (6, 6)), (0.3, (13, 9))])
+BALLS = [(0.05, (14, 22)), (0.3, (8, 40)), (0.7, (6, 6)), (0.3, (13, 9))]
+
+
+@pytest.mark.parametrize(("density", "shape"), BALLS)
 def test_no_ball_is_lost_or_made(backend: str, density: float, shape: tuple[int, int]) -> None:
     """Not even where a side is odd: blocks that overlap at the seam rest."""
     sim = simulator("margolus", backend)
