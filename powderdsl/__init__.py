@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from powderdsl.compiler import compile, load
+    from powderdsl.compiler import load
     from powderdsl.diagnostics import CompileError
-    from powderdsl.simulator import Simulator, World
+    from powderdsl.simulator import Simulator, World, compile
     from powderdsl.worlds.store import load_world, save
 
 _HOMES = {
     "load": "powderdsl.compiler",
-    "compile": "powderdsl.compiler",
+    "compile": "powderdsl.simulator",
     "CompileError": "powderdsl.diagnostics",
     "Simulator": "powderdsl.simulator",
     "World": "powderdsl.simulator",

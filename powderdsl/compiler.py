@@ -1,6 +1,6 @@
 """The sequence: text → located tree → checked model → IR → passes → program. Each stage takes one value and gives one.
 
-`load` stops at the checked model and needs no torch; `compile` goes on to a `Simulator`.
+`load` stops at the checked model, `lower` at optimised IR; neither needs torch. `simulator.compile` goes on from there.
 """
 
 from __future__ import annotations
@@ -19,9 +19,16 @@ from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
     from powderdsl.ir.ops import Program
-    from powderdsl.simulator import Simulator
 
-BACKENDS = ("auto", "torch", "dense", "native", "reference")
+BACKENDS = {
+    "auto": "what starts at once: `torch`",
+    "torch": "any device: one tensor element a cell for little work, packed bit planes for more",
+    "dense": "torch, always one tensor element a cell: the readable one",
+    "planes": "torch, always packed bit planes",
+    "native": "generated C++ for the CPU; compiled once, then kept",
+    "reference": "the slow oracle in NumPy that defines what rules mean",
+}
+"""All of them give the same worlds, bit for bit."""
 
 
 def shipped(folder: str) -> Path:
@@ -41,8 +48,8 @@ def load(*names: str | Path, params: Mapping[str, Any] | None = None) -> Ruleset
 
     Args:
         names: shipped names (``"powderworld"``), paths of rule files, or several joined by ``+``. A name after ``-``
-            is left out: ``"powderworld-gas"``.
-        params: other values for parameters, by qualified name: ``{"water.melt": 0.05}``.
+            is left out: ``"name-pack"``.
+        params: other values for parameters, by qualified name: ``{"pack.param": 0.05}``.
 
     Raises:
         CompileError: with everything that is wrong in the files.
@@ -83,7 +90,7 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:
-    """``core+sand-gas`` as names to load and names to leave out. Paths of files stay whole."""
+    """``a+b-c`` as names to load and names to leave out. Paths of files stay whole."""
     text = str(name)
     if isinstance(name, Path) or Path(text).suffix in (".yaml", ".yml") and "+" not in text or _is_file(text):
         return [text], []
@@ -222,27 +229,3 @@ def lower(ruleset: Ruleset) -> Program:
     from powderdsl.passes import run_passes
 
     return run_passes(lower_ruleset(ruleset))
-
-
-def compile(ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu") -> Simulator:
-    """A simulator that runs a ruleset.
-
-    Args:
-        ruleset: from `load` (or a name to load).
-        backend: ``"torch"`` (masks, rolls and convolutions on any device), ``"reference"`` (the slow oracle), or
-            ``"auto"``.
-        device: a torch device: ``"cpu"``, ``"cuda"``, ``"cuda:1"``.
-
-    Raises:
-        CompileError: PD701 if the backend or the device is not there.
-    """
-    from powderdsl.simulator import Simulator
-
-    model = load(ruleset) if isinstance(ruleset, str) else ruleset
-    if not isinstance(model, Ruleset):
-        raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
-    if backend not in BACKENDS:
-        reporter = Reporter()
-        reporter.error("PD701", f"no backend `{backend}`", None, helps=["backends: " + ", ".join(BACKENDS)])
-        raise CompileError(reporter.diagnostics)
-    return Simulator(model, "torch" if backend == "auto" else backend, device)

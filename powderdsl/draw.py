@@ -16,7 +16,7 @@ Array = Any
 """A NumPy array or a torch tensor. Torch is imported only once a tensor is given."""
 
 MOTION_COLOR = (200, 100, 100)
-"""What a cell is tinted towards where its velocity is not 0."""
+"""What a cell is tinted towards where its motion is not 0."""
 
 MAX_TINT = 0.5
 """The tint at speed 1 and above; slower cells are tinted in proportion."""
@@ -33,35 +33,35 @@ def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
     return table
 
 
-def rgb(ids: Array, colors: Colors, velocity: Array | None = None) -> Any:
+def rgb(ids: Array, colors: Colors, motion: Array | None = None) -> Any:
     """Pictures uint8 [..., H, W, 3] of ids [..., H, W] (any integers), of the same kind, on the same device.
 
-    With `velocity`, float [..., 2, H, W], cells are tinted towards MOTION_COLOR by clamp(|v|/2, 0, 0.5).
+    With `motion`, float [..., 2, H, W], cells are tinted towards MOTION_COLOR by clamp(|v|/2, 0, 0.5).
     Raises ValueError for ids without a colour and shapes that do not fit, TypeError for ids of another type.
     """
     table = _table(colors)
     tensor = _is_tensor(ids)
     if not tensor:
         ids = np.asarray(ids)
-    _check(ids, velocity, len(table), tensor)
+    _check(ids, motion, len(table), tensor)
     if tensor:
-        return _rgb_torch(ids, table, velocity)
+        return _rgb_torch(ids, table, motion)
     image = table[ids]
-    if velocity is None:
+    if motion is None:
         return image
-    speed = np.hypot(*np.moveaxis(np.asarray(velocity, dtype=np.float32), -3, 0))
+    speed = np.hypot(*np.moveaxis(np.asarray(motion, dtype=np.float32), -3, 0))
     weight = np.nan_to_num(np.clip(speed / 2, 0, MAX_TINT))[..., None]
     motion = np.array(MOTION_COLOR, dtype=np.float32)
     return (image + (motion - image) * weight + 0.5).astype(np.uint8)
 
 
-def _rgb_torch(ids: Any, table: NDArray[np.uint8], velocity: Any) -> Any:
+def _rgb_torch(ids: Any, table: NDArray[np.uint8], motion: Any) -> Any:
     import torch
 
     image = torch.as_tensor(table, device=ids.device)[ids.long()]
-    if velocity is None:
+    if motion is None:
         return image
-    weight = (torch.hypot(*velocity.float().unbind(-3)) / 2).clamp(0, MAX_TINT).nan_to_num()[..., None]
+    weight = (torch.hypot(*motion.float().unbind(-3)) / 2).clamp(0, MAX_TINT).nan_to_num()[..., None]
     motion = torch.tensor(MOTION_COLOR, dtype=torch.float32, device=ids.device)
     return (image + (motion - image) * weight + 0.5).to(torch.uint8)
 
@@ -118,7 +118,7 @@ def _is_tensor(value: object) -> bool:
     return any(base.__module__.partition(".")[0] == "torch" for base in type(value).__mro__)
 
 
-def _check(ids: Any, velocity: Any, colors: int, tensor: bool) -> None:
+def _check(ids: Any, motion: Any, colors: int, tensor: bool) -> None:
     integer = not (ids.is_floating_point() or ids.is_complex()) if tensor else ids.dtype.kind in "iu"
     if not integer or str(ids.dtype).endswith("bool"):
         raise TypeError(f"ids must be integers, not {ids.dtype}")
@@ -128,11 +128,11 @@ def _check(ids: Any, velocity: Any, colors: int, tensor: bool) -> None:
         raise ValueError(
             f"ids reach from {int(ids.min())} to {int(ids.max())}, but there are {colors} colours"
         )
-    if velocity is None:
+    if motion is None:
         return
     expected = (*ids.shape[:-2], 2, *ids.shape[-2:])
-    if tuple(velocity.shape) != expected:
-        raise ValueError(f"velocity must have shape {expected}, not {tuple(velocity.shape)}")
+    if tuple(motion.shape) != expected:
+        raise ValueError(f"motion must have shape {expected}, not {tuple(motion.shape)}")
 
 
 def _table(colors: Colors) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl import reference
-from powderdsl.compiler import compile
+from powderdsl.simulator import compile
 from powderdsl.draw import to_numpy
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line

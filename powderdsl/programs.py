@@ -10,6 +10,7 @@ from torch import Tensor
 
 from powderdsl import reference
 from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.ir.ops import Program
 from powderdsl.model.types import Ruleset
 
 Clock = tuple[Tensor, Tensor, Tensor]
@@ -78,24 +79,101 @@ def find_device(name: str | torch.device) -> torch.device:
     return device
 
 
-def make_program(ruleset: Ruleset, backend: str, device: torch.device) -> Runnable:
-    """The program of a ruleset on a backend, for a device that is there."""
+PLANES_FROM = 1 << 16
+"""Cells of a batch from which packed words beat one tensor element a cell (measured on CPU: 16 worlds of 64 × 64)."""
+
+
+class TorchProgram:
+    """Torch in its two forms, which give the same worlds: cells for little work, packed planes for more."""
+
+    def __init__(self, program: Program, device: torch.device):
+        from powderdsl.backends.torch_dense import DenseProgram
+
+        self.program = program
+        self.device = device
+        self._cells: Runnable = DenseProgram(program, device)
+        self._planes: Runnable | None = None
+
+    def run(
+        self,
+        state: Mapping[str, Tensor],
+        clock: Clock,
+        steps: int,
+        params: Mapping[str, Tensor],
+        draws: Mapping[str, Tensor],
+        passes: frozenset[str] | None,
+    ) -> Mapping[str, Tensor]:
+        """The state `steps` later."""
+        big = state["element"].numel() >= PLANES_FROM
+        return (self.planes() if big else self._cells).run(state, clock, steps, params, draws, passes)
+
+    def planes(self) -> Runnable:
+        """The program on packed words, made when first needed; on cells if planes cannot carry it."""
+        from powderdsl.backends.torch_planes import PlanesProgram
+        from powderdsl.ir.bits import NotBits, lower_bits
+
+        if self._planes is None:
+            try:
+                self._planes = PlanesProgram(self.program, lower_bits(self.program), self.device)
+            except NotBits:
+                self._planes = self._cells
+        return self._planes
+
+
+class CompiledProgram:
+    """Native code for whole steps; torch where draws are given or passes chosen."""
+
+    def __init__(self, native: Runnable, rest: Runnable):
+        self._native, self._rest = native, rest
+
+    def run(
+        self,
+        state: Mapping[str, Tensor],
+        clock: Clock,
+        steps: int,
+        params: Mapping[str, Tensor],
+        draws: Mapping[str, Tensor],
+        passes: frozenset[str] | None,
+    ) -> Mapping[str, Tensor]:
+        """The state `steps` later."""
+        runnable = self._rest if draws or passes is not None else self._native
+        return runnable.run(state, clock, steps, params, draws, passes)
+
+
+def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: int = 1) -> Runnable:
+    """The program of a ruleset on a backend, for a device that is there.
+
+    Raises:
+        CompileError: PD701 if the backend needs what is not there.
+    """
     if backend == "reference":
         return ReferenceProgram(ruleset)
     from powderdsl.backends.torch_dense import DenseProgram
-    from powderdsl.backends.torch_planes import PlanesProgram
     from powderdsl.compiler import lower
-    from powderdsl.ir.bits import NotBits, lower_bits
 
     program = lower(ruleset)
     if backend == "dense":
         return DenseProgram(program, device)
-    try:
-        planes = lower_bits(program)
-    except NotBits:  # cells carry everything
-        return DenseProgram(program, device)
+    torch_program = TorchProgram(program, device)
+    if backend == "planes":
+        return torch_program.planes()
     if backend == "native":
-        from powderdsl.backends.torch_native import NativeProgram
+        return CompiledProgram(_native(program, device, threads), torch_program)
+    return torch_program
 
-        return NativeProgram(program, planes)
-    return PlanesProgram(program, planes, device)
+
+def _native(program: Program, device: torch.device, threads: int) -> Runnable:
+    from powderdsl.backends.native_build import NoCompiler
+    from powderdsl.backends.torch_native import NativeProgram
+    from powderdsl.ir.bits import NotBits, lower_bits
+
+    problem = "native code runs on the CPU" if device.type != "cpu" else ""
+    try:
+        if not problem:
+            return NativeProgram(program, lower_bits(program), threads)
+    except (NoCompiler, NotBits) as error:
+        problem = str(error)
+    reporter = Reporter()
+    helps = ["run on the backend `torch`, or install g++, clang++ or `pip install ziglang`"]
+    reporter.error("PD701", "the native backend is not available", None, notes=problem.splitlines(), helps=helps)
+    raise CompileError(reporter.diagnostics)

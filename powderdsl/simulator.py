@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from powderdsl.programs import find_device, make_program
-from powderdsl.diagnostics import suggest
+from powderdsl.compiler import BACKENDS, load
+from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.state import SNAP, Slot, slots
 from powderdsl.model.types import Ruleset
 
@@ -71,12 +72,12 @@ class World:
 class Simulator:
     """Runs one ruleset on one backend and device. Made by `powderdsl.compile`."""
 
-    def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device):
+    def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device, threads: int = 1):
         self.ruleset = ruleset
         self.backend = backend
         self.device = find_device(device)
         self._slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
-        self._program = make_program(ruleset, backend, self.device)
+        self._program = make_program(ruleset, backend, self.device, threads)
         self._defaults: tuple[int, dict[str, Tensor]] | None = None
         self._known = torch.zeros(256, dtype=torch.bool, device=self.device)
         self._known[[element.id for element in ruleset.elements]] = True
@@ -269,13 +270,13 @@ class Simulator:
                 raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
         return whole.to(getattr(torch, slot.dtype)).clone()
 
-    def paint(self, world: World, *, where: Any, element: str | None = None, velocity: Any = None, **fields: Any) -> World:
+    def paint(self, world: World, *, where: Any, element: str | None = None, **fields: Any) -> World:
         """Set cells of a mask: fresh cells of an element, and values of fields.
 
         Args:
             where: bool [B, H, W] or [H, W].
             element: the element's name, plain or qualified.
-            velocity: (rows, columns), for rulesets with such a field; other fields by name.
+            fields: values by field name; vectors as (rows, columns).
 
         Raises:
             KeyError: an unknown element or field. ValueError: a wrong shape or value.
@@ -293,8 +294,6 @@ class Simulator:
                 for name, slot in self._slots.items()
             }
             world = replace(world, state=state)
-        if velocity is not None:
-            fields["velocity"] = velocity
         for name, value in fields.items():
             if name not in self._slots:
                 self.read(world, name)
@@ -409,3 +408,25 @@ class Simulator:
                 raise ValueError(f"{name} takes whole numbers")
             values[name] = tensor.expand(batch).clone()
         return values
+
+
+def compile(ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu", threads: int = 1) -> Simulator:
+    """A simulator that runs a ruleset.
+
+    Args:
+        ruleset: from `load` (or a name to load).
+        backend: one of `BACKENDS`; all give the same worlds, bit for bit.
+        device: a torch device: ``"cpu"``, ``"cuda"``, ``"cuda:1"``.
+        threads: for native code, which shares a batch out among them. Torch has its own setting.
+
+    Raises:
+        CompileError: PD701 if the backend or the device is not there.
+    """
+    model = load(ruleset) if isinstance(ruleset, str) else ruleset
+    if not isinstance(model, Ruleset):
+        raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
+    if backend not in BACKENDS:
+        reporter = Reporter()
+        reporter.error("PD701", f"no backend `{backend}`", None, helps=["backends: " + ", ".join(BACKENDS)])
+        raise CompileError(reporter.diagnostics)
+    return Simulator(model, "torch" if backend == "auto" else backend, device, threads)

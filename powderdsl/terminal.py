@@ -76,16 +76,16 @@ class LiveView:
         if self.in_place:
             self._write(_RESET + _SHOW_CURSOR)
 
-    def show(self, ids: Any, velocity: Any = None, caption: str = "") -> None:
-        """Draw ids [H, W], array or tensor, tinted by `velocity`, float [2, H, W]; `caption` stands below."""
+    def show(self, ids: Any, motion: Any = None, caption: str = "") -> None:
+        """Draw ids [H, W], array or tensor, tinted by `motion`, float [2, H, W]; `caption` stands below."""
         ids = to_numpy(ids)
-        velocity = None if velocity is None else to_numpy(velocity)
+        motion = None if motion is None else to_numpy(motion)
         if self.in_place:
             step = self._thinning(*ids.shape)
             ids = ids[::step, ::step]
-            velocity = None if velocity is None else velocity[:, ::step, ::step]
+            motion = None if motion is None else motion[:, ::step, ::step]
         if self.colour:
-            text = render_frame(rgb(ids, self._colors, velocity))
+            text = render_frame(rgb(ids, self._colors, motion))
         else:
             text = write_ascii(ids, self.elements).rstrip("\n")
         lines = [*text.split("\n"), caption]

@@ -27,8 +27,8 @@ MAX_LINES = 500
 
 _MODEL = ("diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
-_SCREEN = (*_COMPILER, "simulator", "worlds", "draw", "media", "terminal")
-_EVERYTHING = (*_SCREEN, "envs", "web", "experiments", "cli")
+_SCREEN = (*_COMPILER, "programs", "simulator", "worlds", "draw", "media", "terminal")
+_EVERYTHING = (*_SCREEN, "pack_tests", "testing", "envs", "web", "experiments", "cli")
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
@@ -41,16 +41,19 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
     "backends": ("diagnostics", "ir"),
     "compiler": _COMPILER[:-1],
-    "simulator": _COMPILER,
+    "programs": _COMPILER,
+    "simulator": (*_COMPILER, "programs"),
     "worlds": _MODEL,
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
     "draw": _SCREEN[: _SCREEN.index("draw")],
     "media": _SCREEN[: _SCREEN.index("media")],
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
+    "pack_tests": _SCREEN,
+    "testing": (*_SCREEN, "pack_tests"),
     "envs": _SCREEN,
     "web": _SCREEN,
     "experiments": (*_SCREEN, "envs", "web"),
-    "cli": (*_SCREEN, "envs", "web", "experiments"),
+    "cli": (*_SCREEN, "pack_tests", "testing", "envs", "web", "experiments"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }
@@ -65,11 +68,11 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("backends.torch_*", "simulator", "envs", "experiments")
+_TORCH = ("backends.torch_*", "programs", "simulator", "testing", "envs", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),
-    "torch": Home((*_TORCH, "worlds.store", "draw", "media", "terminal", "web", "cli"), _TORCH),
+    "torch": Home((*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "web", "cli"), _TORCH),
     "gymnasium": Home(("envs", "experiments"), ("envs", "experiments")),
     "stable_baselines3": Home(("envs", "experiments"), ("envs", "experiments")),
     "click": Home(("cli",), ("cli",)),
@@ -81,7 +84,7 @@ SLOW_IMPORTS = ("torch", "gymnasium", "stable_baselines3", "matplotlib", "tensor
 EMPTY_NAMES = ("utils", "util", "common", "helpers", "helper", "base", "misc")
 """Names that say nothing: such a module has no reason to refuse anything."""
 
-SHARED_NAMES: dict[str, str] = {}
+SHARED_NAMES: dict[str, str] = {"text": "the printed form of each stage: model.text, ir.text"}
 """Base names that several modules may have, and why."""
 
 NAME_SECTIONS = ("elements", "passes", "fields", "properties")

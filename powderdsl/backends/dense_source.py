@@ -93,6 +93,8 @@ class _Writer:
                 return f"{args[0]}.float()"
             case "settle":
                 return f"k.settle({args[0]}, {attr[0]!r}, {attr[1]!r})"  # type: ignore[index]
+            case "select" if node.type.name == "int" and node.type.hi >= 1 << 31:  # thresholds of draws of 32 bits
+                return f"torch.where({args[0]}, {args[1]}.long(), {args[2]}.long())"
             case "select":
                 return f"torch.where({args[0]}, {args[1]}, {args[2]})"
             case "swap":

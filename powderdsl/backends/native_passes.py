@@ -2,96 +2,13 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
+from powderdsl.backends.native_blocks import Block, Lanes, lane_loop
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_loops import ANCHORS, DRAWS, Loop, is_clean, is_uniform, prerequisites, zero_with
 from powderdsl.backends.native_sweeps import Sweep, leading, quiet, rows_read, stored_parts, sweep_needs, unchanged
 from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, walk
-
-_VARIABLE = re.compile(r"\b[pf][0-9]+\b")
-
-
-@dataclass(frozen=True)
-class Lanes:
-    """A sweep: what it writes, the rows of one world `l`, and what tells that nothing at all is going on."""
-
-    outputs: tuple[tuple[str, bool], ...]
-    """Names of fields (f…) and planes (p…), and what a flag is in cells where all reals are zero."""
-    before: str
-    rows: str
-    after: str
-    asked: tuple[str, ...] | None
-    """Conditions under which all outputs are quiet, besides outputs of sweeps in the same loop; None: never."""
-
-    @property
-    def fields(self) -> set[str]:
-        return {name for name, _ in self.outputs if name.startswith("f")}
-
-
-@dataclass
-class Block:
-    """Statements of a scope; variables they define are released after their last use."""
-
-    statements: list[str | Lanes] = field(default_factory=list)
-    defined: list[str] = field(default_factory=list)
-
-    def text(self) -> str:
-        """The statements with releases."""
-        statements = self._joined()
-        last: dict[str, int] = {}
-        for i, statement in enumerate(statements):
-            for name in _VARIABLE.findall(statement):
-                last[name] = i
-        lines = []
-        for i, statement in enumerate(statements):
-            lines.append(statement)
-            lines += [f"give(c, {name});" for name in sorted(set(self.defined)) if last.get(name) == i]
-        return "\n".join(lines)
-
-    def _joined(self) -> list[str]:
-        """Sweeps that follow each other become one loop over worlds: what one world needs stays in the cache."""
-        result: list[str] = []
-        i = 0
-        while i < len(self.statements):
-            run: list[Lanes] = []
-            while i < len(self.statements) and isinstance(item := self.statements[i], Lanes):
-                run.append(item)
-                i += 1
-            if run:
-                outside = " ".join(_all_text(s) for s in (*self.statements[: i - len(run)], *self.statements[i:]))
-                seen_outside = set(_VARIABLE.findall(outside))
-                result.append(_lane_loop(run, seen_outside))
-            else:
-                result.append(self.statements[i])  # type: ignore[arg-type]
-                i += 1
-        return result
-
-
-def _all_text(statement: str | Lanes) -> str:
-    return statement if isinstance(statement, str) else " ".join((statement.before, statement.rows, statement.after))
-
-
-def _lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
-    """One loop over worlds. Fields that nothing else reads are written over by each world: they need one lane."""
-    written = {name for sweep in run for name in sweep.fields}
-    used = sorted({name for sweep in run for name in _VARIABLE.findall(sweep.rows) if name.startswith("f")})
-    places = " ".join(f"const int l{name} = {'0' if name in written - seen_outside else 'l'};" for name in used)
-    before = "\n".join(sweep.before for sweep in run)
-    rows = "\n".join(f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}" for sweep in run)
-    after = "\n".join(sweep.after for sweep in run)
-    loop = f"{before}\nfor (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
-    outputs = [output for sweep in run for output in sweep.outputs]
-    declared = " ".join(f"{'Field' if name.startswith('f') else 'Plane'}* {name};" for name, _ in outputs)
-    if any(sweep.asked is None for sweep in run):
-        return f"{declared}\n{loop}"
-    asked = dict.fromkeys(c for sweep in run for c in sweep.asked or () if not set(_VARIABLE.findall(c)) & written)
-    quiet_values = " ".join(
-        f"{name} = keep(c.{'calm' if name.startswith('f') else 'everything' if value else 'nothing'});" for name, value in outputs
-    )
-    return f"{declared}\nif ({' && '.join(asked) or 'true'}) {{ {quiet_values} }} else {{\n{loop}\n}}"
-
 
 class PassWriter:
     """Writes `static void pass_N(Context& c)`."""
@@ -481,7 +398,7 @@ class PassWriter:
         pairs = [(name, self.fields[id(base)]) for (_, name, _), (base, _) in zip(outputs, kept, strict=True)]
         copies = " ".join(f"some{name} |= copy_row(c, {name}, {base}, l, y);" for name, base in pairs)
         still = f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; if (!some) {{ {copies} continue; }} }}\n"
-        loop = _lane_loop([replace(sweep, rows=still + sweep.rows)], sweep.fields)
+        loop = lane_loop([replace(sweep, rows=still + sweep.rows)], sweep.fields)
         declared, _, rest = loop.partition("\n")
         same = " ".join(f"{name} = keep({base});" for name, base in pairs)
         empty = " && ".join(f"{plane}->zero" for plane in masks) or "true"

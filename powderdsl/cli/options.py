@@ -88,7 +88,7 @@ def set_option(function: Decorated) -> Decorated:
 def backend_option(default: str, about: str = "What runs the rules.") -> Callable[[Decorated], Decorated]:
     return click.option(
         "--backend",
-        type=click.Choice(BACKENDS),
+        type=click.Choice(list(BACKENDS)),
         default=default,
         show_default=True,
         help=about,

@@ -28,7 +28,7 @@ def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, sca
     check_writable(out)
     from powderdsl.cli.pictures import pictures
     from powderdsl.cli.start_worlds import start_ids, start_world
-    from powderdsl.compiler import compile
+    from powderdsl.simulator import compile
     from powderdsl.media import write_png
 
     ids = start_ids(ruleset, world, size, None, None)

@@ -102,7 +102,7 @@ def command(
     if out is not None:
         check_writable(out)
     from powderdsl.cli.start_worlds import start_ids, start_world
-    from powderdsl.compiler import compile
+    from powderdsl.simulator import compile
 
     # The world first: compiling imports torch, and whoever mistyped a name should not wait for that.
     ids = start_ids(ruleset, world, size, batch, seed)

@@ -104,7 +104,7 @@ class Node:
     attr: Hashable
     index: int
     places: tuple[str, ...] = field(default=(), repr=False)
-    """Where it was written: ``rules/sand.yaml:12``. Takes no part in interning."""
+    """Where it was written: ``rules/acme.yaml:12``. Takes no part in interning."""
 
 
 class Graph:

@@ -162,7 +162,7 @@ def binary(typer: Typer, kind: str, left: Value, right: Value, syntax: Syntax) -
                 other = typer.whole(other, span)
                 bounds = _bounds(op, draws[0].kind, other.kind)
                 args = (left, other) if left is draws[0] else (other, draws[0])
-                return Expr(op, Kind("draw", bounds.lo, bounds.hi), args, span=span)  # type: ignore[arg-type]
+                return Expr(op, Kind("draw", bounds.lo, bounds.hi), args, span=span)
     return Expr(op, REAL, (typer.real(left, span), typer.real(right, span)), span=span)
 
 

@@ -43,7 +43,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     _sets(typer)
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
-    typer.report_unknown()
+    typer.unknown.report()
     reporter.raise_if_errors()
 
     elements = tuple(_tagged(element, composition) for element in composition.elements.values())
@@ -74,7 +74,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
 
 def _facts(symbols: Symbols) -> Facts:
     limited = {name: f.of for name, f in symbols.fields.items() if f.of is not None}
-    defaults = {name: symbols.fields[name].default for name in limited}
+    defaults: dict[str, object] = {name: symbols.fields[name].default for name in limited}
     names = {element.id: name for name, element in symbols.composition.elements.items()}
     return Facts(symbols.ids, symbols.properties, limited, defaults, names)
 
@@ -106,7 +106,7 @@ def _params(symbols: Symbols, typer: Typer) -> None:
 
 
 def _kind_of_literal(decl: TypedDecl, typer: Typer) -> Kind:
-    """`melt: 2%` is a chance, `wet: yes` a flag; other numbers must say their range."""
+    """`rate: 2%` is a chance, `wet: yes` a flag; other numbers must say their range."""
     assert decl.default is not None
     if decl.default.kind == "percent":
         return CHANCE

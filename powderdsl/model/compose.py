@@ -56,6 +56,25 @@ class Composition:
     kernels: dict[str, Named[KernelDecl]]
     sets: dict[str, Named[tuple[Scalar, Syntax]]]
     passes: tuple[Named[PassDecl], ...]
+    owners: dict[str, str]
+    """The pack that defines each global name."""
+
+    def knows(self, pack: str, name: str) -> bool:
+        """Whether a pack can be expected to know a global name: its own, or one of a pack that it needs."""
+        owner = self.owners.get(name)
+        return owner is None or owner in self.needs_of(pack)
+
+    def needs_of(self, pack: str) -> frozenset[str]:
+        """A pack and all packs that it needs, directly or not."""
+        needs = {decl.name.text: [need.text for need in decl.needs] for decl in self.packs}
+        found: set[str] = set()
+        waiting = [pack]
+        while waiting:
+            name = waiting.pop()
+            if name not in found:
+                found.add(name)
+                waiting.extend(needs.get(name, ()))
+        return frozenset(found)
 
 
 def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Composition:
@@ -101,7 +120,7 @@ def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Re
     about = ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else "")
     return Composition(
         name, about, tuple(packs), ruleset, elements, element_decls, slots, tags, tag_spans, properties, fields,
-        streams, params, kernels, sets, passes,
+        streams, params, kernels, sets, passes, {name: pack for name, (_, _, pack) in names.defined.items()},
     )
 
 
@@ -298,11 +317,11 @@ def _order_passes(packs: Sequence[PackDecl], reporter: Reporter) -> tuple[Named[
 
 def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], reporter: Reporter) -> None:
     path = [waiting[0]]
-    while True:
+    cycle: list[str] = []
+    while not cycle:
         step = next(name for name in earlier[path[-1]] if name in waiting)
         if step in path:
             cycle = [*path[path.index(step) :], step]
-            break
         path.append(step)
     labels = [
         Label(earlier[later][first], f"`{first}` before `{later}`") for later, first in zip(cycle, cycle[1:], strict=False)

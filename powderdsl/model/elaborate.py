@@ -130,7 +130,7 @@ class Elaborator:
 
     def _fresh(self, name: str, span: Span, scope: Scope) -> bool:
         """Whether a local name is new; reports one that hides another."""
-        if name not in scope.locals and self.typer.find(name, span, Scope(scope.pack, {})) is None:
+        if not self.typer.hides(name, span, scope):
             return True
         self.typer.reporter.error(
             "PD308", f"`{name}` already means something here", span, "hides the other meaning", helps=["choose another name"]

@@ -7,7 +7,7 @@ from powderdsl.model.compose import Composition
 from powderdsl.model.expressions import Scope, Typer
 from powderdsl.model.operands import Asleep, Poisoned
 from powderdsl.model.packs import TestDecl
-from powderdsl.model.types import Example, Expr
+from powderdsl.model.types import Example, Expr, Kernel
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_SIDE = 64
@@ -27,6 +27,9 @@ def check_examples(composition: Composition, typer: Typer) -> tuple[Example, ...
 
 def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) -> Example:
     legend = {element.glyph: name for name, element in composition.elements.items()}
+    # What the pack's own file says comes first, whatever other packs took before.
+    own = {name: named.decl.glyph for name, named in composition.element_decls.items() if named.pack == pack}
+    legend |= {glyph: name for name, glyph in own.items() if glyph}
     for key, value in decl.legend:
         name = value.text.removesuffix("?")
         if name not in composition.elements:
@@ -45,10 +48,17 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, f"`given` has {len(given)} rows of {len(given[0])} cells")
     if expect is None and not decl.always:
         raise typer.fail("PD109", f"the test `{decl.name}` checks nothing", decl.scalar.span, "`expect` or `always` is missing")
-    always: list[Expr] = [typer.condition(syntax, Scope(pack, {})) for syntax in decl.always]
+    scope = Scope(pack, {"world": _whole_world(len(given), len(given[0]))})
+    always: list[Expr] = [typer.condition(syntax, scope) for syntax in decl.always]
     return Example(
         decl.name, given, tuple(sorted(legend.items())), decl.steps, expect, tuple(always), pack, decl.scalar.span, decl.seed
     )
+
+
+def _whole_world(height: int, width: int) -> Kernel:
+    """A kernel that sees all cells of a small world from each of them: `count(X in world) == 1`."""
+    offsets = ((dy, dx) for dy in range(1 - height, height) for dx in range(1 - width, width))
+    return Kernel("world", tuple((dy, dx, 1) for dy, dx in offsets), wrap=False)
 
 
 def _rows(scalar: Scalar, legend: dict[str, str], typer: Typer, *, wildcard: bool) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from fractions import Fraction
 from itertools import product
 from math import prod
 
-from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model import arithmetic
 from powderdsl.model.builtins import COORDINATES, FUNCTIONS
 from powderdsl.model.calls import CALLS
@@ -35,6 +35,7 @@ from powderdsl.model.operands import (
 )
 from powderdsl.model.symbols import Symbols
 from powderdsl.model.types import CHANCE, DIRECTION, DRAW, ELEMENT, FLAG, Expr, Kernel, Offset
+from powderdsl.model.unknown import UnknownNames
 from powderdsl.syntax.ast import Syntax
 
 Matrix = tuple[tuple[int, int], tuple[int, int]]
@@ -77,7 +78,7 @@ class Typer(Coercer):
         """Tags and sets without elements that the rule asks for."""
         self.set_definitions: dict[str, tuple[str, Syntax]] = {}
         self.resolving: list[str] = []
-        self._unknown: dict[tuple[str, bool], dict[Span, Scope]] = {}
+        self.unknown = UnknownNames(symbols, reporter)
         self._sets_too_deep = False
         self._work = self._rule_start = 0
         self._rule_span: Span | None = None
@@ -105,39 +106,14 @@ class Typer(Coercer):
     # Names
 
     def lookup(self, name: str, span: Span, scope: Scope, *, after_dot: bool = False) -> Operand:
-        """The operand of a name. An unknown one is reported once, with all its places, by `report_unknown`."""
+        """The operand of a name. An unknown one is reported once, with all its places, by `unknown.report`."""
         found = self.find(name, span, scope)
         if found is not None:
             return found
         if self.symbols.is_declared(name, scope.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
-        self._unknown.setdefault((name, after_dot), {})[span] = scope
+        self.unknown.add(name, span, scope.locals, after_dot=after_dot)
         raise Poisoned
-
-    def _cure(self, name: str, scope: Scope, after_dot: bool) -> tuple[str, ...]:
-        known = self.symbols.names(after_dot=after_dot)
-        if not after_dot:
-            known += [*scope.locals, *FUNCTIONS]
-        elsewhere = [qualified for qualified in self.symbols.params if qualified.endswith(f".{name}")]
-        if elsewhere:
-            return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)
-        close = suggest(name, known)
-        if close and close[0].startswith("did"):
-            return close
-        return (f"load the pack that defines it, or write `{name}?` if that may be absent",)
-
-    def report_unknown(self) -> None:
-        """Report every unknown name that came up: one diagnostic a name, however often it is used."""
-        for (name, after_dot), places in self._unknown.items():
-            first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
-            labels = [Label(span, "and here") for span in others[:4]]
-            notes = [f"and in {len(others) - 4} more places"] if len(others) > 4 else []
-            label = "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
-            self.reporter.error(
-                "PD301", f"unknown name `{name}`", first, label, secondary=labels, notes=notes,
-                helps=self._cure(name, places[first], after_dot),
-            )  # fmt: skip
-        self._unknown.clear()
 
     def find(self, name: str, span: Span, scope: Scope) -> Operand | None:
         """The operand of a name, or None if there is none."""
@@ -167,6 +143,13 @@ class Typer(Coercer):
             self.used.add(param.name)
             return Expr("param", param.kind, value=param.name, span=span)
         return None
+
+    def hides(self, name: str, span: Span, scope: Scope) -> bool:
+        """Whether a new local name would hide one that its pack knows. What strangers' packs define may be hidden."""
+        if name in scope.locals:
+            return True
+        found = self.find(name, span, Scope(scope.pack, {}))
+        return found is not None and self.symbols.composition.knows(scope.pack, name)
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
@@ -389,7 +372,7 @@ class Typer(Coercer):
         domains: list[list[tuple[str, Operand]]] = []
         for binding in bindings:
             variable, domain = binding.children
-            if self.find(variable.text, variable.span, scope) is not None or any(d and d[0][0] == variable.text for d in domains):
+            if self.hides(variable.text, variable.span, scope) or any(d and d[0][0] == variable.text for d in domains):
                 raise self.fail("PD308", f"`{variable.text}` already means something here", variable.span, "hides the other meaning", ("choose another name",))
             self.used.add(variable.text)
             domains.append([(variable.text, value) for value in self.domain(domain, scope)])

@@ -10,7 +10,6 @@ from powderdsl.model.literals import read_bounds
 from powderdsl.model.compose import Composition, Named
 from powderdsl.model.operands import (
     Coercer,
-    Expr,
     Items,
     Operand,
     Place,
@@ -22,6 +21,7 @@ from powderdsl.model.types import (
     DIRECTION,
     ELEMENT,
     FLAG,
+    Expr,
     Field,
     Kind,
     Param,

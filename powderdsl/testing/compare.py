@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from powderdsl.compiler import compile as compile_ruleset
+from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.model.types import Moment, Ruleset
 from powderdsl.testing.cases import Start, load_text
 

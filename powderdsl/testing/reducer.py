@@ -82,6 +82,8 @@ def _smaller_trees(tree: Tree) -> Iterator[Tree]:
                 yield from ({(line if k == key else k): v for k, v in tree.items()} for line in _smaller_headers(str(key)))
     for key in keys:
         value = tree[key]  # type: ignore[index]
+        if key in ("type", "pack"):  # another kind would be another case
+            continue
         inner: list[Tree] = [value[0]] if isinstance(value, list) and len(value) == 1 and isinstance(value[0], str) else []
         for smaller in (*inner, *_smaller_trees(value)):
             if isinstance(tree, dict):
@@ -136,7 +138,7 @@ def _smaller_starts(start: Start) -> Iterator[Start]:
         yield replace(start, params={})
     if start.seed:
         yield replace(start, seed=0)
-    if start.ids.any():
+    if start.ids.max() > start.ids.min():
         yield replace(start, ids=np.where(start.ids == start.ids.max(), start.ids.min(), start.ids))
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.types import ELEMENT
 from powderdsl.simulator import Simulator, World
+from powderdsl.worlds.files import replacing
 
 FORMAT = 1
 MAX_BYTES = 1 << 32
@@ -25,7 +24,7 @@ def save(world: World, path: str | Path) -> None:
     """Write worlds with everything their future hangs on. The file appears whole or not at all.
 
     Raises:
-        CompileError: PD602 if the file cannot be written.
+        CompileError: PD613 if the place cannot be written, PD602 if the disk is full.
     """
     target = Path(path)
     ruleset = world.sim.ruleset
@@ -36,19 +35,14 @@ def save(world: World, path: str | Path) -> None:
     }
     arrays = {f"slot_{name}": value.cpu().numpy() for name, value in world.state.items()}
     clock = {name: getattr(world, name).cpu().numpy() for name in ("seed", "index", "step")}
-    try:
-        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}.", delete=False) as file:
-            temporary = Path(file.name)
-            try:
+    with replacing(target) as temporary:
+        try:
+            with temporary.open("wb") as file:
                 np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays, **clock)  # type: ignore[arg-type]
                 file.flush()
                 os.fsync(file.fileno())
-                os.replace(temporary, target)
-            except BaseException:
-                temporary.unlink(missing_ok=True)
-                raise
-    except OSError as error:
-        raise _bad(target, f"cannot be written: {error.strerror}") from None
+        except OSError as error:
+            raise _bad(target, f"cannot be written: {error.strerror}") from None
 
 
 def load_world(path: str | Path, sim: Simulator) -> World:
@@ -57,6 +51,8 @@ def load_world(path: str | Path, sim: Simulator) -> World:
     Raises:
         CompileError: PD602 if the file is no saved world; PD603 if the ruleset lacks one of its elements or fields.
     """
+    import torch
+
     source = Path(path)
     data = _read(source)
     try:

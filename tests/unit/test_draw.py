@@ -1,4 +1,4 @@
-"""Worlds as pictures: exact colours, the tint of velocity, scaling, contact sheets."""
+"""Worlds as pictures: exact colours, the tint of motion, scaling, contact sheets."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_every_cell_has_its_elements_colour(dtype):
 
 
 @pytest.mark.parametrize(
-    ("velocity", "tint"),
+    ("motion", "tint"),
     [
         ((0, 0), 0),
         ((0.5, 0), 0.25),
@@ -52,18 +52,18 @@ def test_every_cell_has_its_elements_colour(dtype):
         ((float("nan"), 0), 0),
     ],
 )
-def test_velocity_tints_by_half_the_speed_up_to_a_half(velocity, tint):
-    field = np.array(velocity, dtype=np.float32).reshape(2, 1, 1)
+def test_motion_tints_by_half_the_speed_up_to_a_half(motion, tint):
+    field = np.array(motion, dtype=np.float32).reshape(2, 1, 1)
     expected = [round(a + (b - a) * tint + 1e-6) for a, b in zip(SAND, (200, 100, 100), strict=True)]
     assert rgb(np.array([[ID["sand"]]]), COLORS, field)[0, 0].tolist() == expected
     assert rgb(torch.tensor([[ID["sand"]]]), COLORS, torch.tensor(field))[0, 0].tolist() == expected
 
 
-def test_the_components_of_velocity_are_not_mixed_up_with_the_batch():
+def test_the_components_of_motion_are_not_mixed_up_with_the_batch():
     """Two worlds, and a tint in exactly one cell of the second."""
-    velocity = np.zeros((2, 2, 3, 4), dtype=np.float32)
-    velocity[1, 0, 2, 1] = 1
-    image = rgb(np.zeros((2, 3, 4), dtype=np.uint8), COLORS, velocity)
+    motion = np.zeros((2, 2, 3, 4), dtype=np.float32)
+    motion[1, 0, 2, 1] = 1
+    image = rgb(np.zeros((2, 3, 4), dtype=np.uint8), COLORS, motion)
     changed = (image != COLORS[0]).any(axis=-1)
     assert np.argwhere(changed).tolist() == [[1, 2, 1]]
 
@@ -71,14 +71,14 @@ def test_the_components_of_velocity_are_not_mixed_up_with_the_batch():
 @settings(max_examples=50, deadline=None)
 @given(
     ids=arrays(np.uint8, (2, 3, 4), elements=st.integers(0, 13)),
-    velocity=arrays(np.float32, (2, 2, 3, 4), elements=st.floats(-8, 8, width=32)),
+    motion=arrays(np.float32, (2, 2, 3, 4), elements=st.floats(-8, 8, width=32)),
 )
-def test_torch_draws_what_numpy_draws(ids, velocity):
-    image = rgb(torch.tensor(ids), COLORS, torch.tensor(velocity))
+def test_torch_draws_what_numpy_draws(ids, motion):
+    image = rgb(torch.tensor(ids), COLORS, torch.tensor(motion))
     assert isinstance(image, torch.Tensor)
     assert image.dtype == torch.uint8
     # A square root may be rounded differently in the last place, and a component with it.
-    assert np.abs(image.numpy().astype(int) - rgb(ids, COLORS, velocity)).max() <= 1
+    assert np.abs(image.numpy().astype(int) - rgb(ids, COLORS, motion)).max() <= 1
     assert np.array_equal(rgb(torch.tensor(ids), COLORS).numpy(), rgb(ids, COLORS))
     assert np.array_equal(scale(image, 3).numpy(), scale(image.numpy(), 3))
 

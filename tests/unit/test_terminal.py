@@ -126,11 +126,11 @@ def test_a_smaller_frame_leaves_nothing_of_the_larger_one():
     assert replay(screen.written)[0] == ["▀▀▀", "small", ""]
 
 
-def test_velocity_tints():
+def test_motion_tints():
     screens = [Screen(True), Screen(True)]
-    velocity = np.zeros((2, 2, 2), dtype=np.float32)
-    velocity[0, 1, 1] = 9
-    for screen, field in zip(screens, (velocity, torch.tensor(velocity)), strict=True):
+    motion = np.zeros((2, 2, 2), dtype=np.float32)
+    motion[0, 1, 1] = 9
+    for screen, field in zip(screens, (motion, torch.tensor(motion)), strict=True):
         with LiveView(ELEMENTS, screen) as view:
             view.show(torch.zeros((2, 2), dtype=torch.uint8), field)
     _, colors, _ = replay(screens[0].written)
