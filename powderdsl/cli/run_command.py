@@ -106,7 +106,7 @@ def command(
 
     # The world first: compiling imports torch, and whoever mistyped a name should not wait for that.
     ids = start_ids(ruleset, world, size, batch, seed)
-    sim = compile(ruleset, backend=backend, device=device)
+    sim = compile(ruleset, backend=backend, device=device, threads=threads or 1)
     start = start_world(sim, ids, world, seed)
     used = _set_threads(threads, start)
     plan = Plan(steps, every, fps, scale, out, watch)

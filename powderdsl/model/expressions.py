@@ -290,7 +290,7 @@ class Typer(Coercer):
 
     def _no_sets(self, operands: list[Operand], syntax: Syntax) -> None:
         """`below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`."""
-        places = any(isinstance(operand, Place) or isinstance(operand, Expr) and operand.kind == ELEMENT for operand in operands)
+        places = any(isinstance(operand, Place) or (isinstance(operand, Expr) and operand.kind == ELEMENT) for operand in operands)
         for operand, child in zip(operands, syntax.children, strict=True):
             if places and isinstance(operand, (SetOf, Items)) and getattr(operand, "name", None) is None:
                 cure = "write `is` or `is not` instead of `==` or `!=`"

@@ -158,7 +158,7 @@ class Search:
         keys = [key for key in self._domains if key[0] == "element"]
         return {key[2]: int(str(self._chosen.get(key, self._domains[key][0]))) for key in keys}
 
-    def _assign(self, order: list[Key], index: int, domains: dict[Key, list[object]], rest: list, chosen: Assignment) -> bool:  # type: ignore[type-arg]
+    def _assign(self, order: list[Key], index: int, domains: dict[Key, list[object]], rest: list, chosen: Assignment) -> bool:
         if index == len(order):
             return True
         key = order[index]
@@ -269,7 +269,7 @@ class Search:
         return _EVALUATE[node.op](node, *args)
 
 
-_EVALUATE: dict[str, Callable] = {  # type: ignore[type-arg]
+_EVALUATE: dict[str, Callable] = {
     "member": lambda node, a: a in node.value,
     "not": lambda node, a: not a,
     "eq": lambda node, a, b: a == b,

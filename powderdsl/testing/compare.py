@@ -10,6 +10,7 @@ import numpy as np
 
 from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.model.types import Moment, Ruleset
+from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.testing.cases import Start, load_text
 
 if TYPE_CHECKING:
