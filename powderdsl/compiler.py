@@ -10,9 +10,10 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.diagnostics import CompileError, Reporter, Severity, Source, suggest
+from powderdsl.diagnostics import Reporter, Severity, Source, suggest
 from powderdsl.model.check import check
-from powderdsl.model.packs import PackDecl, RulesetDecl, read_file
+from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.packs import read_file
 from powderdsl.model.types import Param, Ruleset, Value
 from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
 
@@ -83,16 +84,27 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
         for word in plus:
             _read_one(word, packs, rulesets, reporter, from_ruleset=None)
     for word in left_out - set(packs):
-        reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=list(suggest(word, packs, "packs")))
+        reporter.error(
+            "PD304",
+            f"`{word}` is left out, but it was not there",
+            None,
+            helps=list(suggest(word, packs, "packs")),
+        )
     if not names:
-        reporter.error("PD304", "no rules were named", None, helps=["name a shipped ruleset or a file: `powderworld`"])
+        reporter.error(
+            "PD304", "no rules were named", None, helps=["name a shipped ruleset or a file: `powderworld`"]
+        )
     return [pack for name, pack in packs.items() if name not in left_out], rulesets[-1] if rulesets else None
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:
     """``a+b-c`` as names to load and names to leave out. Paths of files stay whole."""
     text = str(name)
-    if isinstance(name, Path) or Path(text).suffix in (".yaml", ".yml") and "+" not in text or _is_file(text):
+    if (
+        isinstance(name, Path)
+        or (Path(text).suffix in (".yaml", ".yml") and "+" not in text)
+        or _is_file(text)
+    ):
         return [text], []
     plus: list[str] = []
     minus: list[str] = []
@@ -114,7 +126,11 @@ def _is_file(text: str) -> bool:
 
 
 def _read_one(
-    word: str, packs: dict[str, PackDecl], rulesets: list[RulesetDecl], reporter: Reporter, from_ruleset: RulesetDecl | None
+    word: str,
+    packs: dict[str, PackDecl],
+    rulesets: list[RulesetDecl],
+    reporter: Reporter,
+    from_ruleset: RulesetDecl | None,
 ) -> None:
     if word in packs:
         return
@@ -127,11 +143,19 @@ def _read_one(
         if decl.name.text in packs:
             other = packs[decl.name.text]
             if other.source.name != decl.source.name:
-                reporter.error("PD302", f"pack `{decl.name.text}` is loaded twice", decl.name.span, f"also in {other.source.name}", helps=["rename one of them"])
+                reporter.error(
+                    "PD302",
+                    f"pack `{decl.name.text}` is loaded twice",
+                    decl.name.span,
+                    f"also in {other.source.name}",
+                    helps=["rename one of them"],
+                )
             return
         packs[decl.name.text] = decl
     elif from_ruleset is not None:
-        reporter.error("PD304", f"`{word}` is a ruleset, not a pack", decl.name.span, helps=["a ruleset lists packs"])
+        reporter.error(
+            "PD304", f"`{word}` is a ruleset, not a pack", decl.name.span, helps=["a ruleset lists packs"]
+        )
     else:
         rulesets.append(decl)
         for scalar in decl.packs:
@@ -143,7 +167,12 @@ def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | 
     span = next((s.span for s in ruleset.packs if s.text == word), None) if ruleset else None
     looks_like_path = "/" in word or "\\" in word or word.endswith((".yaml", ".yml"))
     if looks_like_path and ruleset is not None:
-        reporter.error("PD304", f"a ruleset names packs, not paths: `{word}`", span, helps=["put the file beside the ruleset and write its name"])
+        reporter.error(
+            "PD304",
+            f"a ruleset names packs, not paths: `{word}`",
+            span,
+            helps=["put the file beside the ruleset and write its name"],
+        )
         return None
     candidates = [Path(word)] if looks_like_path else []
     if ruleset is not None:
@@ -158,7 +187,9 @@ def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | 
         return None
     close = get_close_matches(word, shipped_rules(), n=1)
     helps = [f"did you mean `{close[0]}`?"] if close else ["shipped: " + ", ".join(shipped_rules())]
-    reporter.error("PD304", f"no pack or ruleset `{word}`", span, "not shipped, and no file" if span else "", helps=helps)
+    reporter.error(
+        "PD304", f"no pack or ruleset `{word}`", span, "not shipped, and no file" if span else "", helps=helps
+    )
     return None
 
 
@@ -168,11 +199,18 @@ def read_source(path: Path, reporter: Reporter) -> Source | None:
         with path.open("rb") as file:
             data = file.read(4 * MAX_CHARACTERS + 1)
         if len(data) > 4 * MAX_CHARACTERS:
-            reporter.error("PD102", f"`{path}` is larger than {4 * MAX_CHARACTERS:,} bytes", None, helps=["check that this is the file you meant"])
+            reporter.error(
+                "PD102",
+                f"`{path}` is larger than {4 * MAX_CHARACTERS:,} bytes",
+                None,
+                helps=["check that this is the file you meant"],
+            )
             return None
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        reporter.error("PD101", f"`{path}` is not UTF-8 text", None, notes=[f"byte {error.start} cannot be read"])
+        reporter.error(
+            "PD101", f"`{path}` is not UTF-8 text", None, notes=[f"byte {error.start} cannot be read"]
+        )
         return None
     except OSError as error:
         reporter.error("PD101", f"cannot read `{path}`", None, notes=[error.strerror or "not readable"])
@@ -192,13 +230,17 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
     found: dict[str, Value] = {}
     for name, value in values.items():
         if name not in known:
-            helps = suggest(name, known, "parameters") or ["parameters: " + (", ".join(sorted(known)) or "none")]
+            helps = suggest(name, known, "parameters") or [
+                "parameters: " + (", ".join(sorted(known)) or "none")
+            ]
             reporter.error("PD309", f"unknown parameter `{name}`", None, helps=list(helps))
             continue
         try:
             found[name] = param_value(known[name], value)
         except ValueError as error:
-            reporter.error("PD402", f"parameter `{name}`: {error}", None, notes=[f"it is a {known[name].kind}"])
+            reporter.error(
+                "PD402", f"parameter `{name}`: {error}", None, notes=[f"it is a {known[name].kind}"]
+            )
     return ruleset.with_params(found)
 
 
@@ -208,7 +250,13 @@ def param_value(param: Param, value: Any) -> Value:
         text = value.strip()
         words = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
         try:
-            value = words[text] if text in words else float(text[:-1]) / 100 if text.endswith("%") else float(text)
+            value = (
+                words[text]
+                if text in words
+                else float(text[:-1]) / 100
+                if text.endswith("%")
+                else float(text)
+            )
         except ValueError:
             raise ValueError(f"`{text}` is not a number") from None
     try:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl import reference
-from powderdsl.simulator import compile
 from powderdsl.draw import to_numpy
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Ruleset
+from powderdsl.simulator import compile
 
 if TYPE_CHECKING:
     from powderdsl.simulator import Simulator, World
@@ -135,7 +135,7 @@ def _context(world: World) -> reference.Context:
     }
     dtypes: dict[str, type] = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
     params: dict[str, reference.Array] = {
-        param.name: np.full(len(world), float(param.default), dtypes[param.kind.name])  # type: ignore[arg-type]
+        param.name: np.full(len(world), float(param.default), dtypes[param.kind.name])
         for param in ruleset.params
     }
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))

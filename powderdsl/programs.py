@@ -175,5 +175,7 @@ def _native(program: Program, device: torch.device, threads: int) -> Runnable:
         problem = str(error)
     reporter = Reporter()
     helps = ["run on the backend `torch`, or install g++, clang++ or `pip install ziglang`"]
-    reporter.error("PD701", "the native backend is not available", None, notes=problem.splitlines(), helps=helps)
+    reporter.error(
+        "PD701", "the native backend is not available", None, notes=problem.splitlines(), helps=helps
+    )
     raise CompileError(reporter.diagnostics)

@@ -18,7 +18,10 @@ from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Offset, Pa
 Array = np.ndarray[Any, Any]
 State = dict[str, Array]
 
-FAN = {op: np.dtype("float32").type(value) for op, value in (("near", 0.92387953251128674), ("far", 0.38268343236508977))}
+FAN = {
+    op: np.dtype("float32").type(value)
+    for op, value in (("near", 0.92387953251128674), ("far", 0.38268343236508977))
+}
 """cos(π/8) and cos(3π/8): the borders of the octants."""
 
 
@@ -145,7 +148,9 @@ def _constant(expr: Expr, at: Context) -> Array:
 
 
 def _as_kind(kind: str, value: Any, shape: tuple[int, ...]) -> Array:
-    dtype = {"flag": np.bool_, "real": np.float32, "chance": np.float64, "number": np.float64}.get(kind, np.int64)
+    dtype = {"flag": np.bool_, "real": np.float32, "chance": np.float64, "number": np.float64}.get(
+        kind, np.int64
+    )
     if kind in ("chance", "number"):
         value = float(value)
     return np.broadcast_to(np.asarray(value, dtype), shape)
@@ -164,7 +169,9 @@ def _property(expr: Expr, at: Context) -> Array:
     ids = at.state["element"]
     result = np.zeros(at.shape, _as_kind(prop.kind.name, 0, ()).dtype)
     for identity, value in enumerate(prop.values):
-        one = at.params[value][:, None, None] if isinstance(value, str) else _as_kind(prop.kind.name, value, ())
+        one = (
+            at.params[value][:, None, None] if isinstance(value, str) else _as_kind(prop.kind.name, value, ())
+        )
         result = np.where(ids == identity, one, result)
     return result
 
@@ -178,7 +185,7 @@ def _draw(expr: Expr, at: Context) -> Array:
 
 
 def _coordinate(expr: Expr, at: Context) -> Array:
-    name, modulus = expr.value  # type: ignore[misc]
+    name, modulus = expr.value
     _, height, width = at.shape
     y, x = np.mgrid[:height, :width]
     values = {"row": y, "column": x, "step": at.clock.step.astype(np.int64)[:, None, None]}
@@ -217,7 +224,7 @@ def _octant(expr: Expr, at: Context, v: Array) -> Array:
 
 
 def _member(expr: Expr, at: Context, ids: Array) -> Array:
-    return np.isin(ids, sorted(expr.value))  # type: ignore[call-overload,no-any-return]
+    return np.isin(ids, sorted(expr.value))
 
 
 def _choose(expr: Expr, at: Context, condition: Array, yes: Array, no: Array) -> Array:
@@ -295,12 +302,18 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
             for name, slot in table.items():
                 if slot.travels:
                     arrived = _where(look(mask, back), look(before[name], back), state[name])
-                    state[name] = _where(mask, look(before[name], rule.offset), arrived) if isinstance(rule, Swap) else arrived
+                    state[name] = (
+                        _where(mask, look(before[name], rule.offset), arrived)
+                        if isinstance(rule, Swap)
+                        else arrived
+                    )
     for write, mask in effects:
         _assign(write, values[id(write)], mask, state, table)
     for name, slot in table.items():
         if slot.of is not None:
-            state[name] = _where(np.isin(state["element"], sorted(slot.of)), state[name], _default(slot, state[name]))
+            state[name] = _where(
+                np.isin(state["element"], sorted(slot.of)), state[name], _default(slot, state[name])
+            )
     return state
 
 
@@ -324,7 +337,7 @@ def _become(target: Array, mask: Array, state: State, at: Context, table: Mappin
         elif (prop := at.ruleset.property(name)) is not None:
             fresh = np.zeros(at.shape, np.int64)
             for identity, value in enumerate(prop.values):
-                one = at.params[value][:, None, None] if isinstance(value, str) else value
+                one: Any = at.params[value][:, None, None] if isinstance(value, str) else value
                 fresh = np.where(target == identity, one, fresh)
             fresh = fresh.astype(state[name].dtype)
         else:
@@ -350,7 +363,9 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
 
     def claimed(rule: Any, mask: Array) -> Array:
         """The cells that a rule with this mask takes part in."""
-        return mask | look(mask, (-rule.offset[0], -rule.offset[1])) if isinstance(rule, (Swap, Move)) else mask
+        return (
+            mask | look(mask, (-rule.offset[0], -rule.offset[1])) if isinstance(rule, (Swap, Move)) else mask
+        )
 
     def touches(rule: Any, cells: Array) -> Array:
         """Where a rule would touch one of these cells."""
@@ -359,7 +374,9 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
     taken = np.zeros_like(next(iter(wanted.values()))) if wanted else None
     for rule in claims:
         mask = wanted[id(rule)]
-        if isinstance(rule, (Swap, Move)):  # pairs of one rule that share a cell have no order: none of them happens
+        if isinstance(
+            rule, (Swap, Move)
+        ):  # pairs of one rule that share a cell have no order: none of them happens
             back = (-rule.offset[0], -rule.offset[1])
             mask = mask & ~(look(wanted[id(rule)], rule.offset) | look(wanted[id(rule)], back))
         if policy == "drop_both":
@@ -368,7 +385,7 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
                     mask = mask & ~touches(rule, claimed(other, wanted[id(other)]))
         else:
             mask = mask & ~touches(rule, taken)  # type: ignore[arg-type]
-            taken = taken | claimed(rule, mask)  # type: ignore[operator]
+            taken = taken | claimed(rule, mask)
         masks[id(rule)] = mask
 
 
@@ -388,7 +405,10 @@ def settle(state: State, table: Mapping[str, Slot]) -> State:
 
 def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
     """The state after one pass."""
-    scratch = {f.name: Slot(f.name, f.kind, f.default, False, True, None, "", 2 if f.kind.name == "vec2" else 1) for f in pass_.scratch}
+    scratch = {
+        f.name: Slot(f.name, f.kind, f.default, False, True, None, "", 2 if f.kind.name == "vec2" else 1)
+        for f in pass_.scratch
+    }
     shape = at.shape
     for name, slot in scratch.items():
         at.state = {**at.state, name: _fresh(slot, shape)}
@@ -426,11 +446,13 @@ def step(
     """
     table = {slot.name: slot for slot in slots(ruleset)}
     wide = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
-    working = {name: value.astype(wide.get(table[name].kind.name, np.int64)) for name, value in state.items()}
+    working: State = {
+        name: value.astype(wide.get(table[name].kind.name, np.int64)) for name, value in state.items()
+    }
     shape = state["element"].shape
     for name, slot in table.items():
         if slot.resets:
-            working[name] = _fresh(slot, shape)  # type: ignore[arg-type]
+            working[name] = _fresh(slot, shape)
     at = Context(ruleset, working, params, dict(draws or {}), clock)
     for pass_ in ruleset.passes:
         if passes is None or pass_.name in passes:

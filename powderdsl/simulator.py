@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.programs import find_device, make_program
 from powderdsl.compiler import BACKENDS, load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.state import SNAP, Slot, slots
 from powderdsl.model.types import Ruleset
+from powderdsl.programs import find_device, make_program
 
 MAX_CELLS = 1 << 31
 
@@ -120,7 +120,9 @@ class Simulator:
         self._check_ids(tensor, "ids")
         element = tensor.to(torch.uint8)
         batch = len(element)
-        one_seed = not isinstance(seed, Tensor) and not hasattr(seed, "__len__") or getattr(seed, "ndim", 1) == 0
+        one_seed = (not isinstance(seed, Tensor) and not hasattr(seed, "__len__")) or getattr(
+            seed, "ndim", 1
+        ) == 0
         if index is None:
             index = range(batch) if one_seed else [0] * batch
         world = World(
@@ -143,7 +145,7 @@ class Simulator:
         if slot.planes == 2:
             default = torch.tensor(slot.default, dtype=dtype, device=self.device)
             return default[None, :, None, None].expand(len(ids), 2, *ids.shape[1:]).clone()
-        return torch.full(ids.shape, slot.default, dtype=dtype, device=self.device)  # type: ignore[arg-type]
+        return torch.full(ids.shape, slot.default, dtype=dtype, device=self.device)
 
     def _table(self, name: str) -> Tensor:
         """A property's values by id, parameters at their defaults."""
@@ -174,7 +176,9 @@ class Simulator:
         if tensor.ndim == 0:
             tensor = tensor.expand(batch)
         if tensor.shape != (batch,) or bool((tensor < 0).any()):
-            raise ValueError(f"{name} must be one number of 0 or more, or {batch} of them, found shape {list(tensor.shape)}")
+            raise ValueError(
+                f"{name} must be one number of 0 or more, or {batch} of them, found shape {list(tensor.shape)}"
+            )
         return tensor.clone()
 
     def _check_ids(self, ids: Tensor, name: str) -> None:
@@ -195,9 +199,17 @@ class Simulator:
         prop = self.ruleset.property(name)
         if prop is None:
             known = [*self._slots, *(p.name for p in self.ruleset.properties)]
-            raise KeyError(f"{self.ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}")
+            raise KeyError(
+                f"{self.ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}"
+            )
         table = self._table(name)
-        dtype = torch.float32 if prop.kind.name == "chance" else torch.int16 if prop.kind.name == "int" else torch.uint8
+        dtype = (
+            torch.float32
+            if prop.kind.name == "chance"
+            else torch.int16
+            if prop.kind.name == "int"
+            else torch.uint8
+        )
         return table[world.ids.long()].to(dtype)
 
     def replace(self, world: World, **fields: Any) -> World:
@@ -220,14 +232,21 @@ class Simulator:
             changed = element != state["element"]
             for name, slot in self._slots.items():
                 if slot.travels:
-                    state[name] = torch.where(changed[:, None] if slot.planes == 2 else changed, fresh[name], state[name])
+                    state[name] = torch.where(
+                        changed[:, None] if slot.planes == 2 else changed, fresh[name], state[name]
+                    )
         for name, value in fields.items():
             if name not in self._slots:
                 prop = self.ruleset.property(name)
                 if prop is None:
                     self.read(world, name)
-                if not torch.equal(self._shaped(value, name, world.shape, False).double(), self._table(name)[state["element"].long()]):
-                    raise ValueError(f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it")
+                if not torch.equal(
+                    self._shaped(value, name, world.shape, False).double(),
+                    self._table(name)[state["element"].long()],
+                ):
+                    raise ValueError(
+                        f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
+                    )
                 continue
             state[name] = self._checked(self._slots[name], value, state["element"])
         return replace(world, state=state)
@@ -240,7 +259,9 @@ class Simulator:
         try:
             return tensor.broadcast_to(target)
         except RuntimeError:
-            raise ValueError(f"{name} must have the shape {list(target)}, found {list(tensor.shape)}") from None
+            raise ValueError(
+                f"{name} must have the shape {list(target)}, found {list(tensor.shape)}"
+            ) from None
 
     def _checked(self, slot: Slot, value: Any, ids: Tensor) -> Tensor:
         tensor = self._shaped(value, slot.name, tuple(ids.shape), slot.planes == 2)
@@ -259,11 +280,17 @@ class Simulator:
             self._check_ids(whole, slot.name)
         lo, hi = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(kind.name, (kind.lo, kind.hi))
         if bool(((whole < lo) | (whole > hi)).any()):
-            raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {int(whole.min())}..{int(whole.max())}")
+            raise ValueError(
+                f"{slot.name} takes {lo:g}..{hi:g}, found {int(whole.min())}..{int(whole.max())}"
+            )
         prop = self.ruleset.property(slot.name)
         limited = prop.stored if prop is not None else slot.of
         if limited is not None:
-            usual = self._table(slot.name)[ids.long()].long() if prop is not None else torch.full_like(whole, int(slot.default))  # type: ignore[arg-type]
+            usual = (
+                self._table(slot.name)[ids.long()].long()
+                if prop is not None
+                else torch.full_like(whole, int(slot.default))
+            )
             holders = torch.isin(ids.long(), torch.tensor(sorted(limited), device=self.device))
             if bool(((whole != usual) & ~holders).any()):
                 names = ", ".join(e.name for e in self.ruleset.elements if e.id in limited)
@@ -287,10 +314,14 @@ class Simulator:
         if element is not None:
             found = self.ruleset.element(element)
             if found is None:
-                raise KeyError(f"no element `{element}`; {'; '.join(suggest(element, self.elements, 'elements'))}")
+                raise KeyError(
+                    f"no element `{element}`; {'; '.join(suggest(element, self.elements, 'elements'))}"
+                )
             fresh = self.world(torch.full_like(world.ids, found.id)).state
             state = {
-                name: torch.where(mask[:, None] if slot.planes == 2 else mask, fresh[name], world.state[name]) if slot.travels else world.state[name]
+                name: torch.where(mask[:, None] if slot.planes == 2 else mask, fresh[name], world.state[name])
+                if slot.travels
+                else world.state[name]
                 for name, slot in self._slots.items()
             }
             world = replace(world, state=state)
@@ -301,7 +332,9 @@ class Simulator:
             slot = self._slots[name]
             old = world.state[name]
             new = self._shaped(value, name, world.shape, slot.planes == 2)
-            painted = torch.where(mask[:, None] if slot.planes == 2 else mask, new.to(torch.float64), old.to(torch.float64))
+            painted = torch.where(
+                mask[:, None] if slot.planes == 2 else mask, new.to(torch.float64), old.to(torch.float64)
+            )
             world = self.replace(world, **{name: painted})
         return world
 
@@ -354,16 +387,19 @@ class Simulator:
                 raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
         if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
             raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
-        if not isinstance(steps, Integral) or isinstance(steps, bool) or steps < 0:
-            raise ValueError(f"steps must be a whole number of 0 or more, found {steps!r}")
-        steps = int(steps)
+        steps = _whole(steps, "steps")
         unknown = [name for name in passes or () if name not in self.passes]
         if unknown:
             raise KeyError(f"no pass `{unknown[0]}`; {'; '.join(suggest(unknown[0], self.passes, 'passes'))}")
         draws = self._draws(random or {}, world)
         chosen = None if passes is None else frozenset(passes)
         state = self._program.run(
-            world.state, (world.seed, world.index, world.step), steps, self._params(params or {}, len(world)), draws, chosen
+            world.state,
+            (world.seed, world.index, world.step),
+            steps,
+            self._params(params or {}, len(world)),
+            draws,
+            chosen,
         )
         return replace(world, sim=self, state=state, step=world.step + steps)
 
@@ -384,7 +420,9 @@ class Simulator:
         """The defaults as [B] tensors; the same tensors for the same batch size, which programs may rely on."""
         if self._defaults is None or self._defaults[0] != batch:
             values = {
-                param.name: torch.full((batch,), float(param.default), dtype=torch.float64, device=self.device)  # type: ignore[arg-type]
+                param.name: torch.full(
+                    (batch,), float(param.default), dtype=torch.float64, device=self.device
+                )
                 for param in self.ruleset.params
             }
             self._defaults = (batch, values)
@@ -410,7 +448,16 @@ class Simulator:
         return values
 
 
-def compile(ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu", threads: int = 1) -> Simulator:
+def _whole(value: Any, name: str) -> int:
+    """A whole number of 0 or more, Python's or NumPy's."""
+    if not isinstance(value, Integral) or type(value) is bool or int(value) < 0:
+        raise ValueError(f"{name} must be a whole number of 0 or more, found {value!r}")
+    return int(value)
+
+
+def compile(
+    ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu", threads: int = 1
+) -> Simulator:
     """A simulator that runs a ruleset.
 
     Args:

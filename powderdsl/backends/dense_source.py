@@ -6,7 +6,17 @@ import re
 
 from powderdsl.ir.ops import Node, PassGraph, nodes_of
 
-_INFIX = {"and": "&", "or": "|", "xor": "^", "eq": "==", "lt": "<", "le": "<=", "add": "+", "sub": "-", "mul": "*"}
+_INFIX = {
+    "and": "&",
+    "or": "|",
+    "xor": "^",
+    "eq": "==",
+    "lt": "<",
+    "le": "<=",
+    "add": "+",
+    "sub": "-",
+    "mul": "*",
+}
 
 
 class _Writer:
@@ -39,8 +49,8 @@ class _Writer:
         if node.op == "const":
             self.names[id(node)] = self.constant(node.attr)
             return
-        if node.op == "shift" and node.attr[2]:  # type: ignore[index]
-            dy, dx, _ = node.attr  # type: ignore[misc]
+        if node.op == "shift" and node.attr[2]:
+            dy, dx, _ = node.attr
             self.names[id(node)] = self.roll(args[0], dy, dx)
             return
         expression = self.expression(node, args)
@@ -56,20 +66,20 @@ class _Writer:
             case "input":
                 return f"state[{attr!r}]"
             case "param":
-                name, view = attr  # type: ignore[misc]
+                name, view = attr
                 return f"k.param({name!r}, {(node.type.name if view == 'value' else view)!r})"
             case "coordinate":
-                return f"k.coordinate({attr[0]!r}, {attr[1]})"  # type: ignore[index]
+                return f"k.coordinate({attr[0]!r}, {attr[1]})"
             case "inside":
-                return f"k.inside({attr[0]}, {attr[1]})"  # type: ignore[index]
+                return f"k.inside({attr[0]}, {attr[1]})"
             case "below":
                 return self.below(node, args[0])
             case "draw":
-                return f"k.draw_real({attr[0]!r})"  # type: ignore[index]
+                return f"k.draw_real({attr[0]!r})"
             case "shift":
-                return f"k.reach({args[0]}, {attr[0]}, {attr[1]})"  # type: ignore[index]
+                return f"k.reach({args[0]}, {attr[0]}, {attr[1]})"
             case "count":
-                return f"k.count({args[0]}, {attr[0]}, {attr[1]})"  # type: ignore[index]
+                return f"k.count({args[0]}, {attr[0]}, {attr[1]})"
             case "not":
                 return f"~{args[0]}"
             case "in_set":
@@ -92,31 +102,35 @@ class _Writer:
             case "to_real":
                 return f"{args[0]}.float()"
             case "settle":
-                return f"k.settle({args[0]}, {attr[0]!r}, {attr[1]!r})"  # type: ignore[index]
-            case "select" if node.type.name == "int" and node.type.hi >= 1 << 31:  # thresholds of draws of 32 bits
+                return f"k.settle({args[0]}, {attr[0]!r}, {attr[1]!r})"
+            case "select" if (
+                node.type.name == "int" and node.type.hi >= 1 << 31
+            ):  # thresholds of draws of 32 bits
                 return f"torch.where({args[0]}, {args[1]}.long(), {args[2]}.long())"
             case "select":
                 return f"torch.where({args[0]}, {args[1]}, {args[2]})"
             case "swap":
-                dy, dx = attr  # type: ignore[misc]
+                dy, dx = attr
                 there, back = self.roll(args[0], dy, dx), self.roll(args[0], -dy, -dx)
                 return f"torch.where({args[1]}, {there}, torch.where({self.roll(args[1], -dy, -dx)}, {back}, {args[2]}))"
             case "arrive":
-                dy, dx = attr  # type: ignore[misc]
-                return f"torch.where({self.roll(args[1], -dy, -dx)}, {self.roll(args[0], -dy, -dx)}, {args[2]})"
+                dy, dx = attr
+                return (
+                    f"torch.where({self.roll(args[1], -dy, -dx)}, {self.roll(args[0], -dy, -dx)}, {args[2]})"
+                )
         raise AssertionError(f"no dense kernel for {node.op}")
 
     def below(self, node: Node, limit: str) -> str:
         """A draw below a limit. Constant limits need only the bits down to their last one."""
-        stream, bits = node.attr  # type: ignore[misc]
+        stream, bits = node.attr
         significant = self.significant[stream]
         argument = node.args[0]
         if argument.op == "const":
-            return f"k.draw({stream!r}, {significant}) < {int(argument.attr) >> (bits - significant)}"  # type: ignore[call-overload]
+            return f"k.draw({stream!r}, {significant}) < {int(argument.attr) >> (bits - significant)}"
         return f"k.draw({stream!r}, {bits}) < {limit}"
 
     def in_set(self, node: Node, value: str) -> str:
-        members = sorted(node.attr)  # type: ignore[call-overload]
+        members = sorted(node.attr)
         lo, hi = node.args[0].type.lo, node.args[0].type.hi
         rest = [i for i in range(lo, hi + 1) if i not in members]
         if len(members) == 1:
@@ -141,8 +155,8 @@ def _significant_bits(pass_: PassGraph) -> dict[str, int]:
     for node in nodes_of(pass_):
         if node.op not in ("below", "draw"):
             continue
-        stream, bits = node.attr  # type: ignore[misc]
-        limit = int(node.args[0].attr) if node.op == "below" and node.args[0].op == "const" else None  # type: ignore[call-overload]
+        stream, bits = node.attr
+        limit = int(node.args[0].attr) if node.op == "below" and node.args[0].op == "const" else None
         trailing = (limit & -limit).bit_length() - 1 if limit else 0
         own = bits - min(trailing, bits - 1) if limit is not None else bits
         needed[stream] = max(needed.get(stream, 1), own)

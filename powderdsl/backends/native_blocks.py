@@ -55,7 +55,9 @@ class Block:
                 run.append(item)
                 i += 1
             if run:
-                outside = " ".join(_all_text(s) for s in (*self.statements[: i - len(run)], *self.statements[i:]))
+                outside = " ".join(
+                    _all_text(s) for s in (*self.statements[: i - len(run)], *self.statements[i:])
+                )
                 seen_outside = set(_VARIABLE.findall(outside))
                 result.append(lane_loop(run, seen_outside))
             else:
@@ -65,14 +67,20 @@ class Block:
 
 
 def _all_text(statement: str | Lanes) -> str:
-    return statement if isinstance(statement, str) else " ".join((statement.before, statement.rows, statement.after))
+    return (
+        statement
+        if isinstance(statement, str)
+        else " ".join((statement.before, statement.rows, statement.after))
+    )
 
 
 def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
     """One loop over worlds. Fields that nothing else reads are written over by each world: they need one lane."""
     written = {name for sweep in run for name in sweep.fields}
     used = sorted({name for sweep in run for name in _VARIABLE.findall(sweep.rows) if name.startswith("f")})
-    places = " ".join(f"const int l{name} = {'0' if name in written - seen_outside else 'l'};" for name in used)
+    places = " ".join(
+        f"const int l{name} = {'0' if name in written - seen_outside else 'l'};" for name in used
+    )
     before = "\n".join(sweep.before for sweep in run)
     rows = "\n".join(f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}" for sweep in run)
     after = "\n".join(sweep.after for sweep in run)
@@ -81,8 +89,11 @@ def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
     declared = " ".join(f"{'Field' if name.startswith('f') else 'Plane'}* {name};" for name, _ in outputs)
     if any(sweep.asked is None for sweep in run):
         return f"{declared}\n{loop}"
-    asked = dict.fromkeys(c for sweep in run for c in sweep.asked or () if not set(_VARIABLE.findall(c)) & written)
+    asked = dict.fromkeys(
+        c for sweep in run for c in sweep.asked or () if not set(_VARIABLE.findall(c)) & written
+    )
     quiet_values = " ".join(
-        f"{name} = keep(c.{'calm' if name.startswith('f') else 'everything' if value else 'nothing'});" for name, value in outputs
+        f"{name} = keep(c.{'calm' if name.startswith('f') else 'everything' if value else 'nothing'});"
+        for name, value in outputs
     )
     return f"{declared}\nif ({' && '.join(asked) or 'true'}) {{ {quiet_values} }} else {{\n{loop}\n}}"

@@ -67,7 +67,9 @@ def find_compiler() -> Compiler:
             tried.append(command[0])
             continue
         try:
-            result = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=30, check=True)
+            result = subprocess.run(
+                [*command, "--version"], capture_output=True, text=True, timeout=30, check=True
+            )
         except (OSError, subprocess.SubprocessError):
             tried.append(" ".join(command))
             continue
@@ -112,7 +114,11 @@ def build(source: str) -> Path:
         unit, library = Path(scratch) / "program.cpp", Path(scratch) / "program.so"
         unit.write_text(source, encoding="utf-8")
         command = [*compiler.command, *FLAGS, "-o", str(library), str(unit)]
-        if "-march=native" in command and platform.machine() in ("x86_64", "AMD64") and "avx512f" in processor():
+        if (
+            "-march=native" in command
+            and platform.machine() in ("x86_64", "AMD64")
+            and "avx512f" in processor()
+        ):
             command.insert(-3, "-mprefer-vector-width=512")
         try:
             result = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT)

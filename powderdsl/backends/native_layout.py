@@ -39,27 +39,27 @@ def _place(node: Node, layout: Layout) -> None:
     attr = node.attr
     match node.op:
         case "param" if node.type.name == "real":
-            number(layout.param_reals, attr[0])  # type: ignore[index]
+            number(layout.param_reals, attr[0])
         case "param":
             number(layout.param_planes, param_key(node))
-        case "coordinate" if attr[0] == "step":  # type: ignore[index]
-            number(layout.step_planes, (attr[1], attr[2]))  # type: ignore[index]
+        case "coordinate" if attr[0] == "step":
+            number(layout.step_planes, (attr[1], attr[2]))
         case "coordinate":
-            number(layout.fixed, (0 if attr[0] == "row" else 1, attr[1], attr[2]))  # type: ignore[index]
+            number(layout.fixed, (0 if attr[0] == "row" else 1, attr[1], attr[2]))
         case "inside":
-            number(layout.fixed, (2, attr[0], attr[1]))  # type: ignore[index]
+            number(layout.fixed, (2, attr[0], attr[1]))
         case "shift" | "swap" | "arrive" if node.type.name == "real":
-            layout.reach = max(layout.reach, abs(attr[1]))  # type: ignore[index]
+            layout.reach = max(layout.reach, abs(attr[1]))
 
 
-def number(table: dict, key: object) -> int:  # type: ignore[type-arg]
+def number(table: dict, key: object) -> int:
     """The position of a key, given on first use."""
     return int(table.setdefault(key, len(table)))
 
 
 def param_key(node: Node) -> tuple[str, str, int]:
     """Name, view and bit of a parameter's plane."""
-    name, view, *bit = node.attr  # type: ignore[misc]
+    name, view, *bit = node.attr
     return name, view, bit[0] if bit else 0
 
 

@@ -27,7 +27,7 @@ def gate_cost(node: Node, have: Callable[[Node], bool], limit: int = 1000) -> in
     if node.op in ANCHORS or node.op in DRAWS or node.op == "input":
         return limit
     if node.op == "shift":
-        dy, dx, wraps = node.attr  # type: ignore[misc]
+        _dy, dx, wraps = node.attr
         if not wraps or dx:
             return limit
         return gate_cost(node.args[0], have, limit)
@@ -93,14 +93,14 @@ class Loop:
             case "param":
                 return f"c.param_bits[{self.layout.param_planes[param_key(node)]}]"
             case "coordinate":
-                axis, modulus, bit = node.attr  # type: ignore[misc]
+                axis, modulus, bit = node.attr
                 if axis == "step":
                     return f"c.step_bits[{self.layout.step_planes[modulus, bit]}]"
                 assert dy == 0
                 return f"c.fixed[{self.layout.fixed[0 if axis == 'row' else 1, modulus, bit]}][y * words + w]"
             case "inside":
                 assert dy == 0
-                return f"c.fixed[{self.layout.fixed[2, node.attr[0], node.attr[1]]}][y * words + w]"  # type: ignore[index]
+                return f"c.fixed[{self.layout.fixed[2, node.attr[0], node.attr[1]]}][y * words + w]"
             case "chance" | "below_planes":
                 return self.draw(node, "valid")
             case "shift":
@@ -122,7 +122,7 @@ class Loop:
         raise AssertionError(f"no native plane kernel for {node.op}")
 
     def draw(self, node: Node, wanted: str) -> str:
-        stream, bits, *limit = node.attr  # type: ignore[misc]
+        stream, bits, *limit = node.attr
         number = self.layout.streams[stream]
         if node.op == "chance":
             return f"draw_below(c, {number}, y, w, {wanted}, {bits}, {limit[0]}ull)"
@@ -133,13 +133,14 @@ class Loop:
         return f"draw_below_planes(c, {number}, y, w, {wanted}, {bits}, {name})"
 
     def shift(self, node: Node, dy: int) -> str:
-        sy, sx, wraps = node.attr  # type: ignore[misc]
+        sy, sx, wraps = node.attr
         source = node.args[0]
         if not self.have(source):
-            if source.op in ("const", "param") or (source.op == "coordinate" and source.attr[0] == "step"):  # type: ignore[index]
+            if source.op in ("const", "param") or (source.op == "coordinate" and source.attr[0] == "step"):
                 assert wraps
                 return self.value(source)
-            assert wraps and not sx
+            assert wraps
+            assert not sx
             return self.value(source, dy + sy)
         plane = self.plane(source)
         if wraps:
@@ -165,7 +166,7 @@ class Loop:
 def is_clean(node: Node, have: Callable[[Node], bool]) -> bool:
     """Whether bits beyond the width are surely zero."""
     if have(node) or node.op in ("const", "inside", "coordinate", "shift", *DRAWS, *ANCHORS):
-        return not (node.op == "coordinate" and node.attr[0] == "step")  # type: ignore[index]
+        return not (node.op == "coordinate" and node.attr[0] == "step")
     if node.op == "and":
         return any(is_clean(arg, have) for arg in node.args)
     if node.op in ("or", "xor"):
@@ -187,8 +188,10 @@ def prerequisites(node: Node, have: Callable[[Node], bool]) -> list[Node]:
             return
         if node.op == "shift":
             source = node.args[0]
-            _, dx, wraps = node.attr  # type: ignore[misc]
-            constant = source.op in ("const", "param") or (source.op == "coordinate" and source.attr[0] == "step")  # type: ignore[index]
+            _, dx, wraps = node.attr
+            constant = source.op in ("const", "param") or (
+                source.op == "coordinate" and source.attr[0] == "step"
+            )
             if have(source) or (constant and wraps):
                 return
             if wraps and not dx and gate_cost(source, have) <= RECOMPUTE:
@@ -217,5 +220,9 @@ def zero_with(node: Node, planes: dict[int, str]) -> frozenset[str] | None:
         return min(found, key=len, default=None)
     if node.op in ("or", "xor", "select"):
         parts = [zero_with(arg, planes) for arg in node.args[node.op == "select" :]]
-        return None if any(part is None for part in parts) else frozenset().union(*(part or () for part in parts))
+        return (
+            None
+            if any(part is None for part in parts)
+            else frozenset().union(*(part or () for part in parts))
+        )
     return None

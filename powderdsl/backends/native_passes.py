@@ -5,10 +5,27 @@ from __future__ import annotations
 from dataclasses import replace
 
 from powderdsl.backends.native_blocks import Block, Lanes, lane_loop
+from powderdsl.backends.native_lanes import sweep_lanes
 from powderdsl.backends.native_layout import Layout
-from powderdsl.backends.native_loops import ANCHORS, DRAWS, Loop, is_clean, is_uniform, prerequisites, zero_with
-from powderdsl.backends.native_sweeps import Sweep, leading, quiet, rows_read, stored_parts, sweep_needs, unchanged
+from powderdsl.backends.native_loops import (
+    ANCHORS,
+    DRAWS,
+    Loop,
+    is_clean,
+    is_uniform,
+    prerequisites,
+    zero_with,
+)
+from powderdsl.backends.native_sweeps import (
+    Sweep,
+    leading,
+    quiet,
+    stored_parts,
+    sweep_needs,
+    unchanged,
+)
 from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, walk
+
 
 class PassWriter:
     """Writes `static void pass_N(Context& c)`."""
@@ -26,7 +43,9 @@ class PassWriter:
         nothing = lambda node: node.op == "input"  # noqa: E731
         sources = [n.args[0] for n in nodes if n.op == "shift" and n.type == REAL]
         self.stored = {id(part) for n in sources for part in stored_parts(n, nothing) if part.op != "input"}
-        self.leaders = {id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))}
+        self.leaders = {
+            id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))
+        }
         self.slot_of = {id(n): str(n.attr) for n in nodes if n.op == "input"}
 
     def source(self) -> str:
@@ -55,10 +74,14 @@ class PassWriter:
             return
         if node.type == REAL:
             self.fields[id(node)] = name = self.fresh("f")
-            self.block.statements.append(f"Field* {name} = keep(c.real[{self.layout.reals[str(node.attr)]}]);")
+            self.block.statements.append(
+                f"Field* {name} = keep(c.real[{self.layout.reals[str(node.attr)]}]);"
+            )
         else:
             self.planes[id(node)] = name = self.fresh("p")
-            self.block.statements.append(f"Plane* {name} = keep(c.slot[{self.layout.planes[str(node.attr)]}]);")
+            self.block.statements.append(
+                f"Plane* {name} = keep(c.slot[{self.layout.planes[str(node.attr)]}]);"
+            )
 
     def inputs(self, nodes: list[Node]) -> None:
         for node in nodes:
@@ -68,7 +91,11 @@ class PassWriter:
     # Moments
 
     def moment(self, step: Step, current: dict[str, Node]) -> None:
-        writes = [(slot, node) for slot, node in step.writes if id(node) in self.alive and node.type != REAL and not self.have(node)]
+        writes = [
+            (slot, node)
+            for slot, node in step.writes
+            if id(node) in self.alive and node.type != REAL and not self.have(node)
+        ]
         guards = [guard for guard in step.guards if guard.op != "const"]
         if not writes:
             return
@@ -101,19 +128,27 @@ class PassWriter:
         self.planes, self.fields, self.block = outer
         declared = ", ".join(f"*{name}" for name in dict.fromkeys(names.values()))
         otherwise = " ".join(f"{name} = keep({olds[key]});" for key, name in names.items())
-        self.block.statements.append(f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}")
+        self.block.statements.append(
+            f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}"
+        )
         self.planes.update(names)
 
     def comparisons(self, guards: list[Node]) -> None:
         """Comparisons of reals that masks ask for, outside any branch, with all others that can be had in one sweep."""
-        asked = [n for guard in guards for n in walk(guard) if n.op in ("eq", "lt", "le") and not self.have(n)]
+        asked = [
+            n for guard in guards for n in walk(guard) if n.op in ("eq", "lt", "le") and not self.have(n)
+        ]
         if not asked:
             return
         self.inputs(asked)
         self.ensure([need for node in asked for need in self.direct_needs(node)])
         others = [n for n in self.all_comparisons if not self.have(n) and n not in asked]
         self.inputs([n for n in others if not self.direct_needs_unless_input(n)])
-        ready = [n for n in others if not self.direct_needs(n) and all(self.have(i) for i in walk(n) if i.op == "input")]
+        ready = [
+            n
+            for n in others
+            if not self.direct_needs(n) and all(self.have(i) for i in walk(n) if i.op == "input")
+        ]
         self.ensure([*asked, *ready])
 
     def direct_needs_unless_input(self, node: Node) -> list[Node]:
@@ -159,7 +194,10 @@ class PassWriter:
             clean = any(is_clean(part, self.have) for part in cheap)
             outputs.append((name, " & ".join(parts) if clean else " & ".join([*parts, "valid"])))
         self.emit_loop(loop, outputs)
-        condition = " || ".join(f"!{name}->zero" for name in (*candidates.values(), *(self.planes[id(g)] for g in guards if self.have(g))))
+        condition = " || ".join(
+            f"!{name}->zero"
+            for name in (*candidates.values(), *(self.planes[id(g)] for g in guards if self.have(g)))
+        )
         rest_guards = [(g, rest) for g, _, rest in staged if rest]
         names = {id(g): self.fresh("p") for g, _ in rest_guards}
         outer = (self.planes, self.fields, self.block)
@@ -196,13 +234,16 @@ class PassWriter:
         self.planes, self.fields, self.block = outer
         declared = ", ".join(f"*{name}" for name in names.values())
         otherwise = " ".join(f"{name} = keep(c.nothing);" for name in names.values())
-        self.block.statements.append(f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}")
+        self.block.statements.append(
+            f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}"
+        )
         self.planes.update(names)
         return " || ".join(f"!{self.planes[id(g)]}->zero" for g in guards)
 
     def split(self, guard: Node) -> tuple[list[Node], list[Node]]:
         """Conjuncts that one loop can compute from what is there, and those that take more."""
-        cheap, rest = [], []
+        cheap: list[Node] = []
+        rest: list[Node] = []
         for part in _conjuncts(guard, self.have):
             free = not prerequisites(part, self.have) and part.op not in ANCHORS
             draws = any(n.op in DRAWS for n in walk(part)) and not self.have(part)
@@ -216,7 +257,11 @@ class PassWriter:
 
     def ensure(self, nodes: list[Node]) -> None:
         """Put nodes into planes or fields, with everything they need before them."""
-        wanted = [node for node in dict.fromkeys(nodes) if not self.have(node) and not (is_uniform(node) and node.type == REAL)]
+        wanted = [
+            node
+            for node in dict.fromkeys(nodes)
+            if not self.have(node) and not (is_uniform(node) and node.type == REAL)
+        ]
         if not wanted:
             return
         before: list[Node] = []
@@ -229,7 +274,9 @@ class PassWriter:
             return
         reals = [n for n in wanted if n.type == REAL or n.op in ("eq", "lt", "le")]
         # What neighbours will be asked for later is stored while it is computed anyway.
-        reals += [i for n in reals for i in walk(n) if id(i) in self.stored and not self.have(i) and i not in reals]
+        reals += [
+            i for n in reals for i in walk(n) if id(i) in self.stored and not self.have(i) and i not in reals
+        ]
         reals = list(dict.fromkeys(reals))
         moves = [n for n in wanted if n.op in ("swap", "arrive") and n.type == FLAG]
         loops = [n for n in wanted if n not in reals and n not in moves]
@@ -254,13 +301,15 @@ class PassWriter:
         key = (id(movers), dy, dx)
         if self.targets.get(key) not in self.block.defined:
             name = self.fresh("p")
-            self.block.statements.append(f"Plane* {name} = shifted(c, {self.planes[id(movers)]}, {-dy}, {-dx});")
+            self.block.statements.append(
+                f"Plane* {name} = shifted(c, {self.planes[id(movers)]}, {-dy}, {-dx});"
+            )
             self.targets[key] = name
         return self.targets[key]
 
     def movement(self, node: Node) -> None:
         content, movers, rest = node.args
-        dy, dx = node.attr  # type: ignore[misc]
+        dy, dx = node.attr
         target = self.target_plane(movers, dy, dx)
         name = self.fresh("p")
         a, m, b = (self.planes[id(arg)] for arg in (content, movers, rest))
@@ -290,8 +339,8 @@ class PassWriter:
 
     def simple(self, node: Node) -> str | None:
         """Whole-plane operations that see at once when there is nothing to do."""
-        if node.op == "shift" and node.attr[2] and self.have(node.args[0]):  # type: ignore[index]
-            dy, dx, _ = node.attr  # type: ignore[misc]
+        if node.op == "shift" and node.attr[2] and self.have(node.args[0]):
+            dy, dx, _ = node.attr
             return f"shifted(c, {self.planes[id(node.args[0])]}, {dy}, {dx})"
         if node.op == "and":
             for kept, gone in (node.args, node.args[::-1]):
@@ -303,15 +352,23 @@ class PassWriter:
             return "keep(c.nothing)"
         return None
 
-    def emit_loop(self, loop: Loop, outputs: list[tuple[str, str]], empty: list[frozenset[str] | None] | None = None) -> None:
+    def emit_loop(
+        self, loop: Loop, outputs: list[tuple[str, str]], empty: list[frozenset[str] | None] | None = None
+    ) -> None:
         """A loop that fills planes. `empty`: planes of which it is known that if they are empty, so is the output."""
         takes = " ".join(f"{name} = take(c); V a{name} = splat(0);" for name, _ in outputs)
         declared = "Plane " + ", ".join(f"*{name}" for name, _ in outputs) + ";\n"
         nothing = ""
         if empty and all(names is not None for names in empty):
-            asked = " && ".join(sorted({f"{name}->zero" for names in empty for name in names or ()})) or "true"
-            nothing = f"if ({asked}) {{ {' '.join(f'{name} = keep(c.nothing);' for name, _ in outputs)} }} else "
-        stores = "\n".join(f"{{ const V o = {value}; {name}->data[i] = o; a{name} |= o; }}" for name, value in outputs)
+            asked = (
+                " && ".join(sorted({f"{name}->zero" for names in empty for name in names or ()})) or "true"
+            )
+            nothing = (
+                f"if ({asked}) {{ {' '.join(f'{name} = keep(c.nothing);' for name, _ in outputs)} }} else "
+            )
+        stores = "\n".join(
+            f"{{ const V o = {value}; {name}->data[i] = o; a{name} |= o; }}" for name, value in outputs
+        )
         ends = " ".join(f"{name}->zero = !any(a{name});" for name, _ in outputs)
         body = "\n".join(loop.lines)
         self.block.statements.append(
@@ -329,7 +386,11 @@ class PassWriter:
         nodes = sorted(nodes, key=lambda n: (n.type != REAL, id(n) not in leaders))
         values, masks, _ = quiet(nodes, self.have)
         sweep = Sweep(self.planes, self.fields, self.layout)
-        sweep.wanted = [n for n in dict.fromkeys(i for node in nodes if node.type == REAL for i in walk(node)) if n.op == "select" and n.type == REAL]
+        sweep.wanted = [
+            n
+            for n in dict.fromkeys(i for node in nodes if node.type == REAL for i in walk(node))
+            if n.op == "select" and n.type == REAL
+        ]
         outputs = []
         for node in nodes:
             if node.type == REAL:
@@ -338,79 +399,29 @@ class PassWriter:
             else:
                 name = self.fresh("p")
                 outputs.append((node, name, sweep.comparison(node, self.leaders)))
-        takes, row_start, stores, word_end, row_end, quiet_row = [], [], [], [], [], []
-        for position, (node, name, value) in enumerate(outputs):
-            if node.type == REAL:
-                takes.append(f"{name} = take_field(c); bool some{name} = false;")
-                row_start.append(f"float* o{name} = {name}->data + ((size_t)l{name} * height + y) * c.g.stride + HALO; u32 n{name} = 0;")
-                stores.append(f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= bits_of(o != splatf(0)) & inside; }}")
-                row_end.append(f"finish_row(c, o{name}); {name}->live[l{name} * height + y] = n{name} != 0; some{name} |= n{name} != 0;")
-                quiet_row.append(f"{name}->live[l{name} * height + y] = 0;")
-            else:
-                takes.append(f"{name} = take(c); u64 a{name} = 0;")
-                row_start.append(f"u64 u{name} = 0;")
-                stores.append(f"u{name} |= (u64)({value}) << (x & 63);")
-                rest = bool(values[position]) if values else False
-                word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q; a{name} |= q;"
-                word_end.append(f"{{ const u64 q = u{name} & c.valid(w)[l]; {word} u{name} = 0; }}")
-                quiet_row.append(f"for (int w = 0; w < words; w++) {{ const u64 q = {'c.valid(w)[l]' if rest else '0'}; {word} }}")
-        ends = " ".join(f"{name}->zero = !a{name};" if node.type != REAL else f"{name}->still = !some{name};" for node, name, _ in outputs)
-        pads = " ".join(
-            f"for (int l = c.lanes; l < LANES; l++) for (int i = 0; i < height * words; i++) ((u64*){name}->data)[i * LANES + l] = 0;"
-            if node.type != REAL else f"for (int l = c.lanes; l < LANES; l++) memset({name}->live + l * height, 0, height);"
-            for node, name, _ in outputs
-        )  # fmt: skip
-        rows = " ".join(f"const float* {name} = {call};" for call, name in sweep.rows.items())
-        words = [f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];" for plane, name in sweep.words.items()]
-        words += [f"const u64 {name} = {joined};" for joined, name in sweep.joined.items()]
-        check = ""
-        asked: tuple[str, ...] | None = None
-        if values is not None:
-            read = rows_read(nodes, self.have)
-            busy = [self.busy(node, dy, wraps) for node, dy, wraps in read]
-            gates = [f"((const u64*){self.planes[id(m)]}->data)[(y * words + w) * LANES + l]" for m in masks if m.op != "param"]
-            scan = f"for (int w = 0; w < words; w++) some |= {' | '.join(gates)};" if gates else ""
-            fixed = "true" if any(m.op == "param" for m in masks) else " || ".join(busy) or "false"
-            check = f"{{ u64 some = ({fixed}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet_row)} continue; }} }}"
-            if not any(m.op == "param" for m in masks):
-                still = [f"{self.fields[id(node)]}->still" for node, _, _ in read]
-                asked = (*still, *(f"{self.planes[id(m)]}->zero" for m in masks))
-        body = "\n".join([
-            f"{check}\n{rows} {' '.join(row_start)}",
-            f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
-            "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {",
-            "const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;",
-            *sweep.lines, *stores, "}", " ".join(word_end), "}", " ".join(row_end),
-        ])  # fmt: skip
-        written = tuple((name, bool(values[i]) if values else False) for i, (_, name, _) in enumerate(outputs))
+        lanes = sweep_lanes(outputs, sweep, values, masks)
         kept = [unchanged(node) for node in nodes]
         if all(kept) and all(self.have(base) for base, _ in kept):  # type: ignore[misc]
-            self.changed_rows(outputs, kept, Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, None))  # type: ignore[arg-type]
+            self.changed_rows(outputs, kept, lanes)  # type: ignore[arg-type]
         else:
-            self.block.statements.append(Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, asked))
+            self.block.statements.append(lanes)
         for node, name, _ in outputs:
             (self.fields if node.type == REAL else self.planes)[id(node)] = name
 
-    def changed_rows(self, outputs: list[tuple[Node, str, str]], kept: list[tuple[Node, list[Node]]], sweep: Lanes) -> None:
+    def changed_rows(
+        self, outputs: list[tuple[Node, str, str]], kept: list[tuple[Node, list[Node]]], sweep: Lanes
+    ) -> None:
         """Settled slots under choices stay as they are where no choice holds: whole fields, or row by row."""
         masks = {id(mask): self.planes[id(mask)] for _, chosen in kept for mask in chosen}.values()
         scan = " | ".join(f"((const u64*){plane}->data)[(y * words + w) * LANES + l]" for plane in masks)
         pairs = [(name, self.fields[id(base)]) for (_, name, _), (base, _) in zip(outputs, kept, strict=True)]
         copies = " ".join(f"some{name} |= copy_row(c, {name}, {base}, l, y);" for name, base in pairs)
         still = f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; if (!some) {{ {copies} continue; }} }}\n"
-        loop = lane_loop([replace(sweep, rows=still + sweep.rows)], sweep.fields)
+        loop = lane_loop([replace(sweep, rows=still + sweep.rows, asked=None)], sweep.fields)
         declared, _, rest = loop.partition("\n")
         same = " ".join(f"{name} = keep({base});" for name, base in pairs)
         empty = " && ".join(f"{plane}->zero" for plane in masks) or "true"
         self.block.statements.append(f"{declared}\nif ({empty}) {{ {same} }} else {{\n{rest}\n}}")
-
-    def busy(self, node: Node, dy: int, wraps: bool) -> str:
-        name = self.fields[id(node)]
-        if dy == 0:
-            return f"{name}->live[l{name} * height + y]"
-        if wraps:
-            return f"{name}->live[l{name} * height + c.line(y + {dy})]"
-        return f"(y + {dy} >= 0 && y + {dy} < height && {name}->live[l{name} * height + y + {dy}])"
 
     def finish(self) -> None:
         """Leave the outputs in the context's slots."""
@@ -425,8 +436,12 @@ class PassWriter:
                 number = self.layout.planes[slot]
                 lines.append(f"Plane* s{number} = keep({self.planes[id(node)]});")
         for slot, node in self.pass_.outputs:
-            kind, table, prefix = ("real", self.layout.reals, "r") if node.type == REAL else ("slot", self.layout.planes, "s")
-            lines.append(f"give(c, c.{kind}[{table[slot]}]); c.{kind}[{table[slot]}] = {prefix}{table[slot]};")
+            kind, table, prefix = (
+                ("real", self.layout.reals, "r") if node.type == REAL else ("slot", self.layout.planes, "s")
+            )
+            lines.append(
+                f"give(c, c.{kind}[{table[slot]}]); c.{kind}[{table[slot]}] = {prefix}{table[slot]};"
+            )
         self.block.statements.append("\n".join(lines))
 
 
@@ -434,5 +449,3 @@ def _conjuncts(node: Node, have) -> list[Node]:  # type: ignore[no-untyped-def]
     if node.op != "and" or have(node):
         return [node]
     return [part for arg in node.args for part in _conjuncts(arg, have)]
-
-

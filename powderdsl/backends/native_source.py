@@ -19,9 +19,15 @@ def native_source(program: Program) -> tuple[str, Layout]:
     layout = layout_of(program)
     passes = [PassWriter(p, i, layout).source() for i, p in enumerate(program.passes)]
     calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
-    resets = [(slot, layout.planes.get(slot.name), layout.reals.get(slot.name)) for slot in program.slots if slot.resets]
+    resets = [
+        (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
+        for slot in program.slots
+        if slot.resets
+    ]
     reset_planes = [f"{{{plane}, {int(slot.default)}}}" for slot, plane, _ in resets if plane is not None]
-    reset_reals = [f"{{{real}, {literal(float(slot.default))}}}" for slot, _, real in resets if real is not None]
+    reset_reals = [
+        f"{{{real}, {literal(float(slot.default))}}}" for slot, _, real in resets if real is not None
+    ]
     step_table = [f"{{{a}, {b}}}" for a, b in layout.step_planes]
     fixed = [f"{{{k}, {a}, {b}}}" for k, a, b in layout.fixed]
     idents = [f"{ident}u" for _, ident, _ in program.streams]

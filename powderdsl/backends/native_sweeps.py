@@ -20,7 +20,7 @@ def real_cost(node: Node, have: Callable[[Node], bool]) -> int:
         return 0
     if node.op in _INFIX or node.op == "neg":
         return 1 + sum(real_cost(arg, have) for arg in node.args)
-    if node.op == "shift" and node.attr[2]:  # type: ignore[index]
+    if node.op == "shift" and node.attr[2]:
         return real_cost(node.args[0], have)
     return 100
 
@@ -44,7 +44,7 @@ def sweep_needs(node: Node, have: Callable[[Node], bool]) -> tuple[list[Node], l
             source = top.args[0]
             if have(source):
                 continue
-            if not top.attr[2]:  # type: ignore[index]
+            if not top.attr[2]:
                 reals[id(source)] = source
                 continue
             parts = stored_parts(source, have)
@@ -84,7 +84,11 @@ class Sweep:
     def row(self, field: str, dy: int, wraps: bool = True) -> str:
         """The pointer to a field's row, set up once a row."""
         self.used.add(field)
-        call = f"real_row_wrapped(c, {field}, l{field}, y + {dy})" if wraps else f"real_row_or_nothing(c, {field}, l{field}, y + {dy})"
+        call = (
+            f"real_row_wrapped(c, {field}, l{field}, y + {dy})"
+            if wraps
+            else f"real_row_or_nothing(c, {field}, l{field}, y + {dy})"
+        )
         if wraps and dy == 0:
             call = f"real_row(c, {field}, l{field}, y)"
         return self.rows.setdefault(call, f"r{len(self.rows)}")
@@ -110,7 +114,7 @@ class Sweep:
     def value(self, node: Node, dy: int = 0, dx: int = 0) -> str:
         """The name of the node's chunk at the neighbour (dy, dx)."""
         if node.op == "const":
-            return f"splatf({literal(float(node.attr))})"  # type: ignore[arg-type]
+            return f"splatf({literal(float(node.attr))})"
         key = (id(node), dy, dx)
         if key not in self.memo:
             self.memo[key] = self.compute(node, dy, dx)
@@ -124,9 +128,9 @@ class Sweep:
             return self.select(node)
         match node.op:
             case "param":
-                return self.temporary(f"splatf(c.param_real[{self.layout.param_reals[node.attr[0]]}][l])")  # type: ignore[index]
+                return self.temporary(f"splatf(c.param_real[{self.layout.param_reals[node.attr[0]]}][l])")
             case "draw":
-                stream, bits = node.attr  # type: ignore[misc]
+                stream, bits = node.attr
                 self.counter[0] += 1
                 name = f"d{self.counter[0]}"
                 number = self.layout.streams[stream]
@@ -134,7 +138,7 @@ class Sweep:
                 self.lines.append(f"F {name}; for (int i = 0; i < CHUNK; i++) {name}[i] = {cell};")
                 return name
             case "shift":
-                sy, sx, wraps = node.attr  # type: ignore[misc]
+                sy, sx, wraps = node.attr
                 if wraps:
                     return self.value(args[0], dy + sy, dx + sx)
                 assert dy == dx == 0
@@ -161,7 +165,7 @@ class Sweep:
             case "sqrt":
                 return self.temporary(f"root({values[0]})")
             case "settle":
-                lo, hi = node.attr  # type: ignore[misc]
+                lo, hi = node.attr
                 return self.temporary(f"settle({values[0]}, {literal(lo)}, {literal(hi)}, SNAP)")
         raise AssertionError(f"no native sweep for {node.op}")
 
@@ -194,7 +198,11 @@ class Sweep:
         chain = self.chain(node)
         masks = [choice.args[0] for choice in chain]
         # Parts of a vector hang on the same masks: they are tested once for both.
-        alike = [self.chain(other) for other in self.wanted if other is not node and (id(other), 0, 0) not in self.memo]
+        alike = [
+            self.chain(other)
+            for other in self.wanted
+            if other is not node and (id(other), 0, 0) not in self.memo
+        ]
         chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
         names = []
         for one in chains:
@@ -208,10 +216,16 @@ class Sweep:
             bits = f"b{self.counter[0]}"
             nested = block.inner()
             for one, name in zip(chains, names, strict=True):
-                nested.memo[id(one[level].args[2]), 0, 0] = name  # here only: further on the name holds another value
+                nested.memo[id(one[level].args[2]), 0, 0] = (
+                    name  # here only: further on the name holds another value
+                )
             chosen = [nested.value(one[level].args[1]) for one in chains]
-            blends = [f"{name} = blend({bits}, {value}, {name});" for name, value in zip(names, chosen, strict=True)]
-            block.lines.append(f"if (const u32 {bits} = {self.mask(masks[level])}) {{ {' '.join([*nested.lines, *blends])} }}")
+            blends = [
+                f"{name} = blend({bits}, {value}, {name});" for name, value in zip(names, chosen, strict=True)
+            ]
+            block.lines.append(
+                f"if (const u32 {bits} = {self.mask(masks[level])}) {{ {' '.join([*nested.lines, *blends])} }}"
+            )
         for one, name in zip(chains[1:], names[1:], strict=True):
             self.memo[id(one[0]), 0, 0] = name
         name = names[0]
@@ -227,7 +241,11 @@ class Sweep:
 def leading(node: Node, comparisons: list[Node], pass_: PassGraph) -> Node | None:
     """A comparison that everything which asks for `node` also asks for: where it fails, `node` may be anything."""
     for leader in comparisons:
-        if leader is not node and leader.args != node.args and all(_covered(root, node, leader) for _, root in pass_.outputs):
+        if (
+            leader is not node
+            and leader.args != node.args
+            and all(_covered(root, node, leader) for _, root in pass_.outputs)
+        ):
             return leader
     return None
 
@@ -271,7 +289,9 @@ def stored_parts(source: Node, have: Callable[[Node], bool]) -> list[Node]:
     return [source]
 
 
-def quiet(nodes: list[Node], have: Callable[[Node], bool]) -> tuple[list[float | bool] | None, list[Node], list[Node]]:
+def quiet(
+    nodes: list[Node], have: Callable[[Node], bool]
+) -> tuple[list[float | bool] | None, list[Node], list[Node]]:
     """What the nodes are where all reals are zero and no mask holds; which masks and rows decide that it is so.
 
     The values are None if parameters or draws enter, so that no row may be skipped.
@@ -287,14 +307,14 @@ def quiet(nodes: list[Node], have: Callable[[Node], bool]) -> tuple[list[float |
             sources[id(node)] = node
             result: object = np.float32(0)
         elif node.op == "const":
-            result = np.float32(node.attr)  # type: ignore[arg-type]
+            result = np.float32(node.attr)
         elif node.op == "select":
             masks[id(node.args[0])] = node.args[0]
             result = visit(node.args[2])
         elif node.op == "shift":
             source = node.args[0]
             result = visit(source)
-            if not node.attr[2] and result:  # type: ignore[index]
+            if not node.attr[2] and result:
                 raise LookupError
         elif node.op in ("param", "draw"):
             raise LookupError
@@ -314,7 +334,7 @@ def quiet(nodes: list[Node], have: Callable[[Node], bool]) -> tuple[list[float |
     return found, list(masks.values()), list(sources.values())
 
 
-_QUIET: dict[str, Callable] = {  # type: ignore[type-arg]
+_QUIET: dict[str, Callable] = {
     "add": lambda n, a, b: a + b,
     "sub": lambda n, a, b: a - b,
     "mul": lambda n, a, b: a * b,
@@ -351,7 +371,7 @@ def rows_read(nodes: list[Node], have: Callable[[Node], bool]) -> list[tuple[Nod
         if node.type == REAL and have(node) and node not in nodes:
             found[id(node), dy, wraps] = (node, dy, wraps)
         elif node.op == "shift":
-            visit(node.args[0], dy + node.attr[0], node.attr[2])  # type: ignore[index]
+            visit(node.args[0], dy + node.attr[0], node.attr[2])
         elif node.op == "select":
             visit(node.args[2], dy, wraps)
         else:

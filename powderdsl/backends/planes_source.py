@@ -48,25 +48,25 @@ class _Writer:
                 self.emit(node, f"state[{attr!r}]")
             case "const" if real:
                 name = f"c{len(self.constants)}"
-                self.constants[name] = float(attr)  # type: ignore[arg-type]
+                self.constants[name] = float(attr)
                 self.names[id(node)] = name
             case "const":
                 self.emit(node, "k.valid" if attr else "k.zero")
             case "param":
-                self.emit(node, f"k.param({', '.join(map(repr, attr))})")  # type: ignore[call-overload]
+                self.emit(node, f"k.param({', '.join(map(repr, attr))})")
             case "coordinate":
-                self.emit(node, f"k.coordinate({', '.join(map(repr, attr))})")  # type: ignore[call-overload]
+                self.emit(node, f"k.coordinate({', '.join(map(repr, attr))})")
             case "inside":
-                self.emit(node, f"k.inside({attr[0]}, {attr[1]})")  # type: ignore[index]
+                self.emit(node, f"k.inside({attr[0]}, {attr[1]})")
             case "chance":
-                self.emit(node, f"k.chance({attr[0]!r}, {attr[1]}, {attr[2]})")  # type: ignore[index]
+                self.emit(node, f"k.chance({attr[0]!r}, {attr[1]}, {attr[2]})")
             case "below_planes":
                 planes = ", ".join(self.name(arg) for arg in args)
-                self.emit(node, f"k.below({attr[0]!r}, {attr[1]}, ({planes},))")  # type: ignore[index]
+                self.emit(node, f"k.below({attr[0]!r}, {attr[1]}, ({planes},))")
             case "draw":
-                self.emit(node, f"k.draw_real({attr[0]!r}, {attr[1]})")  # type: ignore[index]
+                self.emit(node, f"k.draw_real({attr[0]!r}, {attr[1]})")
             case "shift":
-                dy, dx, wraps = attr  # type: ignore[misc]
+                dy, dx, wraps = attr
                 call = "k.shift_cells" if real else "k.shift"
                 self.emit(node, f"{call}({self.name(args[0])}, {dy}, {dx}, {wraps})")
             case "not":
@@ -89,9 +89,11 @@ class _Writer:
                 # torch's float32 square root is not always rounded correctly on CPUs; from float64 it is.
                 self.emit(node, f"torch.sqrt({self.name(args[0])}.double()).float()")
             case "settle":
-                self.emit(node, f"k.settle({self.name(args[0])}, {attr[0]!r}, {attr[1]!r})")  # type: ignore[index]
+                self.emit(node, f"k.settle({self.name(args[0])}, {attr[0]!r}, {attr[1]!r})")
             case "select" if real:
-                self.emit(node, f"torch.where({self.dense(args[0])}, {self.name(args[1])}, {self.name(args[2])})")
+                self.emit(
+                    node, f"torch.where({self.dense(args[0])}, {self.name(args[1])}, {self.name(args[2])})"
+                )
             case "select":
                 condition, yes, no = map(self.name, args)
                 self.emit(node, f"{no} ^ ({condition} & ({yes} ^ {no}))")
@@ -103,7 +105,7 @@ class _Writer:
     def movement(self, group: list[Node]) -> None:
         """Swaps or arrivals of several planes with the same movers and offset."""
         first = group[0]
-        dy, dx = first.attr  # type: ignore[misc]
+        dy, dx = first.attr
         if first.type == REAL:
             for node in group:
                 content, movers, rest = node.args
@@ -114,12 +116,12 @@ class _Writer:
         rests = ", ".join(self.name(node.args[2]) for node in group)
         same = contents == rests
         results = []
-        for node in group:
-            self.names[id(node)] = self.fresh()
-            results.append(self.names[id(node)])
-        movers = self.name(first.args[1])
+        for moved in group:
+            self.names[id(moved)] = self.fresh()
+            results.append(self.names[id(moved)])
+        who = self.name(first.args[1])
         given = "None" if same else f"({rests},)"
-        self.lines.append(f"{', '.join(results)}, = k.{first.op}(({contents},), {movers}, {given}, {dy}, {dx})")
+        self.lines.append(f"{', '.join(results)}, = k.{first.op}(({contents},), {who}, {given}, {dy}, {dx})")
 
 
 def _grouped(nodes: list[Node]) -> list[list[Node]]:
@@ -127,7 +129,9 @@ def _grouped(nodes: list[Node]) -> list[list[Node]]:
     key_of = {id(n): (n.op, id(n.args[1]), n.attr, n.type.name) for n in nodes if n.op in ("swap", "arrive")}
     depth: dict[int, int] = {}
     for node in nodes:
-        depth[id(node)] = max((depth[id(arg)] for arg in node.args), default=0) + (node.op in ("swap", "arrive"))
+        depth[id(node)] = max((depth[id(arg)] for arg in node.args), default=0) + (
+            node.op in ("swap", "arrive")
+        )
     groups: dict[object, list[Node]] = {}
     for node in nodes:
         if id(node) in key_of:
@@ -157,5 +161,8 @@ def planes_pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[st
     returned = ", ".join(f"{slot!r}: {writer.name(node)}" for slot, node in pass_.outputs)
     lines = with_deletions(writer.lines, returned)
     body = [f"def {name}(k, state):", *(f"    {line}" for line in lines), f"    return {{{returned}}}"]
-    header = [f"# {comment(pass_.name)}", *(f"# {key} = {value!r}" for key, value in writer.constants.items())]
+    header = [
+        f"# {comment(pass_.name)}",
+        *(f"# {key} = {value!r}" for key, value in writer.constants.items()),
+    ]
     return "\n".join(header + body) + "\n", name, writer.constants

@@ -9,6 +9,7 @@ from __future__ import annotations
 import linecache
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from powderdsl.ir.ops import Program
 SNAP = 2.0**-20
 
 Clock = tuple[Tensor, Tensor, Tensor]
-PassFunction = Callable[["Kernels", dict[str, Tensor]], dict[str, Tensor]]
+PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
 
 _DTYPES = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
 
@@ -140,7 +141,9 @@ class Kernels:
         return limit.clamp(0, count).to(torch.int64)
 
     @staticmethod
-    def swap(content: Tensor, movers: Tensor, targets: Tensor, there: Tensor, back: Tensor, rest: Tensor) -> Tensor:
+    def swap(
+        content: Tensor, movers: Tensor, targets: Tensor, there: Tensor, back: Tensor, rest: Tensor
+    ) -> Tensor:
         return torch.where(movers, there, torch.where(targets, back, rest))
 
     @staticmethod
@@ -157,7 +160,9 @@ class Kernels:
 
 def kernel_source(program: Program, only: str | None = None) -> str:
     """The generated source of all passes (or one), as `--emit kernels` prints it."""
-    return "\n\n".join(pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only)
+    return "\n\n".join(
+        pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
+    )
 
 
 class DenseProgram:
@@ -168,7 +173,9 @@ class DenseProgram:
         self.device = device
         self._slots = {slot.name: slot for slot in program.slots}
         self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
-        self._idents = torch.tensor([ident for _, ident, _ in program.streams], dtype=torch.int64, device=device)
+        self._idents = torch.tensor(
+            [ident for _, ident, _ in program.streams], dtype=torch.int64, device=device
+        )
         self._functions: list[tuple[str, PassFunction]] = [
             (p.name, compiled(*pass_source(p, i), device)) for i, p in enumerate(program.passes)
         ]
@@ -195,7 +202,9 @@ class DenseProgram:
                 kernels.begin(start + i)
                 for name, slot in self._slots.items():
                     if slot.resets:
-                        planes[name] = torch.full(kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device)
+                        planes[name] = torch.full(
+                            kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
+                        )
                 for name, function in self._functions:
                     if passes is None or name in passes:
                         planes.update(function(kernels, planes))
@@ -212,12 +221,16 @@ class DenseProgram:
                 planes[name] = state[name].to(_DTYPES[slot.type.name])
         return planes
 
-    def _pack(self, planes: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: Kernels) -> dict[str, Tensor]:
+    def _pack(
+        self, planes: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: Kernels
+    ) -> dict[str, Tensor]:
         """Planes as state slots in storage dtypes."""
         packed = {}
         for name, old in like.items():
             if old.ndim == 4:
-                packed[name] = torch.stack([kernels.full(planes[f"{name}.{part}"]) for part in ("row", "column")], 1)
+                packed[name] = torch.stack(
+                    [kernels.full(planes[f"{name}.{part}"]) for part in ("row", "column")], 1
+                )
             else:
                 new = kernels.full(planes[name]).to(old.dtype)
                 packed[name] = new.clone() if new is old else new.contiguous()
@@ -230,8 +243,14 @@ def compiled(source: str, name: str, constants: Mapping[str, object], device: to
     linecache.cache[filename] = (len(source), None, source.splitlines(True), filename)
     namespace: dict[str, object] = {"torch": torch}
     for key, value in constants.items():
-        dtype = torch.bool if isinstance(value, bool) else torch.float32 if isinstance(value, float) else torch.int32
-        if dtype == torch.int32 and max(value if isinstance(value, tuple) else (value,)) >= 1 << 31:  # type: ignore[type-var]
+        dtype = (
+            torch.bool
+            if isinstance(value, bool)
+            else torch.float32
+            if isinstance(value, float)
+            else torch.int32
+        )
+        if dtype == torch.int32 and max(value if isinstance(value, tuple) else (value,)) >= 1 << 31:
             dtype = torch.int64  # thresholds of draws of 32 bits
         namespace[key] = torch.tensor(value, dtype=dtype, device=device)
     exec(compile(source, filename, "exec"), namespace)

@@ -19,7 +19,9 @@ from powderdsl.ir.ops import Program, SlotType
 class PackedState(Mapping[str, Tensor]):
     """A batch's state in native memory. Slots are unpacked into tensors one by one, when they are first read."""
 
-    def __init__(self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]):
+    def __init__(
+        self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
+    ):
         self.program, self.handle, self.like = program, handle, like
         self._tensors: dict[str, Tensor] = {}
         weakref.finalize(self, program.library.pd_free, handle)
@@ -65,7 +67,8 @@ class NativeProgram:
         passes: frozenset[str] | None,
     ) -> Mapping[str, Tensor]:
         """The state `steps` later. Given draws and chosen passes are for other backends."""
-        assert not draws and passes is None
+        assert not draws
+        assert passes is None
         seed, index, start = (part.contiguous() for part in clock)
         batch = len(seed)
         if isinstance(state, PackedState) and state.program is self:
@@ -76,14 +79,25 @@ class NativeProgram:
         planes, reals = self._parameters(params, batch)
         packed = PackedState(self, handle, like)
         self.library.pd_run(
-            handle, steps, self.threads, _address(seed), _address(index), _address(start), _address(planes), _address(reals)
+            handle,
+            steps,
+            self.threads,
+            _address(seed),
+            _address(index),
+            _address(start),
+            _address(planes),
+            _address(reals),
         )
         return packed
 
     def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
         """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
         key = tuple(params.values())
-        if self._last is not None and len(key) == len(self._last[0]) and all(a is b for a, b in zip(key, self._last[0], strict=True)):
+        if (
+            self._last is not None
+            and len(key) == len(self._last[0])
+            and all(a is b for a, b in zip(key, self._last[0], strict=True))
+        ):
             return self._last[1]
         planes = torch.zeros(max(1, len(self.layout.param_planes)), batch, dtype=torch.uint8)
         views: dict[tuple[str, str], Tensor] = {}
@@ -98,7 +112,9 @@ class NativeProgram:
         self._last = (key, (planes, reals))
         return planes, reals
 
-    def _pack(self, state: Mapping[str, Tensor]) -> tuple[int, dict[str, tuple[torch.dtype, tuple[int, ...]]]]:
+    def _pack(
+        self, state: Mapping[str, Tensor]
+    ) -> tuple[int, dict[str, tuple[torch.dtype, tuple[int, ...]]]]:
         batch, height, width = state["element"].shape
         handle = self.library.pd_new(batch, height, width)
         like = {}
@@ -109,7 +125,9 @@ class NativeProgram:
                 parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
                 for i, part in enumerate(parts):
                     first = value[:, i] if value.ndim == 4 else value
-                    self.library.pd_load_real(handle, self.layout.reals[part], _address(first), value.stride(0))
+                    self.library.pd_load_real(
+                        handle, self.layout.reals[part], _address(first), value.stride(0)
+                    )
             else:
                 slot, bits, _ = self._where(name)
                 self.library.pd_load(handle, slot, bits, value.element_size(), _address(value))
@@ -131,10 +149,14 @@ class NativeProgram:
             parts = (f"{name}.row", f"{name}.column") if len(shape) == 4 else (name,)
             for i, part in enumerate(parts):
                 first = value[:, i] if len(shape) == 4 else value
-                self.library.pd_store_real(state.handle, self.layout.reals[part], _address(first), value.stride(0))
+                self.library.pd_store_real(
+                    state.handle, self.layout.reals[part], _address(first), value.stride(0)
+                )
         else:
             slot, bits, signed = self._where(name)
-            self.library.pd_store(state.handle, slot, bits, int(signed), value.element_size(), _address(value))
+            self.library.pd_store(
+                state.handle, slot, bits, int(signed), value.element_size(), _address(value)
+            )
         return value
 
 

@@ -50,7 +50,9 @@ class PlaneKernels:
             x = torch_words.columns(x, dx, self.width, self.valid, wraps)
         return torch_words.rows(x, dy, wraps, dim) if dy else x
 
-    def swap(self, contents: tuple[Tensor, ...], movers: Tensor, rests: tuple[Tensor, ...] | None, dy: int, dx: int) -> tuple[Tensor, ...]:
+    def swap(
+        self, contents: tuple[Tensor, ...], movers: Tensor, rests: tuple[Tensor, ...] | None, dy: int, dx: int
+    ) -> tuple[Tensor, ...]:
         """Movers and targets exchanged, in all planes. Where nothing else changed, by the xor of the two."""
         movers = self.full(movers)
         content = torch.stack([self.full(c) for c in contents])
@@ -63,7 +65,9 @@ class PlaneKernels:
         rest = rest ^ (targets & (rest ^ back))
         return (rest ^ (movers & (rest ^ there))).unbind(0)
 
-    def arrive(self, contents: tuple[Tensor, ...], movers: Tensor, rests: tuple[Tensor, ...] | None, dy: int, dx: int) -> tuple[Tensor, ...]:
+    def arrive(
+        self, contents: tuple[Tensor, ...], movers: Tensor, rests: tuple[Tensor, ...] | None, dy: int, dx: int
+    ) -> tuple[Tensor, ...]:
         """Targets get what the movers held."""
         targets = self.shift(movers, -dy, -dx, True)
         back = self.shift(torch.stack([self.full(c) for c in contents]), -dy, -dx, True)
@@ -120,7 +124,11 @@ class PlaneKernels:
 
     def param(self, name: str, view: str, bit: int | None = None) -> Tensor:
         if bit is None and view == "value":
-            return self.dense.param(name, "real") if not self._is_flag(name) else self._mask(self.dense.param(name, "flag"))
+            return (
+                self.dense.param(name, "real")
+                if not self._is_flag(name)
+                else self._mask(self.dense.param(name, "flag"))
+            )
         number = self.dense.param(name, "int" if view == "value" else view).to(torch.int64)
         return self._mask((number >> (bit or 0)) & 1 != 0)
 
@@ -135,7 +143,11 @@ class PlaneKernels:
         key = (axis, modulus, bit)
         if key not in self._cache:
             flags = (self.dense.coordinate(axis, modulus) >> bit) & 1 != 0
-            self._cache[key] = self._mask(flags) if axis == "step" else torch_words.pack(flags.expand(self.dense.shape[1:]))[None]
+            self._cache[key] = (
+                self._mask(flags)
+                if axis == "step"
+                else torch_words.pack(flags.expand(self.dense.shape[1:]))[None]
+            )
         return self._cache[key]
 
     def inside(self, dy: int, dx: int) -> Tensor:
@@ -151,7 +163,9 @@ class PlaneKernels:
 
     def swap_cells(self, content: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
         roll = self.dense.roll
-        return torch.where(movers, roll(content, dy, dx), torch.where(roll(movers, -dy, -dx), roll(content, -dy, -dx), rest))
+        return torch.where(
+            movers, roll(content, dy, dx), torch.where(roll(movers, -dy, -dx), roll(content, -dy, -dx), rest)
+        )
 
     def arrive_cells(self, content: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
         return torch.where(self.dense.roll(movers, -dy, -dx), self.dense.roll(content, -dy, -dx), rest)
@@ -162,7 +176,9 @@ class PlaneKernels:
 
 def planes_kernel_source(program: Program, only: str | None = None) -> str:
     """The generated source of all passes (or one) of a program on planes."""
-    return "\n\n".join(planes_pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only)
+    return "\n\n".join(
+        planes_pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
+    )
 
 
 class PlanesProgram:
@@ -178,7 +194,9 @@ class PlanesProgram:
         self._slots: tuple[SlotType, ...] = program.slots
         self._flags = frozenset(name for name, kind in program.params if kind == "flag")
         self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
-        self._idents = torch.tensor([ident for _, ident, _ in program.streams], dtype=torch.int64, device=device)
+        self._idents = torch.tensor(
+            [ident for _, ident, _ in program.streams], dtype=torch.int64, device=device
+        )
         self._defaults = {slot.name: slot for slot in planes.slots}
         self._functions: list[tuple[str, PassFunction]] = [
             (p.name, compiled(*planes_pass_source(p, i), device)) for i, p in enumerate(planes.passes)
@@ -236,13 +254,17 @@ class PlanesProgram:
                     planes[f"{slot.name}:{i}"] = torch_words.pack((state[slot.name] >> i) & 1 != 0)
         return planes
 
-    def _pack(self, planes: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: PlaneKernels) -> dict[str, Tensor]:
+    def _pack(
+        self, planes: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: PlaneKernels
+    ) -> dict[str, Tensor]:
         """Planes as state slots in storage dtypes."""
         packed = {}
         types = {slot.name: slot.type for slot in self._slots}
         for name, old in like.items():
             if old.ndim == 4:
-                packed[name] = torch.stack([kernels.dense.full(planes[f"{name}.{part}"]) for part in ("row", "column")], 1)
+                packed[name] = torch.stack(
+                    [kernels.dense.full(planes[f"{name}.{part}"]) for part in ("row", "column")], 1
+                )
             elif old.dtype == torch.float32:
                 packed[name] = kernels.dense.full(planes[name]).clone()
             elif types[name].name == "flag":

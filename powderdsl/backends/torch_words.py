@@ -36,11 +36,19 @@ def columns(x: Tensor, dx: int, width: int, valid: Tensor, wraps: bool) -> Tenso
         by = dx % width
         return x if by == 0 else (shift_right(x, by) | (x << (width - by))) & valid
     if count == 1:
-        return shift_right(x, dx) if 0 <= dx < WORD else (x << -dx) & valid if -WORD < dx < 0 else torch.zeros_like(x)
+        return (
+            shift_right(x, dx)
+            if 0 <= dx < WORD
+            else (x << -dx) & valid
+            if -WORD < dx < 0
+            else torch.zeros_like(x)
+        )
     rest = width - WORD * (count - 1)
     if dx > 0:
         after = _following(x, rest, wraps)
-        filled = torch.cat([x[..., :-1], x[..., -1:] | (x[..., :1] << rest)], -1) if wraps and rest < WORD else x
+        filled = (
+            torch.cat([x[..., :-1], x[..., -1:] | (x[..., :1] << rest)], -1) if wraps and rest < WORD else x
+        )
         return (shift_right(filled, dx) | (after << (WORD - dx))) & valid
     before = _preceding(x, rest, wraps)
     return ((x << -dx) | shift_right(before, WORD + dx)) & valid

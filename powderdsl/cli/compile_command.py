@@ -12,7 +12,7 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import backend_option, check_writable, load_rules, rules_argument, set_option
 from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
-from powderdsl.model.packs import Block, PackDecl, PassDecl
+from powderdsl.model.declarations import Block, PackDecl, PassDecl
 from powderdsl.model.text import one_line, place_of, print_model
 from powderdsl.syntax.ast import Syntax
 

@@ -14,7 +14,8 @@ from powderdsl.cli.options import check_writable
 from powderdsl.compiler import read, read_source, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.model.check import check
-from powderdsl.model.packs import ElementDecl, PackDecl, read_file
+from powderdsl.model.declarations import ElementDecl, PackDecl
+from powderdsl.model.packs import read_file
 from powderdsl.model.schema import MAX_NAME, NAME
 from powderdsl.worlds.files import replacing
 

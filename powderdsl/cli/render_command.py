@@ -28,8 +28,8 @@ def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, sca
     check_writable(out)
     from powderdsl.cli.pictures import pictures
     from powderdsl.cli.start_worlds import start_ids, start_world
-    from powderdsl.simulator import compile
     from powderdsl.media import write_png
+    from powderdsl.simulator import compile
 
     ids = start_ids(ruleset, world, size, None, None)
     # Nothing runs, so the backend that takes no compiling will do.

@@ -84,7 +84,9 @@ class Reporter:
         """
         if span is not None and span.end <= span.start:
             span = Span(span.source, span.start, span.start + 1)  # something to underline
-        diagnostic = Diagnostic(code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps))
+        diagnostic = Diagnostic(
+            code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps)
+        )
         if diagnostic in self._found:
             return
         if diagnostic.severity is Severity.ERROR:

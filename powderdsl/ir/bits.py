@@ -24,7 +24,9 @@ def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
     if slot.type.name != "int":
         return (slot,)
     count, _ = width(slot.type.lo, slot.type.hi)
-    return tuple(SlotType(f"{slot.name}:{i}", FLAG, int(slot.default) >> i & 1, slot.resets) for i in range(count))
+    return tuple(
+        SlotType(f"{slot.name}:{i}", FLAG, int(slot.default) >> i & 1, slot.resets) for i in range(count)
+    )
 
 
 def lower_bits(program: Program) -> Program:
@@ -90,15 +92,15 @@ class _PassBits:
             case "input":
                 return self._input(node)
             case "const" if node.type.name == "int":
-                return gates.constant(int(node.attr))  # type: ignore[call-overload]
+                return gates.constant(int(node.attr))
             case "param" if node.type.name == "int":
                 count, signed = width(node.type.lo, node.type.hi)
-                name, view = node.attr  # type: ignore[misc]
+                name, view = node.attr
                 planes = tuple(build.make("param", FLAG, attr=(name, view, i)) for i in range(count))
                 return Bits(planes, signed)
             case "coordinate":
                 count, signed = width(node.type.lo, node.type.hi)
-                planes = tuple(build.make("coordinate", FLAG, attr=(*node.attr, i)) for i in range(count))  # type: ignore[misc]
+                planes = tuple(build.make("coordinate", FLAG, attr=(*node.attr, i)) for i in range(count))
                 return Bits(planes, signed)
             case "below":
                 return self._below(node)
@@ -122,7 +124,9 @@ class _PassBits:
                 return self._compare(node)
             case "select" if node.type.name == "int":
                 condition = self._flag(args[0])
-                return gates.select(condition, self._bits(args[1]), self._bits(args[2]), node.type.lo, node.type.hi)
+                return gates.select(
+                    condition, self._bits(args[1]), self._bits(args[2]), node.type.lo, node.type.hi
+                )
             case "select" if node.type == FLAG:
                 return gates.mux(self._flag(args[0]), self._flag(args[1]), self._flag(args[2]))
             case "swap" | "arrive":
@@ -142,7 +146,7 @@ class _PassBits:
         return self.gates.fit(stored, node.type.lo, node.type.hi)
 
     def _shift(self, node: Node) -> Node | Bits:
-        dy, dx, wraps = node.attr  # type: ignore[misc]
+        dy, dx, wraps = node.attr
         value = self.values[id(node.args[0])]
         if isinstance(value, Bits):
             value = self.gates.fit(value, node.type.lo, node.type.hi)
@@ -160,31 +164,31 @@ class _PassBits:
         if isinstance(content, Node):
             assert isinstance(rest, Node)
             if content.type == REAL:  # cell by cell anyway: choices between what neighbours hold
-                dy, dx = offset  # type: ignore[misc]
+                dy, dx = offset
                 targets = self.gates.shift(movers, (-dy, -dx), True)
                 moved = self.build.select(targets, self.build.shift(content, (-dy, -dx)), rest)
                 if node.op == "swap":
                     moved = self.build.select(movers, self.build.shift(content, (dy, dx)), moved)
                 return moved
-            return make(content, movers, rest, offset)  # type: ignore[arg-type]
+            return make(content, movers, rest, offset)
         assert isinstance(rest, Bits)
         content = self.gates.fit(content, node.type.lo, node.type.hi)
         rest = self.gates.fit(rest, node.type.lo, node.type.hi)
         planes = []
         for a, b in zip(content.planes, rest.planes, strict=True):
-            planes.append(a if a is b and a.op == "const" else make(a, movers, b, offset))  # type: ignore[arg-type]
+            planes.append(a if a is b and a.op == "const" else make(a, movers, b, offset))
         return Bits(tuple(planes), content.signed)
 
     def _below(self, node: Node) -> Node:
         """A draw below a limit. A constant limit is an attribute; another is given plane by plane, highest first."""
         limit = node.args[0]
-        stream, bits = node.attr  # type: ignore[misc]
+        stream, bits = node.attr
         if limit.op == "select":
             condition, yes, no = limit.args
             parts = [self._below(replace_argument(node, arg)) for arg in (yes, no)]
             return self.gates.mux(self._flag(condition), *parts)
         if limit.op == "const":
-            count = int(limit.attr)  # type: ignore[call-overload]
+            count = int(limit.attr)
             if count <= 0:
                 return self.gates.no
             if count >= 1 << bits:
@@ -217,7 +221,9 @@ class _PassBits:
         entries = node.attr
         assert isinstance(entries, tuple)
         hi = min(hi, len(entries) - 1)
-        planes = tuple(self._function(value, lo, hi, lambda v, i=i: entries[v] >> i & 1) for i in range(count))
+        planes = tuple(
+            self._function(value, lo, hi, lambda v, i=i: entries[v] >> i & 1) for i in range(count)
+        )
         return Bits(planes, signed)
 
     def _compare(self, node: Node) -> Node:
@@ -230,7 +236,7 @@ class _PassBits:
         for value, other, flipped in ((left, right, False), (right, left, True)):
             planes = self._bits(value).planes
             if other.op == "const" and len(planes) <= 5:
-                bound = int(other.attr)  # type: ignore[call-overload]
+                bound = int(other.attr)
                 holds = {
                     "eq": lambda v, c=bound: v == c,
                     "lt": (lambda v, c=bound: c < v) if flipped else (lambda v, c=bound: v < c),
@@ -245,18 +251,20 @@ class _PassBits:
         """0 < count(x), 1 <= count(x), count(x) == 0: neighbours are joined, not counted."""
         left, right = node.args
         counted = right if right.op == "count" else left
-        if counted.op != "count" or any(weight < 0 for _, _, weight in counted.attr[0]):  # type: ignore[index]
+        if counted.op != "count" or any(weight < 0 for _, _, weight in counted.attr[0]):
             return None
         bound = left if counted is right else right
         if bound.op != "const":
             return None
-        limit = int(bound.attr)  # type: ignore[call-overload]
-        some = (node.op == "lt" and counted is right and limit == 0) or (node.op == "le" and counted is right and limit == 1)
+        limit = int(bound.attr)
+        some = (node.op == "lt" and counted is right and limit == 0) or (
+            node.op == "le" and counted is right and limit == 1
+        )
         none = (node.op == "eq" and limit == 0) or (node.op == "lt" and counted is left and limit == 1)
         none = none or (node.op == "le" and counted is left and limit == 0)
         if not (some or none):
             return None
-        weights, wraps = counted.attr  # type: ignore[misc]
+        weights, wraps = counted.attr
         flag = self._flag(counted.args[0])
         rows = self._rows(weights)
         joined = self.gates.any([
@@ -275,7 +283,7 @@ class _PassBits:
     def _count(self, node: Node) -> Bits:
         """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
         gates = self.gates
-        weights, wraps = node.attr  # type: ignore[misc]
+        weights, wraps = node.attr
         flag = self._flag(node.args[0])
         sums: dict[tuple[tuple[int, int], ...], tuple[tuple[Node, ...], tuple[Node, ...]]] = {}
         columns: tuple[list[list[Node]], list[list[Node]]] = ([], [])
@@ -346,11 +354,20 @@ class _PassBits:
         assert isinstance(modulus, int)
         count, signed = width(0, modulus - 1)
         if modulus & (modulus - 1) == 0:
-            return Bits(tuple(self.gates.bit(value, i) if i < modulus.bit_length() - 1 else self.gates.no for i in range(count)), signed)
+            return Bits(
+                tuple(
+                    self.gates.bit(value, i) if i < modulus.bit_length() - 1 else self.gates.no
+                    for i in range(count)
+                ),
+                signed,
+            )
         inner = node.args[0].type
         if len(value.planes) > MAX_TABLE_BITS // 2:
             return self.gates.fit(self._remainder(value, modulus), 0, modulus - 1)
-        planes = tuple(self._function(value, inner.lo, inner.hi, lambda v, i=i: v % modulus >> i & 1) for i in range(count))
+        planes = tuple(
+            self._function(value, inner.lo, inner.hi, lambda v, i=i: v % modulus >> i & 1)
+            for i in range(count)
+        )
         return Bits(planes, signed)
 
     def _remainder(self, value: Bits, modulus: int) -> Bits:
@@ -381,7 +398,9 @@ class _PassBits:
         for i, plane in enumerate(value.planes):
             weight = -float(1 << i) if value.signed and i == len(value.planes) - 1 else float(1 << i)
             if plane is not self.gates.no:
-                total = build.arithmetic("add", total, build.select(plane, build.real(weight), build.real(0.0)))
+                total = build.arithmetic(
+                    "add", total, build.select(plane, build.real(weight), build.real(0.0))
+                )
         return total
 
 

@@ -32,7 +32,9 @@ class Builder:
         return self.make("const", REAL, attr=float(value))
 
     def const(self, value: int | float, type: Type) -> Node:
-        return {"flag": self.flag, "int": self.whole, "real": self.real}[type.name](value)  # type: ignore[operator,no-any-return]
+        if type == FLAG:
+            return self.flag(bool(value))
+        return self.real(value) if type == REAL else self.whole(int(value))
 
     # Flags
 

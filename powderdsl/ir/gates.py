@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations
+from typing import Any
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, Node, Offset
@@ -110,8 +111,8 @@ class Gates:
     def shift(self, a: Node, offset: Offset, wraps: bool) -> Node:
         if a is self.no or (a is self.yes and wraps) or offset == (0, 0):
             return a
-        if a.op == "shift" and a.attr[2] and wraps:  # type: ignore[index]
-            dy, dx, _ = a.attr  # type: ignore[misc]
+        if a.op == "shift" and a.attr[2] and wraps:
+            dy, dx, _ = a.attr
             return self.shift(a.args[0], (dy + offset[0], dx + offset[1]), True)
         return self.build.shift(a, offset, wraps)
 
@@ -202,7 +203,7 @@ class Gates:
         return self._expand([inputs[i] for i in used], tuple(table), order)
 
     def _expand(self, inputs: list[Node], table: tuple[bool | None, ...], order: tuple[int, ...]) -> Node:
-        gates = {
+        gates: dict[str, Callable[..., Any]] = {
             "no": lambda: self.no,
             "yes": lambda: self.yes,
             "and": lambda i, f: self.and_(inputs[i], f),
@@ -219,7 +220,9 @@ def _opposite(a: Node, b: Node) -> bool:
     return (a.op == "not" and a.args[0] is b) or (b.op == "not" and b.args[0] is a)
 
 
-def _shannon(table: tuple[bool | None, ...], order: tuple[int, ...], gates: dict[str, Callable]):  # type: ignore[type-arg, no-untyped-def]
+def _shannon(
+    table: tuple[bool | None, ...], order: tuple[int, ...], gates: dict[str, Callable[..., Any]]
+) -> Any:
     """Split a truth table on its inputs in order; halves that agree where both matter are joined."""
     cares = {value for value in table if value is not None}
     if True not in cares:
@@ -254,7 +257,7 @@ def _best_order(table: tuple[bool | None, ...], inputs: int) -> tuple[int, ...]:
     """The order of inputs that takes the fewest gates; highest first where there are too many to try."""
     if inputs > 5:
         return tuple(reversed(range(inputs)))
-    cost: dict[str, Callable] = {  # type: ignore[type-arg]
+    cost: dict[str, Callable[..., Any]] = {
         "no": lambda: 0, "yes": lambda: 0, "and": lambda i, f: f + 1, "andnot": lambda i, f: f + 1, "or": lambda i, f: f + 1,
         "ornot": lambda i, f: f + 1, "xor": lambda i, f: f + 1, "mux": lambda i, f, g: f + g + 2,
     }  # fmt: skip

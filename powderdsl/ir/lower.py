@@ -39,9 +39,11 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
     for slot in table.values():
         defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
         for name, default in zip(plane_names(slot), defaults, strict=True):
-            slot_types.append(SlotType(name, plane_type(slot.kind, ruleset.slots), default, slot.resets))  # type: ignore[arg-type]
+            slot_types.append(SlotType(name, plane_type(slot.kind, ruleset.slots), default, slot.resets))
     # What a slot that starts each step at its default can have become by the time a pass reads it.
-    ranges = {s.name: whole(int(s.default), int(s.default)) for s in slot_types if s.resets and s.type.name == "int"}
+    ranges = {
+        s.name: whole(int(s.default), int(s.default)) for s in slot_types if s.resets and s.type.name == "int"
+    }
     passes = []
     for pass_ in ruleset.passes:
         graph = _PassLowering(ruleset, table, {s.name: s.type for s in slot_types} | ranges).lower(pass_)
@@ -73,11 +75,20 @@ class _PassLowering:
         self.lets: dict[str, Node | Pair] = {}
         self.slots = dict(self.table)
         for item in pass_.scratch:
-            slot = Slot(item.name, item.kind, item.default, False, True, None, "", 2 if item.kind.name == "vec2" else 1)
+            slot = Slot(
+                item.name,
+                item.kind,
+                item.default,
+                False,
+                True,
+                None,
+                "",
+                2 if item.kind.name == "vec2" else 1,
+            )
             self.slots[item.name] = slot
             type = plane_type(item.kind, self.ruleset.slots)
             for name in plane_names(slot):
-                self.state[name] = build.const(0 if slot.planes == 2 else item.default, type)  # type: ignore[arg-type]
+                self.state[name] = build.const(0 if slot.planes == 2 else item.default, type)
         steps = tuple(self._moment(moment, pass_) for moment in pass_.moments)
         outputs = []
         for name, type in self.types.items():
@@ -85,7 +96,9 @@ class _PassLowering:
                 continue
             if type == REAL:
                 kind = self.table[name.removesuffix(".row").removesuffix(".column")].kind
-                self.state[name] = build.make("settle", REAL, self.state[name], attr=(float(kind.lo), float(kind.hi)))
+                self.state[name] = build.make(
+                    "settle", REAL, self.state[name], attr=(float(kind.lo), float(kind.hi))
+                )
             outputs.append((name, self.state[name]))
         return PassGraph(pass_.name, pass_.pack, steps, tuple(outputs))
 
@@ -99,7 +112,9 @@ class _PassLowering:
         for let in moment.lets:
             self.lets[let.name] = lower_expression(let.value, self.planes())
         at = self.planes()
-        masks = {id(rule): _flag(lower_expression(rule.mask, at)) for rule in moment.rules if rule.mask is not None}
+        masks = {
+            id(rule): _flag(lower_expression(rule.mask, at)) for rule in moment.rules if rule.mask is not None
+        }
         movers: list[Mover] = [rule for rule in moment.rules if not isinstance(rule, Assign)]
         if moment.policy != "prove":
             self._apply_policy(moment.policy, movers, masks)
@@ -137,7 +152,13 @@ class _PassLowering:
         build = self.build
         before = dict(self.state)
         for rule in movers:
-            target = rule.target if isinstance(rule, Transform) else rule.leaving if isinstance(rule, Move) else None
+            target = (
+                rule.target
+                if isinstance(rule, Transform)
+                else rule.leaving
+                if isinstance(rule, Move)
+                else None
+            )
             if target is not None:
                 fresh = lower_expression(target, at)
                 assert isinstance(fresh, Node)
@@ -167,7 +188,7 @@ class _PassLowering:
             defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
             type = plane_type(slot.kind, self.ruleset.slots)
             for name, default in zip(plane_names(slot), defaults, strict=True):
-                found[name] = build.const(default, type)  # type: ignore[arg-type]
+                found[name] = build.const(default, type)
         return found
 
     def _apply_policy(self, policy: str, movers: list[Mover], masks: dict[int, Node]) -> None:

@@ -91,7 +91,7 @@ def _const(expr: Expr, at: Planes) -> Node:
             return build.flag(bool(expr.value))
         case "real" | "chance" | "number":
             return build.real(_float32(expr.value))
-    return build.whole(int(expr.value))  # type: ignore[call-overload,no-any-return]
+    return build.whole(int(expr.value))
 
 
 def _float32(value: object) -> float:
@@ -129,7 +129,7 @@ def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
 
 def _look(expr: Expr, at: Planes) -> Node | Pair:
     offset = expr.value
-    return _each(lambda a: at.build.shift(a, offset), lower_expression(expr.args[0], at))  # type: ignore[arg-type]
+    return _each(lambda a: at.build.shift(a, offset), lower_expression(expr.args[0], at))
 
 
 def _arithmetic(expr: Expr, at: Planes) -> Node | Pair:
@@ -143,7 +143,7 @@ def _divide(expr: Expr, at: Planes) -> Node | Pair:
 
 
 def _member(expr: Expr, at: Planes) -> Node:
-    return at.build.in_set(node(expr.args[0], at), expr.value)  # type: ignore[arg-type]
+    return at.build.in_set(node(expr.args[0], at), expr.value)
 
 
 def _logic(expr: Expr, at: Planes) -> Node:
@@ -165,7 +165,7 @@ def _draw_real(expr: Expr, at: Planes) -> Node:
         return at.build.make("draw", REAL, attr=_stream(expr, at))
     parts = [_draw_real(a, at) if a.kind.name == "draw" else at.build.to_real(node(a, at)) for a in expr.args]
     if expr.op == "look":
-        return at.build.shift(parts[0], expr.value)  # type: ignore[arg-type]
+        return at.build.shift(parts[0], expr.value)
     return at.build.arithmetic(expr.op, parts[0], parts[1])
 
 
@@ -178,16 +178,20 @@ def _chance_real(expr: Expr, at: Planes) -> Node:
         case "param":
             return param_node(at, str(expr.value), "value")
         case "look":
-            return build.shift(_chance_real(expr.args[0], at), expr.value)  # type: ignore[arg-type]
+            return build.shift(_chance_real(expr.args[0], at), expr.value)
         case "choose":
-            return build.select(node(expr.args[0], at), _chance_real(expr.args[1], at), _chance_real(expr.args[2], at))
+            return build.select(
+                node(expr.args[0], at), _chance_real(expr.args[1], at), _chance_real(expr.args[2], at)
+            )
         case "let":
             value = at.lets[str(expr.value)]
             assert isinstance(value, Node)
             return value
     prop = at.ruleset.property(str(expr.value))
     assert prop is not None
-    values = [param_node(at, v, "value") if isinstance(v, str) else build.real(_float32(v)) for v in prop.values]
+    values = [
+        param_node(at, v, "value") if isinstance(v, str) else build.real(_float32(v)) for v in prop.values
+    ]
     return at.by_element(at.state["element"], values)
 
 
@@ -205,7 +209,7 @@ def _split_draw(expr: Expr, at: Planes) -> tuple[Expr, tuple[int, int], Node | N
         return expr, (0, 0), None
     if expr.op == "look":
         draw, (dy, dx), extra = _split_draw(expr.args[0], at)
-        oy, ox = expr.value  # type: ignore[misc]
+        oy, ox = expr.value
         return draw, (dy + oy, dx + ox), at.build.shift(extra, (oy, ox)) if extra else None
     left, right = expr.args
     if left.kind.name == "draw":
@@ -229,16 +233,17 @@ def _threshold_node(chance: Expr, bits: int, mode: str, at: Planes) -> Node:
     build = at.build
     match chance.op:
         case "const":
-            return build.whole(threshold(chance.value, bits, mode))  # type: ignore[arg-type]
+            return build.whole(threshold(chance.value, bits, mode))
         case "param":
             return param_node(at, str(chance.value), f"{mode}{bits}")
         case "look":
-            return build.shift(_threshold_node(chance.args[0], bits, mode, at), chance.value)  # type: ignore[arg-type]
+            return build.shift(_threshold_node(chance.args[0], bits, mode, at), chance.value)
         case "choose":
             yes, no = (_threshold_node(arg, bits, mode, at) for arg in chance.args[1:])
             return build.select(node(chance.args[0], at), yes, no)
     prop = at.ruleset.property(str(chance.value))
-    assert prop is not None and chance.op == "property"
+    assert prop is not None
+    assert chance.op == "property"
     values = [
         param_node(at, v, f"{mode}{bits}") if isinstance(v, str) else build.whole(threshold(v, bits, mode))  # type: ignore[arg-type]
         for v in prop.values
@@ -258,7 +263,9 @@ def _lt(expr: Expr, at: Planes) -> Node:
     other = left if flipped else right
 
     def below(limit: Node) -> Node:
-        found = build.make("below", FLAG, build.shift(limit, (-offset[0], -offset[1])), attr=_stream(draw, at))
+        found = build.make(
+            "below", FLAG, build.shift(limit, (-offset[0], -offset[1])), attr=_stream(draw, at)
+        )
         return build.shift(found, offset)
 
     bits = _stream(draw, at)[1]
@@ -280,7 +287,9 @@ def _lt(expr: Expr, at: Planes) -> Node:
             result = part
         else:
             zero = build.whole(0)
-            result = build.or_(build.compare("lt", extra, zero), build.and_(build.compare("eq", extra, zero), part))
+            result = build.or_(
+                build.compare("lt", extra, zero), build.and_(build.compare("eq", extra, zero), part)
+            )
     return build.not_(result) if flipped else result
 
 
@@ -369,8 +378,10 @@ _LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
     "field": lambda e, at: _slot(str(e.value), at),
     "let": lambda e, at: at.lets[str(e.value)],
     "draw": _draw_real,
-    "coordinate": lambda e, at: at.build.make("coordinate", whole(int(e.kind.lo), int(e.kind.hi)), attr=e.value),  # type: ignore[arg-type]
-    "inside": lambda e, at: at.build.make("inside", FLAG, attr=e.value),  # type: ignore[arg-type]
+    "coordinate": lambda e, at: at.build.make(
+        "coordinate", whole(int(e.kind.lo), int(e.kind.hi)), attr=e.value
+    ),
+    "inside": lambda e, at: at.build.make("inside", FLAG, attr=e.value),
     "look": _look,
     "member": _member,
     "not": _logic,
@@ -387,7 +398,7 @@ _LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
     "div": _divide,
     "neg": lambda e, at: _each(at.build.neg, lower_expression(e.args[0], at)),
     "abs": lambda e, at: at.build.abs(node(e.args[0], at)),
-    "mod": lambda e, at: at.build.mod(node(e.args[0], at), e.value),  # type: ignore[arg-type]
+    "mod": lambda e, at: at.build.mod(node(e.args[0], at), e.value),
     "to_real": _to_real,
     "count": _count,
     "sum": _sum,

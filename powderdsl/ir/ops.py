@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 Offset = tuple[int, int]
 
@@ -48,17 +49,53 @@ OPS: dict[str, Op] = {
         # where values come from
         Op("input", (), "?", "slot", "what the pass finds in a slot"),
         Op("const", (), "?", "value", "the same everywhere"),
-        Op("param", (), "?", "(name, view[, bit])", "one number a world; view: `value`, or a chance as a threshold for draws"),
+        Op(
+            "param",
+            (),
+            "?",
+            "(name, view[, bit])",
+            "one number a world; view: `value`, or a chance as a threshold for draws",
+        ),
         Op("coordinate", (), "?", "(row | column | step, modulus[, bit])"),
         Op("inside", (), "flag", "offset", "whether that neighbour lies inside the grid"),
-        Op("below", ("int",), "flag", "(stream, bits)", "whether the stream's draw k is less than the argument"),
+        Op(
+            "below",
+            ("int",),
+            "flag",
+            "(stream, bits)",
+            "whether the stream's draw k is less than the argument",
+        ),
         Op("draw", (), "real", "(stream, bits)", "(k + ½) / 2^bits, rounded to float32"),
         # the same on bit planes
-        Op("chance", (), "flag", "(stream, bits, limit)", "whether the stream's draw k is less than a constant"),
-        Op("below_planes", ("*flag",), "flag", "(stream, bits)", "`below`, the limit's planes given highest first"),
+        Op(
+            "chance",
+            (),
+            "flag",
+            "(stream, bits, limit)",
+            "whether the stream's draw k is less than a constant",
+        ),
+        Op(
+            "below_planes",
+            ("*flag",),
+            "flag",
+            "(stream, bits)",
+            "`below`, the limit's planes given highest first",
+        ),
         # neighbours
-        Op("shift", ("?",), "=", "(rows, columns, wraps)", "the value at a neighbour; zero outside unless it wraps"),
-        Op("count", ("flag",), "int", "((rows, columns, weight)…, wraps)", "weighted number of neighbours that hold"),
+        Op(
+            "shift",
+            ("?",),
+            "=",
+            "(rows, columns, wraps)",
+            "the value at a neighbour; zero outside unless it wraps",
+        ),
+        Op(
+            "count",
+            ("flag",),
+            "int",
+            "((rows, columns, weight)…, wraps)",
+            "weighted number of neighbours that hold",
+        ),
         # flags
         Op("not", ("flag",), "flag"),
         Op("and", ("flag", "flag"), "flag"),
@@ -81,11 +118,29 @@ OPS: dict[str, Op] = {
         Op("mod", ("int",), "int", "modulus"),
         Op("sqrt", ("real",), "real"),
         Op("to_real", ("?",), "real"),
-        Op("settle", ("real",), "real", "(low, high)", "not a number → 0, cut off at the bounds, smaller than SNAP → 0"),
+        Op(
+            "settle",
+            ("real",),
+            "real",
+            "(low, high)",
+            "not a number → 0, cut off at the bounds, smaller than SNAP → 0",
+        ),
         # choices and movements
         Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),
-        Op("swap", ("=", "flag", "="), "=", "offset", "(content, movers, rest): movers and their targets exchanged"),
-        Op("arrive", ("=", "flag", "="), "=", "offset", "(content, movers, rest): targets get the movers' content"),
+        Op(
+            "swap",
+            ("=", "flag", "="),
+            "=",
+            "offset",
+            "(content, movers, rest): movers and their targets exchanged",
+        ),
+        Op(
+            "arrive",
+            ("=", "flag", "="),
+            "=",
+            "offset",
+            "(content, movers, rest): targets get the movers' content",
+        ),
     )
 }
 """Every operation of the IR."""
@@ -101,7 +156,7 @@ class Node:
     op: str
     type: Type
     args: tuple[Node, ...]
-    attr: Hashable
+    attr: Any
     index: int
     places: tuple[str, ...] = field(default=(), repr=False)
     """Where it was written: ``rules/acme.yaml:12``. Takes no part in interning."""
@@ -113,7 +168,14 @@ class Graph:
     def __init__(self) -> None:
         self._nodes: dict[Hashable, Node] = {}
 
-    def node(self, op: str, type: Type, args: tuple[Node, ...] = (), attr: Hashable = None, places: tuple[str, ...] = ()) -> Node:
+    def node(
+        self,
+        op: str,
+        type: Type,
+        args: tuple[Node, ...] = (),
+        attr: Hashable = None,
+        places: tuple[str, ...] = (),
+    ) -> Node:
         if op in COMMUTATIVE and args[0].type != REAL and args[0].index > args[1].index:
             args = (args[1], args[0])
         # A const's type keeps 1 and 1.0 and True apart; -0.0 never arises as a constant.

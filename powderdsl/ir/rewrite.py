@@ -104,14 +104,16 @@ def rebuild(node: Node, args: tuple[Node, ...], build: Builder) -> Node:
         case "select":
             return build.select(*args)
         case "swap" | "arrive":
-            return (build.swap if node.op == "swap" else build.arrive)(*args, node.attr)  # type: ignore[arg-type]
+            content, movers, rest = args
+            move = build.swap if node.op == "swap" else build.arrive
+            return move(content, movers, rest, node.attr)
         case "neg":
             return build.neg(*args)
         case "abs":
             return build.abs(*args)
         case "shift":
-            dy, dx, wraps = node.attr  # type: ignore[misc]
+            dy, dx, wraps = node.attr
             return build.shift(args[0], (dy, dx), wraps)
         case "table":
-            return build.table(args[0], node.attr)  # type: ignore[arg-type]
+            return build.table(args[0], node.attr)
     return build.make(node.op, node.type, *args, attr=node.attr)

@@ -21,7 +21,7 @@ def verify(program: Program, after: str) -> None:
             raise InvalidIR(f"after {after}, pass {pass_.name}: {error}") from None
 
 
-def _verify_pass(pass_: PassGraph, slots: dict, params: set[str], streams: set[tuple[str, int]]) -> None:  # type: ignore[type-arg]
+def _verify_pass(pass_: PassGraph, slots: dict, params: set[str], streams: set[tuple[str, int]]) -> None:
     seen: dict[object, Node] = {}
     for node in nodes_of(pass_):
         _verify_node(node)
@@ -30,7 +30,7 @@ def _verify_pass(pass_: PassGraph, slots: dict, params: set[str], streams: set[t
         if node.op == "input":
             _demand(node.attr in slots, f"unknown slot {node.attr}")
         elif node.op == "param":
-            _demand(node.attr[0] in params, f"unknown parameter {node.attr}")  # type: ignore[index]
+            _demand(node.attr[0] in params, f"unknown parameter {node.attr}")
         elif node.op in ("below", "draw"):
             _demand(node.attr in streams, f"unknown stream {node.attr}")
     for name, node in pass_.outputs:

@@ -17,7 +17,8 @@ from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, 
 from powderdsl.syntax.ast import Syntax
 
 if TYPE_CHECKING:
-    from powderdsl.model.expressions import Scope, Typer
+    from powderdsl.model.expressions import Typer
+    from powderdsl.model.scope import Scope
 
 Value = Expr | Number
 
@@ -25,7 +26,12 @@ _FLIP = {"<": ">", ">": "<", "<=": ">=", ">=": "<=", "==": "==", "!=": "!="}
 
 
 def compare(
-    typer: Typer, operator: str, left: Value, right: Value, span: Span, places: tuple[Span, Span] | None = None
+    typer: Typer,
+    operator: str,
+    left: Value,
+    right: Value,
+    span: Span,
+    places: tuple[Span, Span] | None = None,
 ) -> Expr:
     """A comparison as `eq`, `lt` or `le`, maybe negated. `places` are where the two sides stand, for messages."""
     places = places or (span, span)
@@ -34,7 +40,11 @@ def compare(
     if operator in (">", ">="):
         return compare(typer, _FLIP[operator], right, left, span, (places[1], places[0]))
     if isinstance(left, Number) and isinstance(right, Number):
-        holds = {"==": left.value == right.value, "<": left.value < right.value, "<=": left.value <= right.value}[operator]
+        holds = {
+            "==": left.value == right.value,
+            "<": left.value < right.value,
+            "<=": left.value <= right.value,
+        }[operator]
         return TRUE if holds else FALSE
     op = {"==": "eq", "<": "lt", "<=": "le"}[operator]
     kinds = {operand.kind.name for operand in (left, right) if isinstance(operand, Expr)}
@@ -64,9 +74,21 @@ def _compare_discrete(
             if not isinstance(other, Expr) or other.kind != value.kind:
                 raise typer.wrong(other, f"{words} to compare with {words}", place, cure)
             if op != "eq":
-                raise typer.fail("PD401", f"{words} is not more or less than another", span, "has no order", ("use `==` or `!=`",))
+                raise typer.fail(
+                    "PD401",
+                    f"{words} is not more or less than another",
+                    span,
+                    "has no order",
+                    ("use `==` or `!=`",),
+                )
             return Expr(op, FLAG, (left, right), span=span)  # type: ignore[arg-type]
-    raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", helps=("compare `length(…)`, or `.row` and `.column`",))
+    raise typer.fail(
+        "PD401",
+        "vectors are not compared",
+        span,
+        "one side is a vector",
+        helps=("compare `length(…)`, or `.row` and `.column`",),
+    )
 
 
 def _compare_whole(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
@@ -87,7 +109,13 @@ def _compare_draw(
     typer: Typer, op: str, left: Value, right: Value, span: Span, places: tuple[Span, Span]
 ) -> Expr:
     if op == "eq":
-        raise typer.fail("PD401", "a draw never equals anything exactly", span, "always false", ("compare with `<` or `>`",))
+        raise typer.fail(
+            "PD401",
+            "a draw never equals anything exactly",
+            span,
+            "always false",
+            ("compare with `<` or `>`",),
+        )
     on_left = isinstance(left, Expr) and left.kind.name == "draw"
     draw, other, place = (left, right, places[1]) if on_left else (right, left, places[0])
     assert isinstance(draw, Expr)
@@ -99,7 +127,11 @@ def _compare_draw(
                 shown = f"{float(other.value):g}"
                 cure = f"`{shown}%`" if 0 <= other.value <= 100 else "a chance such as `20%`"
                 raise typer.fail(
-                    "PD403", f"a draw compared with {shown}", place, "draws lie between 0 and 1", (f"did you mean {cure}?",)
+                    "PD403",
+                    f"a draw compared with {shown}",
+                    place,
+                    "draws lie between 0 and 1",
+                    (f"did you mean {cure}?",),
                 )
             return TRUE if (other.value > draw.kind.hi) == (draw is left) else FALSE
         kind = CHANCE if 0 <= other.value <= 1 else Kind("number")
@@ -108,7 +140,9 @@ def _compare_draw(
     if other.kind.name == "real":
         draw = Expr("to_real", REAL, (draw,), span=span)
     elif other.kind.name not in ("chance", "number", "int"):
-        raise typer.wrong(other, "a chance to compare the draw with", place, "such as `5%`, a parameter or a property")
+        raise typer.wrong(
+            other, "a chance to compare the draw with", place, "such as `5%`, a parameter or a property"
+        )
     # A draw lies strictly between two multiples of its resolution's half step: `<` and `<=` mean the same.
     pair = (draw, other) if isinstance(left, Expr) and left.kind.name == "draw" else (other, draw)
     return Expr("lt", FLAG, pair, span=span)
@@ -123,7 +157,9 @@ def _check_resolution(typer: Typer, draw: Expr, other: Expr, span: Span) -> None
     nearest = Fraction(max(0, ceil(p * steps - Fraction(1, 2))), steps)
     if abs(nearest - p) > p / 20:
         typer.reporter.report(
-            "PD404", f"a chance of {float(100 * p):.3g}% is drawn as {float(100 * nearest):.3g}%", span,
+            "PD404",
+            f"a chance of {float(100 * p):.3g}% is drawn as {float(100 * nearest):.3g}%",
+            span,
             f"this stream draws in steps of 1/{steps}",
             helps=["declare the stream with `bits: 32`, or say `with chance`"],
         )
@@ -143,13 +179,19 @@ def binary(typer: Typer, kind: str, left: Value, right: Value, syntax: Syntax) -
         return Number(value)
     kinds = {operand.kind.name for operand in (left, right) if isinstance(operand, Expr)}
     if kinds & {"flag", "element", "direction"}:
-        bad = next(o for o in (left, right) if isinstance(o, Expr) and o.kind.name in ("flag", "element", "direction"))
+        bad = next(
+            o
+            for o in (left, right)
+            if isinstance(o, Expr) and o.kind.name in ("flag", "element", "direction")
+        )
         raise typer.wrong(bad, "a number", syntax.children[0 if bad is left else 1].span)
     if "vec2" in kinds:
         return _vector_arithmetic(typer, op, left, right, span)
     if isinstance(right, Number) and right.value == 0 and op == "div":
         raise typer.fail("PD402", "division by zero", syntax.children[1].span, "this is 0")
-    whole = all((o.value.denominator == 1) if isinstance(o, Number) else o.kind.name == "int" for o in (left, right))
+    whole = all(
+        (o.value.denominator == 1) if isinstance(o, Number) else o.kind.name == "int" for o in (left, right)
+    )
     if whole and op != "div":
         a, b = typer.whole(left, span), typer.whole(right, span)
         return typer.bounded(Expr(op, _bounds(op, a.kind, b.kind), (a, b), span=span), span)
@@ -178,9 +220,20 @@ def _bounds(op: str, a: Kind, b: Kind) -> Kind:
 def _vector_arithmetic(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
     left_is, right_is = (isinstance(o, Expr) and o.kind.name == "vec2" for o in (left, right))
     if op in ("add", "sub") and not (left_is and right_is):
-        raise typer.fail("PD401", "a vector adds up with vectors only", span, "one side is no vector", ("write `vector(rows, columns)`",))
+        raise typer.fail(
+            "PD401",
+            "a vector adds up with vectors only",
+            span,
+            "one side is no vector",
+            ("write `vector(rows, columns)`",),
+        )
     if (op == "mul" and left_is and right_is) or (op == "div" and right_is):
-        raise typer.fail("PD401", "a vector is multiplied or divided by a number", span, "the other way round, or two vectors")
+        raise typer.fail(
+            "PD401",
+            "a vector is multiplied or divided by a number",
+            span,
+            "the other way round, or two vectors",
+        )
     if op == "div" and isinstance(right, Number) and right.value == 0:
         raise typer.fail("PD402", "division by zero", span, "the divisor is 0")
     a = left if left_is else typer.real(left, span)
@@ -236,11 +289,15 @@ def choose(
     """`a if c else b`, both of one kind; whole numbers join their ranges."""
     a, b = typer.value(*yes), typer.value(*no)
     kinds = [o.kind.name if isinstance(o, Expr) else "number" for o in (a, b)]
-    if set(kinds) <= {"int", "number"} and all(not isinstance(o, Number) or o.value.denominator == 1 for o in (a, b)):
+    if set(kinds) <= {"int", "number"} and all(
+        not isinstance(o, Number) or o.value.denominator == 1 for o in (a, b)
+    ):
         first, second = typer.whole(a, yes[1]), typer.whole(b, no[1])
         kind = integer(min(first.kind.lo, second.kind.lo), max(first.kind.hi, second.kind.hi))
         return Expr("choose", kind, (condition, first, second), span=span)
-    if set(kinds) <= {"chance", "number"} and all(not isinstance(o, Number) or 0 <= o.value <= 1 for o in (a, b)):
+    if set(kinds) <= {"chance", "number"} and all(
+        not isinstance(o, Number) or 0 <= o.value <= 1 for o in (a, b)
+    ):
         return Expr("choose", CHANCE, (condition, typer.chance(a, yes[1]), typer.chance(b, no[1])), span=span)
     if set(kinds) <= {"int", "number", "real", "chance", "draw"}:
         return Expr("choose", REAL, (condition, typer.real(a, yes[1]), typer.real(b, no[1])), span=span)
@@ -256,11 +313,16 @@ def extreme(typer: Typer, op: str, values: list[tuple[Value, Span]], span: Span)
         if isinstance(result, Number) and isinstance(value, Number):
             result = Number((min if op == "min" else max)(result.value, value.value))
             continue
-        whole = all((o.value.denominator == 1) if isinstance(o, Number) else o.kind.name == "int" for o in (result, value))
+        whole = all(
+            (o.value.denominator == 1) if isinstance(o, Number) else o.kind.name == "int"
+            for o in (result, value)
+        )
         if whole:
             a, b = typer.whole(result, span), typer.whole(value, span)
             pick = min if op == "min" else max
-            result = Expr(op, integer(pick(a.kind.lo, b.kind.lo), pick(a.kind.hi, b.kind.hi)), (a, b), span=span)
+            result = Expr(
+                op, integer(pick(a.kind.lo, b.kind.lo), pick(a.kind.hi, b.kind.hi)), (a, b), span=span
+            )
         else:
             result = Expr(op, REAL, (typer.real(result, span), typer.real(value, span)), span=span)
     return constant(result, span) if isinstance(result, Number) and result.value.denominator == 1 else result

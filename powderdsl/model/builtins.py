@@ -55,10 +55,17 @@ class Function:
 FUNCTIONS: dict[str, Function] = {
     row.name: row
     for row in (
-        Function("count", "count(SET in KERNEL)", "how many cells of the neighbourhood hold; `box` if none is named", (1, 16)),
+        Function(
+            "count",
+            "count(SET in KERNEL)",
+            "how many cells of the neighbourhood hold; `box` if none is named",
+            (1, 16),
+        ),
         Function("sum", "sum(VALUE in KERNEL)", "the weighted sum of a value over the neighbourhood", (1, 1)),
         Function("at", "at(ROWS, COLUMNS)", "the neighbour so many rows down and columns right", (2, 2)),
-        Function("inside", "inside(PLACE)", "whether that neighbour lies inside the grid, without wrapping", (1, 1)),
+        Function(
+            "inside", "inside(PLACE)", "whether that neighbour lies inside the grid, without wrapping", (1, 1)
+        ),
         Function("octant", "octant(VEC2)", "the direction a vector points to", (1, 1)),
         Function("length", "length(VEC2)", "the length of a vector", (1, 1)),
         Function("vector", "vector(ROWS, COLUMNS)", "a vec2 from two numbers", (2, 2)),
@@ -90,6 +97,10 @@ MAX_MAGNITUDE = 1_000_000
 """The largest number a rule file may contain."""
 
 RESERVED = (
-    frozenset(DIRECTIONS) | frozenset(DIRECTION_SETS) | frozenset(KERNELS) | frozenset(FUNCTIONS) | frozenset(COORDINATES)
+    frozenset(DIRECTIONS)
+    | frozenset(DIRECTION_SETS)
+    | frozenset(KERNELS)
+    | frozenset(FUNCTIONS)
+    | frozenset(COORDINATES)
 )
 """Words that no definition may take."""

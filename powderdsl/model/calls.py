@@ -12,7 +12,8 @@ from powderdsl.model.types import DIRECTION, FLAG, REAL, VEC2, Expr, Kernel, int
 from powderdsl.syntax.ast import Syntax
 
 if TYPE_CHECKING:
-    from powderdsl.model.expressions import Scope, Typer
+    from powderdsl.model.expressions import Typer
+    from powderdsl.model.scope import Scope
 
 
 def _split_kernel(typer: Typer, syntax: Syntax, scope: Scope) -> tuple[list[Syntax], Kernel]:
@@ -59,7 +60,9 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         value = typer.evaluate(child, scope)
         if not isinstance(value, Number) or value.value.denominator != 1:
             cure = "where it varies, loop over the values: `any(… for n in 0..3)`"
-            raise typer.fail("PD405", "`at` takes two whole constants", child.span, "not a whole constant", (cure,))
+            raise typer.fail(
+                "PD405", "`at` takes two whole constants", child.span, "not a whole constant", (cure,)
+            )
         steps.append(int(value.value))
     place = Place(typer.offset((steps[0], steps[1]), syntax.span))
     return typer.turn(place, scope)
@@ -89,7 +92,9 @@ def _vector(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 
 
 def _extreme(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    values = [(typer.value(typer.evaluate(child, scope), child.span), child.span) for child in syntax.children]
+    values = [
+        (typer.value(typer.evaluate(child, scope), child.span), child.span) for child in syntax.children
+    ]
     return arithmetic.extreme(typer, syntax.text, values, syntax.span)
 
 
@@ -108,7 +113,9 @@ def _abs(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 def _clamp(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     value, low, high = ((typer.value(typer.evaluate(c, scope), c.span), c.span) for c in syntax.children)
     raised = arithmetic.extreme(typer, "max", [value, low], syntax.span)
-    return arithmetic.extreme(typer, "min", [(typer.value(raised, syntax.span), syntax.span), high], syntax.span)
+    return arithmetic.extreme(
+        typer, "min", [(typer.value(raised, syntax.span), syntax.span), high], syntax.span
+    )
 
 
 def _opposite(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:

@@ -8,13 +8,14 @@ from dataclasses import replace
 
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.compose import Composition, compose
+from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_examples
-from powderdsl.model.expressions import Scope, Typer
+from powderdsl.model.expressions import Typer
 from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
 from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
-from powderdsl.model.packs import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.satisfy import Facts
+from powderdsl.model.scope import Scope
 from powderdsl.model.symbols import (
     Symbols,
     base_symbols,
@@ -50,7 +51,9 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     passes = tuple(elaborated.passes)
     facts = _facts(symbols)
     stored = {name: overridden_ids(passes, name, facts) for name in elaborated.overridden}
-    symbols.properties = {name: replace(p, stored=stored.get(name, frozenset())) for name, p in symbols.properties.items()}
+    symbols.properties = {
+        name: replace(p, stored=stored.get(name, frozenset())) for name, p in symbols.properties.items()
+    }
     facts = _facts(symbols)
     check_logic(passes, facts, elaborated, reporter)
     _check_use(composition, typer, produced_ids(passes, facts), reporter)
@@ -89,7 +92,12 @@ def _params(symbols: Symbols, typer: Typer) -> None:
             if kind is None:
                 kind = _kind_of_literal(decl, typer)
             if kind.name not in ("chance", "int", "real", "flag"):
-                raise typer.fail("PD401", f"a parameter cannot be a {kind}", decl.name.span, helps=("kinds: chance, LOW..HIGH, real(LOW..HIGH), flag",))
+                raise typer.fail(
+                    "PD401",
+                    f"a parameter cannot be a {kind}",
+                    decl.name.span,
+                    helps=("kinds: chance, LOW..HIGH, real(LOW..HIGH), flag",),
+                )
             value = _constant(decl.default, kind, Scope(named.pack, {}), typer)
         except Poisoned:
             continue
@@ -97,10 +105,18 @@ def _params(symbols: Symbols, typer: Typer) -> None:
     for key, syntax in symbols.composition.ruleset.params if symbols.composition.ruleset else ():
         param = symbols.params.get(key.text)
         if param is None:
-            typer.reporter.error("PD309", f"unknown parameter `{key.text}`", key.span, "no loaded pack has it", helps=suggest(key.text, symbols.params, "parameters"))
+            typer.reporter.error(
+                "PD309",
+                f"unknown parameter `{key.text}`",
+                key.span,
+                "no loaded pack has it",
+                helps=suggest(key.text, symbols.params, "parameters"),
+            )
             continue
         try:
-            symbols.params[key.text] = replace(param, default=_constant(syntax, param.kind, Scope("", {}), typer))
+            symbols.params[key.text] = replace(
+                param, default=_constant(syntax, param.kind, Scope("", {}), typer)
+            )
         except Poisoned:
             continue
 
@@ -113,7 +129,10 @@ def _kind_of_literal(decl: TypedDecl, typer: Typer) -> Kind:
     if decl.default.kind in ("yes", "no"):
         return FLAG
     raise typer.fail(
-        "PD401", f"the parameter `{decl.name.text}` does not say its kind", decl.default.span, "neither a percentage nor `yes` or `no`",
+        "PD401",
+        f"the parameter `{decl.name.text}` does not say its kind",
+        decl.default.span,
+        "neither a percentage nor `yes` or `no`",
         (_kind_help(decl.name.text, decl.default.span.text),),
     )
 
@@ -143,7 +162,12 @@ def _properties(symbols: Symbols, typer: Typer) -> None:
                 continue
             kind = read_kind(named.decl.type, typer)
             if kind.name in ("real", "vec2", "element", "direction"):
-                raise typer.fail("PD401", f"a property cannot be a {kind}", named.decl.type.span, helps=("kinds of properties: LOW..HIGH, flag, chance",))
+                raise typer.fail(
+                    "PD401",
+                    f"a property cannot be a {kind}",
+                    named.decl.type.span,
+                    helps=("kinds of properties: LOW..HIGH, flag, chance",),
+                )
         except Poisoned:
             continue
         symbols.properties[name] = Property(name, kind, (), frozenset(), named.pack, named.decl.name.span)
@@ -162,9 +186,18 @@ def _property_values(symbols: Symbols, typer: Typer) -> None:
                 given[(name, element)] = (syntax, pack_name)
             elif not key.text.endswith("?"):
                 typer.reporter.error(
-                    "PD108", f"unknown property `{name}`", key.span, "no loaded pack declares it",
-                    helps=[*suggest(name, [*composition.properties, "id", "color", "glyph", "about", "tags"], "properties"),
-                           f"if its pack may be absent, write `{name}?`"],  # fmt: skip
+                    "PD108",
+                    f"unknown property `{name}`",
+                    key.span,
+                    "no loaded pack declares it",
+                    helps=[
+                        *suggest(
+                            name,
+                            [*composition.properties, "id", "color", "glyph", "about", "tags"],
+                            "properties",
+                        ),
+                        f"if its pack may be absent, write `{name}?`",
+                    ],
                 )
     for name, named in composition.properties.items():
         for key, syntax in named.decl.values:
@@ -172,14 +205,29 @@ def _property_values(symbols: Symbols, typer: Typer) -> None:
             if element in composition.elements:
                 given[(name, element)] = (syntax, named.pack)
             elif not key.text.endswith("?"):
-                typer.reporter.error("PD301", f"unknown element `{element}`", key.span, helps=[*suggest(element, composition.elements, "elements"), f"if its pack may be absent, write `{element}?`"])
+                typer.reporter.error(
+                    "PD301",
+                    f"unknown element `{element}`",
+                    key.span,
+                    helps=[
+                        *suggest(element, composition.elements, "elements"),
+                        f"if its pack may be absent, write `{element}?`",
+                    ],
+                )
         if name in symbols.properties:
             prop = symbols.properties[name]
-            symbols.properties[name] = replace(prop, values=_values(prop, named.decl, named.pack, given, symbols, typer))
+            symbols.properties[name] = replace(
+                prop, values=_values(prop, named.decl, named.pack, given, symbols, typer)
+            )
 
 
 def _values(
-    prop: Property, decl: TypedDecl, pack: str, given: dict[tuple[str, str], tuple[Syntax, str]], symbols: Symbols, typer: Typer
+    prop: Property,
+    decl: TypedDecl,
+    pack: str,
+    given: dict[tuple[str, str], tuple[Syntax, str]],
+    symbols: Symbols,
+    typer: Typer,
 ) -> tuple[Value | str, ...]:
     """A property's values by id. A value may name a parameter, which stays changeable."""
 
@@ -212,13 +260,20 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
                 continue
             kind = read_kind(decl.type, typer)
             if kind.name == "chance":
-                raise typer.fail("PD401", "a field cannot be a chance", decl.type.span, helps=("use `real(0..1)`",))
+                raise typer.fail(
+                    "PD401", "a field cannot be a chance", decl.type.span, helps=("use `real(0..1)`",)
+                )
             default = _constant(decl.default, kind, scope, typer) if decl.default else default_of(kind)
             of = None
             if decl.of is not None:
                 of = frozenset(typer.set_of(typer.evaluate(decl.of, scope), decl.of.span).ids)
                 if decl.at != "element":
-                    raise typer.fail("PD401", "`of` needs `at: element`", decl.of.span, "a field of a place belongs to no element")
+                    raise typer.fail(
+                        "PD401",
+                        "`of` needs `at: element`",
+                        decl.of.span,
+                        "a field of a place belongs to no element",
+                    )
         except Poisoned:
             continue
         symbols.fields[name] = field_from(decl, named.pack, kind, default, of)
@@ -246,17 +301,36 @@ def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tu
     for stream in streams:
         other = by_ident.setdefault(stream.ident, stream.name)
         if other != stream.name:
-            reporter.error("PD302", f"streams `{other}` and `{stream.name}` would draw the same numbers", None, helps=["rename one of them"])
+            reporter.error(
+                "PD302",
+                f"streams `{other}` and `{stream.name}` would draw the same numbers",
+                None,
+                helps=["rename one of them"],
+            )
     return tuple(streams)
 
 
 def _check_use(composition: Composition, typer: Typer, produced: frozenset[int], reporter: Reporter) -> None:
     for qualified, param in composition.params.items():
-        if qualified not in typer.used and not any(qualified in map(str, p.values) for p in typer.symbols.properties.values()):
-            reporter.report("PD507", f"the parameter `{qualified}` is never used", param.decl.name.span, "no rule reads it", helps=["remove it"])
+        if qualified not in typer.used and not any(
+            qualified in map(str, p.values) for p in typer.symbols.properties.values()
+        ):
+            reporter.report(
+                "PD507",
+                f"the parameter `{qualified}` is never used",
+                param.decl.name.span,
+                "no rule reads it",
+                helps=["remove it"],
+            )
     for name, named_set in composition.sets.items():
         if name not in typer.used:
-            reporter.report("PD507", f"the set `{name}` is never used", named_set.decl[0].span, "no rule reads it", helps=["remove it"])
+            reporter.report(
+                "PD507",
+                f"the set `{name}` is never used",
+                named_set.decl[0].span,
+                "no rule reads it",
+                helps=["remove it"],
+            )
         elif not typer.set_of(typer.symbols.constants[name], named_set.decl[0].span).ids:
             reporter.report(
                 "PD505", f"the set `{name}` is empty", named_set.decl[1].span, "no element of the loaded packs is in it",
@@ -264,15 +338,29 @@ def _check_use(composition: Composition, typer: Typer, produced: frozenset[int],
             )  # fmt: skip
     for name, kernel in composition.kernels.items():
         if name not in typer.used:
-            reporter.report("PD507", f"the kernel `{name}` is never used", kernel.decl.name.span, "no rule reads it", helps=["remove it"])
+            reporter.report(
+                "PD507",
+                f"the kernel `{name}` is never used",
+                kernel.decl.name.span,
+                "no rule reads it",
+                helps=["remove it"],
+            )
     for element in composition.elements.values():
         if element.id not in produced:
-            reporter.report("PD504", f"no rule produces `{element.name}`", element.span, "it only comes from the start world, or by painting")
+            reporter.report(
+                "PD504",
+                f"no rule produces `{element.name}`",
+                element.span,
+                "it only comes from the start world, or by painting",
+            )
 
 
 def _matrix(composition: Composition, symbols: Symbols, reporter: Reporter) -> tuple[str, ...]:
     """The channels of `World.matrix()`: as the ruleset says, or elements, then everything a cell holds."""
-    holds = [*(p.name for p in symbols.properties.values() if p.stored), *(n for n, f in symbols.fields.items() if not f.resets)]
+    holds = [
+        *(p.name for p in symbols.properties.values() if p.stored),
+        *(n for n, f in symbols.fields.items() if not f.resets),
+    ]
     if composition.ruleset is None or not composition.ruleset.matrix:
         return ("elements", *holds)
     known = ["elements", *symbols.properties, *symbols.fields]
@@ -280,5 +368,11 @@ def _matrix(composition: Composition, symbols: Symbols, reporter: Reporter) -> t
         name, _, part = scalar.text.removesuffix("?").partition(".")
         if (name not in known or part not in ("", "row", "column")) and not scalar.text.endswith("?"):
             helps = [*suggest(name, known, "channels"), f"if its pack may be absent, write `{scalar.text}?`"]
-            reporter.error("PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property", helps=helps)
+            reporter.error(
+                "PD310",
+                f"unknown channel `{scalar.text}`",
+                scalar.span,
+                "not a field or property",
+                helps=helps,
+            )
     return tuple(s.text.removesuffix("?") for s in composition.ruleset.matrix)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import RESERVED
-from powderdsl.model.packs import (
+from powderdsl.model.declarations import (
     ElementDecl,
     KernelDecl,
     PackDecl,
@@ -21,7 +22,6 @@ from powderdsl.model.types import Element
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
-
 
 MAX_PASSES = 200
 
@@ -88,7 +88,9 @@ def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Re
     top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
     if top and ruleset and ruleset.slots and top.id >= ruleset.slots:
         reporter.error(
-            "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {ruleset.slots} slots", top.span,
+            "PD402",
+            f"element `{top.name}` has id {top.id}, but the ruleset has {ruleset.slots} slots",
+            top.span,
             helps=[f"say `slots: {top.id + 1}` in {ruleset.source.name}"],
         )
     tag_spans: dict[str, Span] = {}
@@ -119,8 +121,23 @@ def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Re
     name = ruleset.name.text if ruleset else "+".join(pack.name.text for pack in packs)
     about = ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else "")
     return Composition(
-        name, about, tuple(packs), ruleset, elements, element_decls, slots, tags, tag_spans, properties, fields,
-        streams, params, kernels, sets, passes, {name: pack for name, (_, _, pack) in names.defined.items()},
+        name,
+        about,
+        tuple(packs),
+        ruleset,
+        elements,
+        element_decls,
+        slots,
+        tags,
+        tag_spans,
+        properties,
+        fields,
+        streams,
+        params,
+        kernels,
+        sets,
+        passes,
+        {name: pack for name, (_, _, pack) in names.defined.items()},
     )
 
 
@@ -140,7 +157,10 @@ class _Names:
     def check_word(self, scalar: Scalar, kind: str) -> bool:
         if scalar.text in self.reserved:
             self.reporter.error(
-                "PD311", f"`{scalar.text}` is a word of the language", scalar.span, f"cannot name {a(kind)}",
+                "PD311",
+                f"`{scalar.text}` is a word of the language",
+                scalar.span,
+                f"cannot name {a(kind)}",
                 helps=[f"write `{scalar.text}_`, or choose another name"],
             )
             return False
@@ -153,9 +173,15 @@ class _Names:
         known = self.defined.get(scalar.text)
         if known is not None:
             self.reporter.error(
-                "PD302", f"`{scalar.text}` is defined twice", scalar.span, f"{a(kind)} of {pack}",
+                "PD302",
+                f"`{scalar.text}` is defined twice",
+                scalar.span,
+                f"{a(kind)} of {pack}",
                 secondary=[Label(known[1].span, f"{a(known[0])} of {known[2]}")],
-                helps=["rename one of them" + ("; to replace an element say `override: yes`" if kind == "element" else "")],
+                helps=[
+                    "rename one of them"
+                    + ("; to replace an element say `override: yes`" if kind == "element" else "")
+                ],
             )
             return False
         self.defined[scalar.text] = (kind, scalar, pack)
@@ -168,14 +194,21 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
         for need in pack.needs:
             if need.text not in loaded:
                 reporter.error(
-                    "PD305", f"pack `{pack.name.text}` needs `{need.text}`, which is not loaded", need.span, "not loaded",
+                    "PD305",
+                    f"pack `{pack.name.text}` needs `{need.text}`, which is not loaded",
+                    need.span,
+                    "not loaded",
                     helps=[_need_help(need.text, pack.name.text, loaded)],
                 )
         for other in pack.conflicts:
             if other.text in loaded:
                 reporter.error(
-                    "PD306", f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together", other.span, "says so",
-                    secondary=[Label(loaded[other.text].name.span, "loaded too")], helps=["leave one of them out"],
+                    "PD306",
+                    f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together",
+                    other.span,
+                    "says so",
+                    secondary=[Label(loaded[other.text].name.span, "loaded too")],
+                    helps=["leave one of them out"],
                 )
 
 
@@ -196,7 +229,10 @@ def _elements(
                 continue
             if decl.override and name not in chosen:
                 reporter.error(
-                    "PD301", f"`{name}` overrides nothing", decl.name.span, "no pack before this one defines it",
+                    "PD301",
+                    f"`{name}` overrides nothing",
+                    decl.name.span,
+                    "no pack before this one defines it",
                     helps=["remove `override`, or load the other pack first"],
                 )
             if names.define(decl.name, "element", pack.name.text):
@@ -212,19 +248,35 @@ def _elements(
         if decl.id in by_id:
             free = next((i for i in range(256) if i not in used), None)
             reporter.error(
-                "PD303", f"elements `{by_id[decl.id].name.text}` and `{name}` have the same id {decl.id}",
-                decl.id_scalar.span if decl.id_scalar else decl.name.span, "already taken",
-                secondary=[Label(by_id[decl.id].name.span, "by this one")], helps=[] if free is None else [f"id {free} is free"],
+                "PD303",
+                f"elements `{by_id[decl.id].name.text}` and `{name}` have the same id {decl.id}",
+                decl.id_scalar.span if decl.id_scalar else decl.name.span,
+                "already taken",
+                secondary=[Label(by_id[decl.id].name.span, "by this one")],
+                helps=[] if free is None else [f"id {free} is free"],
             )
         by_id[decl.id] = decl
         glyph = decl.glyph or next(
-            (c for c in [*name, *name.upper(), *"0123456789@$&*+=<>"] if c.isalnum() | (c in "@$&*+=<>") and c not in glyphs), "?"
+            (
+                c
+                for c in [*name, *name.upper(), *"0123456789@$&*+=<>"]
+                if c.isalnum() | (c in "@$&*+=<>") and c not in glyphs
+            ),
+            "?",
         )
         glyphs.add(glyph)
-        elements[name] = Element(name, named.pack, decl.id, decl.color, glyph, decl.about, frozenset(), decl.name.span)
+        elements[name] = Element(
+            name, named.pack, decl.id, decl.color, glyph, decl.about, frozenset(), decl.name.span
+        )
     _check_glyphs(chosen, reporter)
     if not chosen:
-        reporter.error("PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements", helps=["define `elements:`, or load `core` too"])
+        reporter.error(
+            "PD109",
+            "no element is defined",
+            packs[0].name.span if packs else None,
+            "a world needs elements",
+            helps=["define `elements:`, or load `core` too"],
+        )
     ordered = dict(sorted(elements.items(), key=lambda item: item[1].id))
     return ordered, {name: chosen[name] for name in ordered}
 
@@ -255,8 +307,14 @@ def _tags(
                     members[tag].add(elements[element].id)
             elif not scalar.text.endswith("?"):
                 reporter.error(
-                    "PD301", f"unknown tag `{tag}`", scalar.span, "no loaded pack declares it",
-                    helps=[*suggest(tag, members, "tags"), f"if its pack may be absent, write `{tag}?`; to make a tag, declare it under `tags:`"],
+                    "PD301",
+                    f"unknown tag `{tag}`",
+                    scalar.span,
+                    "no loaded pack declares it",
+                    helps=[
+                        *suggest(tag, members, "tags"),
+                        f"if its pack may be absent, write `{tag}?`; to make a tag, declare it under `tags:`",
+                    ],
                 )
 
     for pack in packs:
@@ -266,8 +324,14 @@ def _tags(
             name = also.element.text.removesuffix("?")
             if name not in elements and not also.element.text.endswith("?"):
                 reporter.error(
-                    "PD301", f"unknown element `{name}`", also.element.span, "no loaded pack defines it",
-                    helps=[*suggest(name, elements, "elements"), f"if its pack may be absent, write `{name}?`"],
+                    "PD301",
+                    f"unknown element `{name}`",
+                    also.element.span,
+                    "no loaded pack defines it",
+                    helps=[
+                        *suggest(name, elements, "elements"),
+                        f"if its pack may be absent, write `{name}?`",
+                    ],
                 )
             give(name, also.tags)
     return {tag: frozenset(ids) for tag, ids in members.items()}
@@ -281,14 +345,20 @@ def _order_passes(packs: Sequence[PackDecl], reporter: Reporter) -> tuple[Named[
             name = decl.name.text
             if name in passes:
                 reporter.error(
-                    "PD302", f"pass `{name}` is defined twice", decl.name.span, f"in {pack.name.text}",
-                    secondary=[Label(passes[name].decl.name.span, f"in {passes[name].pack}")], helps=["rename one of them"],
+                    "PD302",
+                    f"pass `{name}` is defined twice",
+                    decl.name.span,
+                    f"in {pack.name.text}",
+                    secondary=[Label(passes[name].decl.name.span, f"in {passes[name].pack}")],
+                    helps=["rename one of them"],
                 )
             else:
                 passes[name] = Named(pack.name.text, decl)
     if len(passes) > MAX_PASSES:
         last = list(passes.values())[MAX_PASSES].decl.name.span
-        reporter.error("PD508", f"{len(passes):,} passes", last, f"the limit is {MAX_PASSES}", helps=["load fewer packs"])
+        reporter.error(
+            "PD508", f"{len(passes):,} passes", last, f"the limit is {MAX_PASSES}", helps=["load fewer packs"]
+        )
         return tuple(passes.values())
     earlier: dict[str, dict[str, Span]] = {name: {} for name in passes}
     for name, named in passes.items():
@@ -300,8 +370,14 @@ def _order_passes(packs: Sequence[PackDecl], reporter: Reporter) -> tuple[Named[
                     earlier[second][first] = scalar.span
                 elif not scalar.text.endswith("?"):
                     reporter.error(
-                        "PD301", f"unknown pass `{other}`", scalar.span, "no loaded pack has it",
-                        helps=[*suggest(other, passes, "passes"), f"if its pack may be absent, write `{other}?`"],
+                        "PD301",
+                        f"unknown pass `{other}`",
+                        scalar.span,
+                        "no loaded pack has it",
+                        helps=[
+                            *suggest(other, passes, "passes"),
+                            f"if its pack may be absent, write `{other}?`",
+                        ],
                     )
     ordered: list[str] = []
     waiting = list(passes)
@@ -324,9 +400,14 @@ def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], repor
             cycle = [*path[path.index(step) :], step]
         path.append(step)
     labels = [
-        Label(earlier[later][first], f"`{first}` before `{later}`") for later, first in zip(cycle, cycle[1:], strict=False)
+        Label(earlier[later][first], f"`{first}` before `{later}`")
+        for later, first in itertools.pairwise(cycle)
     ]
     reporter.error(
-        "PD307", "passes wait for each other: " + " after ".join(f"`{name}`" for name in cycle),
-        labels[0].span, labels[0].text, secondary=labels[1:], helps=["take one of these names out of its `after` or `before`"],
+        "PD307",
+        "passes wait for each other: " + " after ".join(f"`{name}`" for name in cycle),
+        labels[0].span,
+        labels[0].text,
+        secondary=labels[1:],
+        helps=["take one of these names out of its `after` or `before`"],
     )

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
 from powderdsl.model.compose import Named
-from powderdsl.model.expressions import IDENTITY, Matrix, Scope, Typer, turned
+from powderdsl.model.declarations import Block, PassDecl
+from powderdsl.model.expressions import Typer
 from powderdsl.model.operands import (
     FALSE,
     Absent,
@@ -21,7 +22,7 @@ from powderdsl.model.operands import (
     conjunction,
     constant,
 )
-from powderdsl.model.packs import Block, PassDecl
+from powderdsl.model.scope import IDENTITY, Matrix, Scope, turned
 from powderdsl.model.symbols import default_of, read_kind, stream_ident
 from powderdsl.model.types import (
     REAL,
@@ -96,7 +97,11 @@ class Elaborator:
         for span, name in self.result.asleep.items():
             if span not in self.result.awake:
                 self.typer.reporter.report(
-                    "PD506", f"this rule is asleep: `{name}` is not loaded", span, "left out", helps=[f"it wakes up with a pack that defines `{name}`"]
+                    "PD506",
+                    f"this rule is asleep: `{name}` is not loaded",
+                    span,
+                    "left out",
+                    helps=[f"it wakes up with a pack that defines `{name}`"],
                 )
         return self.result
 
@@ -120,7 +125,9 @@ class Elaborator:
             if kind is None:
                 names[item.name.text] = Broken()
                 continue
-            scratch[qualified] = Field(qualified, kind, default_of(kind), "place", True, None, named.pack, item.name.span)
+            scratch[qualified] = Field(
+                qualified, kind, default_of(kind), "place", True, None, named.pack, item.name.span
+            )
             names[item.name.text] = Expr("field", kind, value=qualified, span=item.name.span)
         self._scratch = scratch
         self._block(decl.block, Scope(named.pack, names), "", None, None)
@@ -137,11 +144,19 @@ class Elaborator:
         )  # fmt: skip
         return False
 
-    def _block(self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None) -> None:
+    def _block(
+        self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None
+    ) -> None:
         self._blocks += 1
         if self._blocks > MAX_BLOCKS and block.header is not None:
             self._blocks = 0
-            raise self.typer.fail("PD508", "loops in loops that never end", block.header.span, "repeated too often", ("loop over fewer things",))
+            raise self.typer.fail(
+                "PD508",
+                "loops in loops that never end",
+                block.header.span,
+                "repeated too often",
+                ("loop over fewer things",),
+            )
         symmetry, policy = block.symmetry or symmetry, block.policy or policy
         for scalar, syntax in block.lets:
             fresh = self._fresh(scalar.text, scalar.span, scope)
@@ -167,7 +182,13 @@ class Elaborator:
         if header.kind == "repeat":
             rounds = int(header.text) if len(header.text) < 4 else 1000
             if not 1 <= rounds <= 64:
-                self.typer.reporter.error("PD508", f"a loop of {header.text} rounds", header.span, "1 to 64 are possible", helps=["repeat less often"])
+                self.typer.reporter.error(
+                    "PD508",
+                    f"a loop of {header.text} rounds",
+                    header.span,
+                    "1 to 64 are possible",
+                    helps=["repeat less often"],
+                )
                 return []
             return [(scope, f"{label}round {i + 1}") for i in range(rounds)]
         try:
@@ -177,7 +198,13 @@ class Elaborator:
         variables = [binding.children[0].text for binding in header.children]
         for variable in variables:
             self.typer.used.discard(variable)
-        return [(inner, ", ".join([*filter(None, [label]), *(f"{v} = {_show(inner.locals[v])}" for v in variables)])) for inner in scopes]
+        return [
+            (
+                inner,
+                ", ".join([*filter(None, [label]), *(f"{v} = {_show(inner.locals[v])}" for v in variables)]),
+            )
+            for inner in scopes
+        ]
 
     def _let(self, name: str, syntax: Syntax, scope: Scope) -> Operand:
         self.typer.start_rule(syntax.span)
@@ -203,18 +230,28 @@ class Elaborator:
         self._pending.append(Let(unique, value, syntax.span))
         return Expr("let", value.kind, value=unique, span=syntax.span)
 
-    def _moment(self, rules: tuple[Syntax, ...], scope: Scope, label: str, symmetry: str | None, policy: str | None) -> None:
+    def _moment(
+        self, rules: tuple[Syntax, ...], scope: Scope, label: str, symmetry: str | None, policy: str | None
+    ) -> None:
         found: list[Rule] = []
         self._label = label
         for syntax in rules:
             copies: list[Rule] = []
             for matrix in ORIENTATIONS[symmetry]:
-                copies.extend(rule for rule in self._rule(syntax, replace(scope, orientation=matrix)) if rule not in copies)
+                copies.extend(
+                    rule
+                    for rule in self._rule(syntax, replace(scope, orientation=matrix))
+                    if rule not in copies
+                )
             found.extend(copies)
         self._rules += len(found)
         if self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
             raise self.typer.fail(
-                "PD508", f"loops unroll to more than {MAX_MOMENTS} moments or {MAX_RULES} rules", rules[0].span, "here", ("loop over fewer things",)
+                "PD508",
+                f"loops unroll to more than {MAX_MOMENTS} moments or {MAX_RULES} rules",
+                rules[0].span,
+                "here",
+                ("loop over fewer things",),
             )
         self._moments.append(Moment(tuple(self._pending), tuple(found), policy or "prove", label))
         self._pending = []
@@ -282,7 +319,9 @@ class Elaborator:
     def _neighbour(self, syntax: Syntax, scope: Scope) -> Offset:
         place = self.typer.place(self.typer.evaluate(syntax, scope), syntax.span)
         if place.offset == (0, 0):
-            raise self.typer.fail("PD401", "a cell cannot move to itself", syntax.span, "expected a neighbour")
+            raise self.typer.fail(
+                "PD401", "a cell cannot move to itself", syntax.span, "expected a neighbour"
+            )
         return self.typer.offset(place.offset, syntax.span)
 
     def _effects(self, syntax: Syntax, scope: Scope) -> tuple[Assign, ...]:
@@ -303,13 +342,22 @@ class Elaborator:
             wide = Kind(kind.name, -1e6, 1e6)
             expr = self.typer.of_kind(operand, wide, value.span)
         else:
-            raise self.typer.fail("PD407", f"`{syntax.text}` needs a number", syntax.span, f"`{name}` is a {kind}", ("assign with `:=`",))
+            raise self.typer.fail(
+                "PD407",
+                f"`{syntax.text}` needs a number",
+                syntax.span,
+                f"`{name}` is a {kind}",
+                ("assign with `:=`",),
+            )
         return Assign(name, offset, syntax.text, expr, mask, syntax.span)
 
     def _check_fits(self, value: Expr, kind: Kind, span: Span, name: str) -> None:
         if kind.name == "int" and (value.kind.lo < kind.lo or value.kind.hi > kind.hi):
             self.typer.reporter.report(
-                "PD408", f"a value of {value.kind} goes into `{name}`, which holds {kind}", span, "it is cut off at the bounds",
+                "PD408",
+                f"a value of {value.kind} goes into `{name}`, which holds {kind}",
+                span,
+                "it is cut off at the bounds",
                 helps=[f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"],
             )
 
@@ -327,17 +375,31 @@ class Elaborator:
         if isinstance(operand, Absent):
             raise Asleep(operand.name)
         if not isinstance(operand, Expr) or operand.op not in ("field", "property"):
-            fields = [*self.typer.symbols.fields, *self.typer.symbols.properties, *(n.split(".")[1] for n in self._scratch)]
+            fields = [
+                *self.typer.symbols.fields,
+                *self.typer.symbols.properties,
+                *(n.split(".")[1] for n in self._scratch),
+            ]
             helps = suggest(syntax.text, fields, "fields")
             if isinstance(operand, (SetOf, Place)):
                 helps = ("one element becomes another with `->`: `SET -> ELEMENT if …`",)
             raise self.typer.fail(
-                "PD407", f"`{syntax.span.text}` cannot be assigned", syntax.span, "not a field or property", helps
+                "PD407",
+                f"`{syntax.span.text}` cannot be assigned",
+                syntax.span,
+                "not a field or property",
+                helps,
             )
         name = str(operand.value)
         if operand.op == "property":
             if operand.kind.name == "chance":
-                raise self.typer.fail("PD407", f"the chance `{name}` cannot be assigned", syntax.span, "chances belong to elements", ("declare it as a whole number",))
+                raise self.typer.fail(
+                    "PD407",
+                    f"the chance `{name}` cannot be assigned",
+                    syntax.span,
+                    "chances belong to elements",
+                    ("declare it as a whole number",),
+                )
             self.result.overridden.add(name)
         return name, operand.kind, offset
 
@@ -350,21 +412,31 @@ class Elaborator:
             raise self.typer.wrong(operand, "a neighbour before the dot", before.span, cure)
         if isinstance(operand, Expr) and operand.kind.name == "vec2":
             cure = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
-            raise self.typer.fail("PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", (cure,))
+            raise self.typer.fail(
+                "PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", (cure,)
+            )
         return self.typer.place(operand, before.span)
 
     def _push(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         target, amount, source = syntax.children[:3]
         name, kind, _ = self._target(target, scope)
         if kind.name != "vec2":
-            raise self.typer.fail("PD401", f"`{name}` is no vector", target.span, f"this is a {kind}", ("`push` works on vec2 fields",))
+            raise self.typer.fail(
+                "PD401",
+                f"`{name}` is no vector",
+                target.span,
+                f"this is a {kind}",
+                ("`push` works on vec2 fields",),
+            )
         mask = self._mask([self.typer.condition(source, scope)], syntax, scope)
         strength = self.typer.real(self.typer.evaluate(amount, scope), amount.span)
         zero = Expr("const", REAL, value=0.0)
         rules: list[Rule] = []
         for dy, dx in DIRECTION_SETS["sides"]:
             dy, dx = turned((dy, dx), scope.orientation)
-            parts = tuple(zero if d == 0 else strength if d > 0 else Expr("neg", REAL, (strength,)) for d in (dy, dx))
+            parts = tuple(
+                zero if d == 0 else strength if d > 0 else Expr("neg", REAL, (strength,)) for d in (dy, dx)
+            )
             vector = Expr("vector", VEC2, parts, span=amount.span)
             rules.append(Assign(name, (dy, dx), "+=", vector, mask, syntax.span))
         return rules

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.compose import Composition
-from powderdsl.model.expressions import Scope, Typer
+from powderdsl.model.declarations import TestDecl
+from powderdsl.model.expressions import Typer
 from powderdsl.model.operands import Asleep, Poisoned
-from powderdsl.model.packs import TestDecl
+from powderdsl.model.scope import Scope
 from powderdsl.model.types import Example, Expr, Kernel
 from powderdsl.syntax.yaml_tree import Scalar
 
@@ -35,23 +36,50 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         if name not in composition.elements:
             if value.text != name:
                 raise Asleep(name)  # a test of what packs do together waits until both are loaded
-            helps = (*suggest(name, composition.elements, "elements"), f"if its pack may be absent, write `{name}?`")
+            helps = (
+                *suggest(name, composition.elements, "elements"),
+                f"if its pack may be absent, write `{name}?`",
+            )
             raise typer.fail("PD301", f"unknown element `{name}`", value.span, helps=helps)
         if len(key.text) != 1:
             raise typer.fail("PD110", "a legend explains single characters", key.span, "not one character")
         legend[key.text] = name
     if decl.given is None:
-        raise typer.fail("PD109", f"the test `{decl.name}` has no start world", decl.scalar.span, "`given` is missing")
+        raise typer.fail(
+            "PD109", f"the test `{decl.name}` has no start world", decl.scalar.span, "`given` is missing"
+        )
     given = _rows(decl.given, legend, typer, wildcard=False)
     expect = _rows(decl.expect, legend, typer, wildcard=True) if decl.expect else None
-    if expect is not None and decl.expect is not None and (len(expect), len(expect[0])) != (len(given), len(given[0])):
-        raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, f"`given` has {len(given)} rows of {len(given[0])} cells")
+    if (
+        expect is not None
+        and decl.expect is not None
+        and (len(expect), len(expect[0])) != (len(given), len(given[0]))
+    ):
+        raise typer.fail(
+            "PD110",
+            "`expect` has another size than `given`",
+            decl.expect.span,
+            f"`given` has {len(given)} rows of {len(given[0])} cells",
+        )
     if expect is None and not decl.always:
-        raise typer.fail("PD109", f"the test `{decl.name}` checks nothing", decl.scalar.span, "`expect` or `always` is missing")
+        raise typer.fail(
+            "PD109",
+            f"the test `{decl.name}` checks nothing",
+            decl.scalar.span,
+            "`expect` or `always` is missing",
+        )
     scope = Scope(pack, {"world": _whole_world(len(given), len(given[0]))})
     always: list[Expr] = [typer.condition(syntax, scope) for syntax in decl.always]
     return Example(
-        decl.name, given, tuple(sorted(legend.items())), decl.steps, expect, tuple(always), pack, decl.scalar.span, decl.seed
+        decl.name,
+        given,
+        tuple(sorted(legend.items())),
+        decl.steps,
+        expect,
+        tuple(always),
+        pack,
+        decl.scalar.span,
+        decl.seed,
     )
 
 
@@ -64,10 +92,18 @@ def _whole_world(height: int, width: int) -> Kernel:
 def _rows(scalar: Scalar, legend: dict[str, str], typer: Typer, *, wildcard: bool) -> tuple[str, ...]:
     rows = tuple("".join(line.split()) for line in scalar.text.splitlines() if line.strip())
     if not rows or len({len(row) for row in rows}) != 1 or max(len(rows), len(rows[0])) > MAX_SIDE:
-        raise typer.fail("PD110", "rows of a world are equally long", scalar.span, f"expected 1 to {MAX_SIDE} equal rows")
+        raise typer.fail(
+            "PD110", "rows of a world are equally long", scalar.span, f"expected 1 to {MAX_SIDE} equal rows"
+        )
     for char in sorted(set("".join(rows))):
         if char not in legend and not (wildcard and char == "?"):
             place = scalar.content.start + max(scalar.content.text.find(char), 0)
             known = " ".join(f"{glyph}={name}" for glyph, name in sorted(legend.items()))
-            raise typer.fail("PD301", f"`{char}` stands for nothing", Span(scalar.span.source, place, place + 1), "not in the legend", (f"known: {known}",))
+            raise typer.fail(
+                "PD301",
+                f"`{char}` stands for nothing",
+                Span(scalar.span.source, place, place + 1),
+                "not in the legend",
+                (f"known: {known}",),
+            )
     return rows

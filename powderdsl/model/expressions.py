@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from itertools import product
 from math import prod
@@ -13,6 +13,7 @@ from powderdsl.model import arithmetic
 from powderdsl.model.builtins import COORDINATES, FUNCTIONS
 from powderdsl.model.calls import CALLS
 from powderdsl.model.literals import read_bounds, read_number
+from powderdsl.model.membership import holds
 from powderdsl.model.operands import (
     FALSE,
     TRUE,
@@ -30,16 +31,13 @@ from powderdsl.model.operands import (
     conjunction,
     disjunction,
     look,
-    member,
     negation,
 )
+from powderdsl.model.scope import IDENTITY, Scope, turned
 from powderdsl.model.symbols import Symbols
-from powderdsl.model.types import CHANCE, DIRECTION, DRAW, ELEMENT, FLAG, Expr, Kernel, Offset
+from powderdsl.model.types import CHANCE, DIRECTION, DRAW, ELEMENT, FLAG, Expr, Kernel
 from powderdsl.model.unknown import UnknownNames
 from powderdsl.syntax.ast import Syntax
-
-Matrix = tuple[tuple[int, int], tuple[int, int]]
-IDENTITY: Matrix = ((1, 0), (0, 1))
 
 MAX_ROUNDS = 4096
 """Rounds of one loop over several variables."""
@@ -52,18 +50,6 @@ MAX_WORK = 250_000
 
 MAX_SET_DEPTH = 24
 """How many sets may be defined by each other in a row."""
-
-
-@dataclass(frozen=True)
-class Scope:
-    """Where an expression stands: its pack, the local names, and how it is turned by a symmetry."""
-
-    pack: str
-    locals: dict[str, Operand]
-    orientation: Matrix = IDENTITY
-
-    def bind(self, **names: Operand) -> Scope:
-        return replace(self, locals={**self.locals, **names})
 
 
 class Typer(Coercer):
@@ -153,8 +139,12 @@ class Typer(Coercer):
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
-            path = " -> ".join(f"`{other}`" for other in [*self.resolving[self.resolving.index(name) :], name])
-            raise self.fail("PD307", f"the set `{name}` is defined by itself", span, path, ("list elements or tags",))
+            path = " -> ".join(
+                f"`{other}`" for other in [*self.resolving[self.resolving.index(name) :], name]
+            )
+            raise self.fail(
+                "PD307", f"the set `{name}` is defined by itself", span, path, ("list elements or tags",)
+            )
         if len(self.resolving) >= MAX_SET_DEPTH:
             for waiting in self.resolving:
                 self.symbols.constants[waiting] = Broken()
@@ -192,10 +182,20 @@ class Typer(Coercer):
     def name(self, syntax: Syntax, scope: Scope) -> Operand:
         if syntax.text in COORDINATES:
             raise self.fail(
-                "PD406", f"`{syntax.text}` stands without `mod`", syntax.span, "endless by itself", (f"write `{syntax.text} mod 2`",)
+                "PD406",
+                f"`{syntax.text}` stands without `mod`",
+                syntax.span,
+                "endless by itself",
+                (f"write `{syntax.text} mod 2`",),
             )
         if syntax.text in FUNCTIONS:
-            raise self.fail("PD406", f"`{syntax.text}` is a function", syntax.span, "its values are missing", helps=(f"write `{FUNCTIONS[syntax.text].signature}`",))
+            raise self.fail(
+                "PD406",
+                f"`{syntax.text}` is a function",
+                syntax.span,
+                "its values are missing",
+                helps=(f"write `{FUNCTIONS[syntax.text].signature}`",),
+            )
         return self.lookup(syntax.text, syntax.span, scope)
 
     def optional_name(self, syntax: Syntax, scope: Scope) -> Operand:
@@ -209,7 +209,10 @@ class Typer(Coercer):
         base_syntax = syntax.children[0]
         if base_syntax.kind == "name":
             qualified = f"{base_syntax.text}.{syntax.text}"
-            if qualified in self.symbols.params and self.find(base_syntax.text, syntax.span, Scope("", scope.locals)) is None:
+            if (
+                qualified in self.symbols.params
+                and self.find(base_syntax.text, syntax.span, Scope("", scope.locals)) is None
+            ):
                 self.used.add(qualified)
                 param = self.symbols.params[qualified]
                 return Expr("param", param.kind, value=qualified, span=syntax.span)
@@ -220,7 +223,13 @@ class Typer(Coercer):
         if isinstance(base, Expr) and base.kind.name == "vec2":
             if syntax.text in ("row", "column"):
                 return arithmetic.part(base, syntax.text, syntax.span)
-            raise self.fail("PD301", f"a vector has no `{syntax.text}`", word, "not a part of it", helps=("parts of a vector: `.row`, `.column`",))
+            raise self.fail(
+                "PD301",
+                f"a vector has no `{syntax.text}`",
+                word,
+                "not a part of it",
+                helps=("parts of a vector: `.row`, `.column`",),
+            )
         if not isinstance(base, Place):
             raise self.wrong(base, "a neighbour before the dot", base_syntax.span, "such as `below.FIELD`")
         value = self.lookup(syntax.text, word, scope, after_dot=True)
@@ -232,7 +241,13 @@ class Typer(Coercer):
                 return look(value, self.offset(base.offset, syntax.span), syntax.span)
             case SetOf():
                 text = f"{base_syntax.span.text} is {syntax.text}"
-                raise self.fail("PD401", f"`{syntax.text}` is no field or property", word, f"this is {'an element' if value.name else 'a set of elements'}", helps=(f"write `{text}`",))
+                raise self.fail(
+                    "PD401",
+                    f"`{syntax.text}` is no field or property",
+                    word,
+                    f"this is {'an element' if value.name else 'a set of elements'}",
+                    helps=(f"write `{text}`",),
+                )
         raise self.wrong(value, "a field, property or neighbour after the dot", word)
 
     # Literals and lists
@@ -243,16 +258,16 @@ class Typer(Coercer):
     def truth(self, syntax: Syntax, scope: Scope) -> Operand:
         return TRUE if syntax.kind == "yes" else FALSE
 
-    def range(self, syntax: Syntax, scope: Scope) -> Operand:
+    def range_(self, syntax: Syntax, scope: Scope) -> Operand:
         return Bounds(*read_bounds(syntax, self))
 
-    def tuple(self, syntax: Syntax, scope: Scope) -> Operand:
+    def tuple_(self, syntax: Syntax, scope: Scope) -> Operand:
         items = tuple(self.evaluate(child, scope) for child in syntax.children)
         if all(isinstance(item, (SetOf, Absent)) for item in items):
             return self.set_of(Items(items), syntax.span)
         return Items(items)
 
-    def any(self, syntax: Syntax, scope: Scope) -> Operand:
+    def any_(self, syntax: Syntax, scope: Scope) -> Operand:
         return SetOf(self.symbols.ids)
 
     def any_but(self, syntax: Syntax, scope: Scope) -> Operand:
@@ -267,7 +282,9 @@ class Typer(Coercer):
             sets = [set(self.set_of(operand, syntax.span).ids) for operand in operands]
             ids = sets[0] | sets[1] if syntax.kind == "or_" else sets[0] & sets[1]
             return SetOf(tuple(sorted(ids)))
-        flags = [self.flag(operand, child.span) for operand, child in zip(operands, syntax.children, strict=True)]
+        flags = [
+            self.flag(operand, child.span) for operand, child in zip(operands, syntax.children, strict=True)
+        ]
         return (disjunction if syntax.kind == "or_" else conjunction)(flags, syntax.span)
 
     def not_(self, syntax: Syntax, scope: Scope) -> Operand:
@@ -278,7 +295,9 @@ class Typer(Coercer):
         self._no_sets(operands, syntax)
         headings = any(isinstance(operand, Expr) and operand.kind == DIRECTION for operand in operands)
         values = [
-            self.direction(operand, child.span) if headings and isinstance(operand, Place) else self.value(operand, child.span)
+            self.direction(operand, child.span)
+            if headings and isinstance(operand, Place)
+            else self.value(operand, child.span)
             for operand, child in zip(operands, syntax.children, strict=True)
         ]
         parts = []
@@ -290,7 +309,10 @@ class Typer(Coercer):
 
     def _no_sets(self, operands: list[Operand], syntax: Syntax) -> None:
         """`below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`."""
-        places = any(isinstance(operand, Place) or (isinstance(operand, Expr) and operand.kind == ELEMENT) for operand in operands)
+        places = any(
+            isinstance(operand, Place) or (isinstance(operand, Expr) and operand.kind == ELEMENT)
+            for operand in operands
+        )
         for operand, child in zip(operands, syntax.children, strict=True):
             if places and isinstance(operand, (SetOf, Items)) and getattr(operand, "name", None) is None:
                 cure = "write `is` or `is not` instead of `==` or `!=`"
@@ -299,60 +321,8 @@ class Typer(Coercer):
     def is_(self, syntax: Syntax, scope: Scope) -> Operand:
         positive = syntax.kind in ("is_", "in_")
         left, right = (self.evaluate(child, scope) for child in syntax.children)
-        result = self.holds(left, right, syntax)
+        result = holds(self, left, right, syntax)
         return result if positive else negation(result, syntax.span)
-
-    def holds(self, left: Operand, right: Operand, syntax: Syntax) -> Expr:
-        """Whether `left` is, or lies in, `right`."""
-        span = syntax.span
-        first, second = syntax.children
-        match left, right:
-            case Place(), Place():
-                return TRUE if left == right else FALSE
-            case Place(), Items() if all(isinstance(item, Place) for item in right.items):
-                return TRUE if left in right.items else FALSE
-            case Place(), Expr() if right.kind == FLAG:
-                return look(right, left.offset, span)
-            case Number(), Number():
-                return TRUE if left == right else FALSE
-            case SetOf(), SetOf() if left.name is not None:
-                return TRUE if left.ids[0] in right.ids else FALSE
-            case Expr(), Place():
-                return arithmetic.compare(self, "==", left, self.direction(right, second.span), span)
-            case _, Bounds():
-                value = self.value(left, first.span)
-                low, high = Number(Fraction(right.lo)), Number(Fraction(right.hi))
-                return conjunction(
-                    [arithmetic.compare(self, "<=", low, value, span), arithmetic.compare(self, "<=", value, high, span)], span
-                )
-            case _, Items() if any(isinstance(item, (Number, Place)) for item in right.items):
-                return disjunction([self.equals(left, item, syntax) for item in right.items], span)
-            case _, Number():
-                raise self._not_a_set(syntax)
-            case _, Absent():
-                return FALSE
-            case Absent(), _:
-                raise Asleep(left.name)
-        ids = self.set_of(right, second.span).ids
-        if isinstance(left, SetOf) and left.name is None:
-            raise self.wrong(left, "a place or an element before `is`", first.span, "such as `below is …`")
-        return member(self.element(left, first.span), ids, span)
-
-    def equals(self, left: Operand, item: Operand, syntax: Syntax) -> Expr:
-        """Whether `left` is one item of a list: numbers are compared, places and elements named."""
-        if isinstance(item, Number) and not isinstance(left, Number):
-            return arithmetic.compare(self, "==", self.value(left, syntax.children[0].span), item, syntax.span)
-        return self.holds(left, item, syntax)
-
-    def _not_a_set(self, syntax: Syntax) -> Poisoned:
-        second = syntax.children[1]
-        if syntax.kind in ("is_", "is_not"):
-            return self.fail(
-                "PD401", "`is` asks for an element or a direction", second.span, "this is a number",
-                ("compare numbers with `==`",),
-            )  # fmt: skip
-        cure = "a range is written `LOW..HIGH`" if second.kind == "subtract" else "compare numbers with `==`"
-        return self.fail("PD401", "`in` asks for a range or a set", second.span, "this is a number", (cure,))
 
     def choose(self, syntax: Syntax, scope: Scope) -> Operand:
         yes, condition, no = syntax.children
@@ -372,14 +342,28 @@ class Typer(Coercer):
         domains: list[list[tuple[str, Operand]]] = []
         for binding in bindings:
             variable, domain = binding.children
-            if self.hides(variable.text, variable.span, scope) or any(d and d[0][0] == variable.text for d in domains):
-                raise self.fail("PD308", f"`{variable.text}` already means something here", variable.span, "hides the other meaning", ("choose another name",))
+            if self.hides(variable.text, variable.span, scope) or any(
+                d and d[0][0] == variable.text for d in domains
+            ):
+                raise self.fail(
+                    "PD308",
+                    f"`{variable.text}` already means something here",
+                    variable.span,
+                    "hides the other meaning",
+                    ("choose another name",),
+                )
             self.used.add(variable.text)
             domains.append([(variable.text, value) for value in self.domain(domain, scope)])
         rounds = prod(len(domain) for domain in domains)
         if rounds > MAX_ROUNDS:
             place = bindings[0].span.to(bindings[-1].span)
-            raise self.fail("PD508", f"a loop of {rounds:,} rounds", place, f"the limit is {MAX_ROUNDS:,}", ("loop over fewer things",))
+            raise self.fail(
+                "PD508",
+                f"a loop of {rounds:,} rounds",
+                place,
+                f"the limit is {MAX_ROUNDS:,}",
+                ("loop over fewer things",),
+            )
         return [scope.bind(**dict(choice)) for choice in product(*domains)]
 
     def domain(self, syntax: Syntax, scope: Scope) -> list[Operand]:
@@ -388,7 +372,13 @@ class Typer(Coercer):
         match operand:
             case Bounds():
                 if operand.hi - operand.lo >= 64:
-                    raise self.fail("PD508", f"a loop of {operand.hi - operand.lo + 1:,} rounds", syntax.span, "the limit is 64", ("loop over fewer things",))
+                    raise self.fail(
+                        "PD508",
+                        f"a loop of {operand.hi - operand.lo + 1:,} rounds",
+                        syntax.span,
+                        "the limit is 64",
+                        ("loop over fewer things",),
+                    )
                 return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():
                 return [SetOf((i,), names[i]) for i in operand.ids]
@@ -396,16 +386,30 @@ class Typer(Coercer):
                 return list(operand.items)
             case Absent():
                 return []
-        raise self.wrong(operand, "a range, a set or a list", syntax.span, "such as `0..4`, a tag, or `(left, right)`")
+        raise self.wrong(
+            operand, "a range, a set or a list", syntax.span, "such as `0..4`, a tag, or `(left, right)`"
+        )
 
     def call(self, syntax: Syntax, scope: Scope) -> Operand:
         function = FUNCTIONS.get(syntax.text)
         name_span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(syntax.text))
         if function is None:
-            raise self.fail("PD301", f"unknown function `{syntax.text}`", name_span, "not a function", suggest(syntax.text, FUNCTIONS, "functions"))
+            raise self.fail(
+                "PD301",
+                f"unknown function `{syntax.text}`",
+                name_span,
+                "not a function",
+                suggest(syntax.text, FUNCTIONS, "functions"),
+            )
         lo, hi = function.arity
         if not lo <= len(syntax.children) <= hi:
-            raise self.fail("PD406", f"`{syntax.text}` takes {'1 value' if lo == hi == 1 else f'{lo} values' if lo == hi else f'{lo} to {hi} values'}, found {len(syntax.children)}", syntax.span, "too few" if len(syntax.children) < lo else "too many", helps=(f"write `{function.signature}`",))
+            raise self.fail(
+                "PD406",
+                f"`{syntax.text}` takes {'1 value' if lo == hi == 1 else f'{lo} values' if lo == hi else f'{lo} to {hi} values'}, found {len(syntax.children)}",
+                syntax.span,
+                "too few" if len(syntax.children) < lo else "too many",
+                helps=(f"write `{function.signature}`",),
+            )
         return CALLS[syntax.text](self, syntax, scope)
 
     def binary(self, syntax: Syntax, scope: Scope) -> Operand:
@@ -428,11 +432,6 @@ class Typer(Coercer):
         return Expr("lt", FLAG, (Expr("to_real", threshold.kind, (draw,)), threshold), span=syntax.span)
 
 
-def turned(offset: Offset, matrix: Matrix) -> Offset:
-    (a, b), (c, d) = matrix
-    return (a * offset[0] + b * offset[1], c * offset[0] + d * offset[1])
-
-
 HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "name": Typer.name,
     "optional_name": Typer.optional_name,
@@ -442,9 +441,9 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "percent": Typer.number,
     "yes": Typer.truth,
     "no": Typer.truth,
-    "range": Typer.range,
-    "tuple": Typer.tuple,
-    "any": Typer.any,
+    "range": Typer.range_,
+    "tuple": Typer.tuple_,
+    "any": Typer.any_,
     "any_but": Typer.any_but,
     "or_": Typer.logic,
     "and_": Typer.logic,

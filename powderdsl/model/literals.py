@@ -13,9 +13,17 @@ def read_number(syntax: Syntax, coercer: Coercer) -> Fraction:
     """The exact value of an integer, decimal or percentage literal."""
     text = syntax.text
     if syntax.kind == "integer" and len(text) > 1 and text[0] == "0":
-        raise coercer.fail("PD110", f"`{text}` starts with a zero", syntax.span, "not a plain number", helps=(f"write `{text.lstrip('0') or '0'}`",))
+        raise coercer.fail(
+            "PD110",
+            f"`{text}` starts with a zero",
+            syntax.span,
+            "not a plain number",
+            helps=(f"write `{text.lstrip('0') or '0'}`",),
+        )
     if "e" in text.lower() and abs(int(text.lower().split("e")[1])) > 12:
-        raise coercer.fail("PD402", f"`{text}` is too large or too small", syntax.span, f"the limit is {MAX_MAGNITUDE:,}")
+        raise coercer.fail(
+            "PD402", f"`{text}` is too large or too small", syntax.span, f"the limit is {MAX_MAGNITUDE:,}"
+        )
     value = Fraction(text.removesuffix("%"))
     if syntax.kind == "percent":
         value /= 100
@@ -32,9 +40,17 @@ def read_bounds(syntax: Syntax, coercer: Coercer) -> tuple[int, int]:
     for end in syntax.children:
         sign, literal = (-1, end.children[0]) if end.kind == "negate" else (1, end)
         if literal.kind != "integer":
-            raise coercer.fail("PD405", "a range has whole numbers at its ends", end.span, "not a whole number")
+            raise coercer.fail(
+                "PD405", "a range has whole numbers at its ends", end.span, "not a whole number"
+            )
         bounds.append(sign * int(read_number(literal, coercer)))
     lo, hi = bounds
     if lo > hi:
-        raise coercer.fail("PD402", "a range that runs backwards", syntax.span, f"{lo} is above {hi}", (f"write `{hi}..{lo}`",))
+        raise coercer.fail(
+            "PD402",
+            "a range that runs backwards",
+            syntax.span,
+            f"{lo} is above {hi}",
+            (f"write `{hi}..{lo}`",),
+        )
     return lo, hi

@@ -46,7 +46,9 @@ class Conflict:
         notes = [*filter(None, [example]), *self.notes]
         if len(labels) > 1:
             more = "copy" if len(labels) == 2 else "copies"
-            notes.append(f"the same in {len(labels) - 1} more {more} of the rule that its loop or symmetry makes")
+            notes.append(
+                f"the same in {len(labels) - 1} more {more} of the rule that its loop or symmetry makes"
+            )
         one = self.first == self.second
         reporter.error(
             self.code, self.message + where, claim(self.second), "two of these can meet" if one else "claims it too",
@@ -96,11 +98,16 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
             _report_sleep(f"`{elaborated.asleep[span]}` is not loaded", span, reporter)
         elif not fires and span in elaborated.empty:
             _report_sleep(f"no element is in `{elaborated.empty[span]}`", span, reporter)
-        elif not fires and any(satisfiable(relaxed, [(mask, HERE)], lets) for mask, lets in silent.get(span, [])):
+        elif not fires and any(
+            satisfiable(relaxed, [(mask, HERE)], lets) for mask, lets in silent.get(span, [])
+        ):
             _report_sleep("no loaded element has the properties it asks for", span, reporter)
         elif not fires:
             reporter.report(
-                "PD503", "this rule can never fire", span, "no cell can fulfil all of it",
+                "PD503",
+                "this rule can never fire",
+                span,
+                "no cell can fulfil all of it",
                 helps=["look for conditions that exclude each other, or that no element's properties meet"],
             )
         elif not useful[span]:
@@ -119,7 +126,7 @@ def _report_sleep(reason: str, span: Span, reporter: Reporter) -> None:
 
 def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
     if isinstance(rule, Transform) and rule.target.op == "const" and not rule.effects:
-        same = member_of(ELEMENT_HERE, (rule.target.value,))  # type: ignore[arg-type]
+        same = member_of(ELEMENT_HERE, (rule.target.value,))
         return satisfiable(facts, [(rule.mask, HERE), (negation(same), HERE)], lets)
     return True
 
@@ -136,8 +143,12 @@ def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Ite
             if possible:
                 yield _conflict(first, second), _in_words(facts, possible, lets)
                 break
-    plain = [(rule, rule.mask) for rule in rules if isinstance(rule, Assign)]
-    effects = [(effect, rule.mask) for rule in movers for effect in rule.effects]
+    plain: list[tuple[Assign, Expr | None]] = [
+        (rule, rule.mask) for rule in rules if isinstance(rule, Assign)
+    ]
+    effects: list[tuple[Assign, Expr | None]] = [
+        (effect, rule.mask) for rule in movers for effect in rule.effects
+    ]
     for assigns in (plain, effects):
         yield from _check_assigns(assigns, facts, lets)
 
@@ -168,8 +179,16 @@ def _in_words(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dic
     found = sorted(example(facts, conditions, lets).items())
     if not 0 < len(found) <= 4:
         return ""
-    places = [f"`{facts.names[n]}` {_PLACES.get(at) or f'at({at[0]}, {at[1]})'}" for at, n in found if n in facts.names]
-    return "for example with " + " and ".join(filter(None, [", ".join(places[:-1]), places[-1]])) if places else ""
+    places = [
+        f"`{facts.names[n]}` {_PLACES.get(at) or f'at({at[0]}, {at[1]})'}"
+        for at, n in found
+        if n in facts.names
+    ]
+    return (
+        "for example with " + " and ".join(filter(None, [", ".join(places[:-1]), places[-1]]))
+        if places
+        else ""
+    )
 
 
 def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
@@ -207,11 +226,15 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
             "add a condition that a target cannot fulfil, such as a comparison of densities",
             "or choose what happens then: `conflicts: drop_both`",
         )
-        return Conflict("PD501", "a cell may be both mover and target", first.span, first.span, (note,), helps)
+        return Conflict(
+            "PD501", "a cell may be both mover and target", first.span, first.span, (note,), helps
+        )
     movement = isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move))
     message = "two rules may claim one cell in the same moment"
     choice = "or choose what happens then: `conflicts: first_wins` or `conflicts: drop_both`"
-    return Conflict("PD501" if movement else "PD502", message, first.span, second.span, (), (_EXCLUDE, choice))
+    return Conflict(
+        "PD501" if movement else "PD502", message, first.span, second.span, (), (_EXCLUDE, choice)
+    )
 
 
 def overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
@@ -240,9 +263,15 @@ def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
     for pass_ in passes:
         for moment in pass_.moments:
             for rule in moment.rules:
-                target = rule.target if isinstance(rule, Transform) else rule.leaving if isinstance(rule, Move) else None
+                target = (
+                    rule.target
+                    if isinstance(rule, Transform)
+                    else rule.leaving
+                    if isinstance(rule, Move)
+                    else None
+                )
                 if target is not None:
-                    found |= {target.value} if target.op == "const" else set(facts.ids)  # type: ignore[arg-type]
+                    found |= {target.value} if target.op == "const" else set(facts.ids)
     return frozenset(found)
 
 
@@ -250,6 +279,8 @@ def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tu
     """The passes without assignments to properties that no cell can come to override: there is no place for them."""
 
     def kept(moment: Moment) -> Moment:
-        return replace(moment, rules=tuple(r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)))
+        return replace(
+            moment, rules=tuple(r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead))
+        )
 
     return tuple(replace(pass_, moments=tuple(kept(moment) for moment in pass_.moments)) for pass_ in passes)

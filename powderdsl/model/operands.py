@@ -126,7 +126,9 @@ class Coercer:
         self.reporter = reporter
         self._misused: set[tuple[Span, str]] = set()
 
-    def fail(self, code: str, message: str, span: Span, label: str = "", helps: tuple[str, ...] = ()) -> Poisoned:
+    def fail(
+        self, code: str, message: str, span: Span, label: str = "", helps: tuple[str, ...] = ()
+    ) -> Poisoned:
         self.reporter.error(code, message, span, label, helps=helps)
         return Poisoned()
 
@@ -135,13 +137,23 @@ class Coercer:
             return Poisoned()
         found = describe(operand)
         secondary = []
-        if isinstance(operand, Expr) and operand.op == "let" and operand.span is not None and operand.span != span:
+        if (
+            isinstance(operand, Expr)
+            and operand.op == "let"
+            and operand.span is not None
+            and operand.span != span
+        ):
             if (operand.span, wanted) in self._misused:
                 return Poisoned()  # one value of the wrong kind is one mistake, however often it is used
             self._misused.add((operand.span, wanted))
             secondary = [Label(operand.span, "its value, set here")]
         self.reporter.error(
-            "PD401", f"expected {wanted}, found {found}", span, f"this is {found}", secondary=secondary, helps=helps
+            "PD401",
+            f"expected {wanted}, found {found}",
+            span,
+            f"this is {found}",
+            secondary=secondary,
+            helps=helps,
         )
         return Poisoned()
 
@@ -226,7 +238,9 @@ class Coercer:
         value = self.value(operand, span)
         if isinstance(value, Number):
             if value.value.denominator != 1:
-                raise self.fail("PD401", "expected a whole number", span, f"{float(value.value):g} is not whole")
+                raise self.fail(
+                    "PD401", "expected a whole number", span, f"{float(value.value):g} is not whole"
+                )
             return constant(value, span)
         if value.kind.name == "int":
             return value
@@ -239,7 +253,11 @@ class Coercer:
             if not 0 <= value.value <= 1:
                 shown = f"{float(value.value * 100):g}%"
                 meant = 1 < value.value <= 100 and "%" not in span.text
-                cure = f"did you mean `{float(value.value):g}%`?" if meant else "write a chance from `0%` to `100%`"
+                cure = (
+                    f"did you mean `{float(value.value):g}%`?"
+                    if meant
+                    else "write a chance from `0%` to `100%`"
+                )
                 raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%", (cure,))
             return Expr("const", CHANCE, value=value.value, span=span)
         if value.kind.name in ("chance", "real"):
@@ -273,8 +291,18 @@ class Coercer:
                 value = self.real(operand, span)
             case _:
                 value = self.whole(operand, span)
-        if value.op == "const" and isinstance(value.value, (int, float)) and not kind.lo <= value.value <= kind.hi:
-            raise self.fail("PD402", f"{value.value:g} lies outside {kind}", span, f"the range is {kind.lo:g}..{kind.hi:g}", ("write a number in this range, or widen it where it is declared",))
+        if (
+            value.op == "const"
+            and isinstance(value.value, (int, float))
+            and not kind.lo <= value.value <= kind.hi
+        ):
+            raise self.fail(
+                "PD402",
+                f"{value.value:g} lies outside {kind}",
+                span,
+                f"the range is {kind.lo:g}..{kind.hi:g}",
+                ("write a number in this range, or widen it where it is declared",),
+            )
         return value
 
     def direction(self, operand: Operand, span: Span) -> Expr:
@@ -290,13 +318,20 @@ class Coercer:
 
     def offset(self, offset: Offset, span: Span) -> Offset:
         if max(abs(offset[0]), abs(offset[1])) > MAX_OFFSET:
-            raise self.fail("PD409", "a neighbour too far away", span, f"rules reach {MAX_OFFSET} cells a step")
+            raise self.fail(
+                "PD409", "a neighbour too far away", span, f"rules reach {MAX_OFFSET} cells a step"
+            )
         return offset
 
     def bounded(self, value: Expr, span: Span) -> Expr:
         """A whole number whose declared range is still reasonable."""
         if max(abs(value.kind.lo), abs(value.kind.hi)) > MAX_MAGNITUDE:
-            raise self.fail("PD402", f"numbers up to {max(abs(value.kind.lo), abs(value.kind.hi)):,}", span, f"the limit is {MAX_MAGNITUDE:,}")
+            raise self.fail(
+                "PD402",
+                f"numbers up to {max(abs(value.kind.lo), abs(value.kind.hi)):,}",
+                span,
+                f"the limit is {MAX_MAGNITUDE:,}",
+            )
         return value
 
 

@@ -3,130 +3,24 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import Label, Reporter, Source
+from powderdsl.model.declarations import (
+    AlsoDecl,
+    Block,
+    ElementDecl,
+    KernelDecl,
+    PackDecl,
+    PassDecl,
+    RulesetDecl,
+    StreamDecl,
+    TestDecl,
+    TypedDecl,
+)
 from powderdsl.model.schema import KEYS, Reader, first_line
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_yaml
-
-
-@dataclass(frozen=True)
-class TypedDecl:
-    """A property, field or parameter as written: its kind and default are still syntax."""
-
-    name: Scalar
-    type: Syntax | None
-    default: Syntax | None
-    at: str = "place"
-    of: Syntax | None = None
-    resets: bool = False
-    values: tuple[tuple[Scalar, Syntax], ...] = ()
-    about: str = ""
-
-
-@dataclass(frozen=True)
-class ElementDecl:
-    name: Scalar
-    id: int | None
-    id_scalar: Scalar | None
-    color: str
-    glyph: str
-    about: str
-    tags: tuple[Scalar, ...]
-    values: tuple[tuple[Scalar, Syntax], ...]
-    override: bool
-
-
-@dataclass(frozen=True)
-class AlsoDecl:
-    element: Scalar
-    tags: tuple[Scalar, ...]
-    values: tuple[tuple[Scalar, Syntax], ...]
-
-
-@dataclass(frozen=True)
-class KernelDecl:
-    name: Scalar
-    rows: tuple[tuple[int, ...], ...]
-    wrap: bool
-
-
-@dataclass(frozen=True)
-class StreamDecl:
-    name: Scalar
-    bits: int
-
-
-@dataclass(frozen=True)
-class Block:
-    """A block of a pass: lets, then one action (a moment of rules, or further blocks, maybe in a loop), then the rest."""
-
-    lets: tuple[tuple[Scalar, Syntax], ...]
-    header: Syntax | None
-    rules: tuple[Syntax, ...]
-    blocks: tuple[Block, ...]
-    symmetry: str | None
-    policy: str | None
-    then: tuple[Block, ...]
-
-
-@dataclass(frozen=True)
-class PassDecl:
-    name: Scalar
-    about: str
-    after: tuple[Scalar, ...]
-    before: tuple[Scalar, ...]
-    scratch: tuple[TypedDecl, ...]
-    block: Block
-
-
-@dataclass(frozen=True)
-class TestDecl:
-    name: str
-    scalar: Scalar
-    given: Scalar | None
-    legend: tuple[tuple[Scalar, Scalar], ...]
-    steps: int
-    expect: Scalar | None
-    always: tuple[Syntax, ...]
-    seed: int | None
-
-
-@dataclass(frozen=True)
-class PackDecl:
-    """One pack file."""
-
-    name: Scalar
-    source: Source
-    about: str
-    needs: tuple[Scalar, ...]
-    conflicts: tuple[Scalar, ...]
-    tags: tuple[tuple[Scalar, str], ...]
-    properties: tuple[TypedDecl, ...]
-    fields: tuple[TypedDecl, ...]
-    streams: tuple[StreamDecl, ...]
-    params: tuple[TypedDecl, ...]
-    kernels: tuple[KernelDecl, ...]
-    sets: tuple[tuple[Scalar, Syntax], ...]
-    elements: tuple[ElementDecl, ...]
-    also: tuple[AlsoDecl, ...]
-    passes: tuple[PassDecl, ...]
-    tests: tuple[TestDecl, ...]
-
-
-@dataclass(frozen=True)
-class RulesetDecl:
-    """One ruleset file: a list of packs with a name."""
-
-    name: Scalar
-    source: Source
-    about: str
-    packs: tuple[Scalar, ...]
-    slots: int | None
-    matrix: tuple[Scalar, ...]
-    params: tuple[tuple[Scalar, Syntax], ...] = field(default=())
 
 
 def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | None:
@@ -134,7 +28,9 @@ def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | No
     tree = parse_yaml(source, reporter)
     if tree is None:
         if not reporter.has_errors:
-            reporter.error("PD107", f"{source.name} is empty", None, helps=["a pack starts with `pack: NAME`"])
+            reporter.error(
+                "PD107", f"{source.name} is empty", None, helps=["a pack starts with `pack: NAME`"]
+            )
         return None
     if not isinstance(tree, Mapping):
         Reader(reporter).shape(tree, "a pack: a mapping that starts with `pack: NAME`")
@@ -174,8 +70,13 @@ class _PackReader(Reader):
         if isinstance(node, Mapping):
             params = [(key, line) for key, value in node.entries if (line := self.line(value))]
         return RulesetDecl(
-            name, self.source, self.text(entries, "about"), self.words(entries.get("packs", (None, None))[1]),
-            self.number(entries, "slots", 1, 256), self.words(entries.get("matrix", (None, None))[1]), tuple(params),
+            name,
+            self.source,
+            self.text(entries, "about"),
+            self.words(entries.get("packs", (None, None))[1]),
+            self.number(entries, "slots", 1, 256),
+            self.words(entries.get("matrix", (None, None))[1]),
+            tuple(params),
         )
 
     def pack(self, tree: Mapping) -> PackDecl | None:
@@ -193,14 +94,25 @@ class _PackReader(Reader):
             about=self.text(entries, "about"),
             needs=self.words(value("needs")),
             conflicts=self.words(value("conflicts")),
-            tags=tuple((key, node.text if isinstance(node, Scalar) else "") for key, node in self.named(value("tags"), "a tag")),
-            properties=tuple(self.property(key, node) for key, node in self.named(value("properties"), "a property")),
+            tags=tuple(
+                (key, node.text if isinstance(node, Scalar) else "")
+                for key, node in self.named(value("tags"), "a tag")
+            ),
+            properties=tuple(
+                self.property(key, node) for key, node in self.named(value("properties"), "a property")
+            ),
             fields=tuple(self.field(key, node) for key, node in self.named(value("fields"), "a field")),
             streams=self.streams(value("streams")),
             params=tuple(self.param(key, node) for key, node in self.named(value("params"), "a parameter")),
-            kernels=tuple(k for key, node in self.named(value("kernels"), "a kernel") if (k := self.kernel(key, node))),
-            sets=tuple((key, line) for key, node in self.named(value("sets"), "a set") if (line := self.line(node))),
-            elements=tuple(self.element(key, node) for key, node in self.named(value("elements"), "an element")),
+            kernels=tuple(
+                k for key, node in self.named(value("kernels"), "a kernel") if (k := self.kernel(key, node))
+            ),
+            sets=tuple(
+                (key, line) for key, node in self.named(value("sets"), "a set") if (line := self.line(node))
+            ),
+            elements=tuple(
+                self.element(key, node) for key, node in self.named(value("elements"), "an element")
+            ),
             also=tuple(self.also(key, node) for key, node in self._pairs(value("also"))),
             passes=tuple(self.pass_(key, node) for key, node in self.named(value("passes"), "a pass")),
             tests=tuple(t for node in self._items(value("tests")) if (t := self.test(node))),
@@ -228,11 +140,16 @@ class _PackReader(Reader):
         entries = self.mapping(node, "property", f"the property `{key.text}`")
         values = self.open_values(entries, "property")
         return TypedDecl(
-            key, self.entry_line(entries, "type"), self.entry_line(entries, "default"), values=values,
+            key,
+            self.entry_line(entries, "type"),
+            self.entry_line(entries, "default"),
+            values=values,
             about=self.text(entries, "about"),
         )
 
-    def open_values(self, entries: dict[str, tuple[Scalar, Node]], context: str) -> tuple[tuple[Scalar, Syntax], ...]:
+    def open_values(
+        self, entries: dict[str, tuple[Scalar, Node]], context: str
+    ) -> tuple[tuple[Scalar, Syntax], ...]:
         """Entries beyond the table's keys: property values, or values for elements."""
         found = []
         for name, (key, node) in entries.items():
@@ -249,8 +166,13 @@ class _PackReader(Reader):
         at = self.choice(entries, "at", ("element", "place")) or "place"
         resets = self.choice(entries, "resets", ("step",)) is not None
         return TypedDecl(
-            key, self.entry_line(entries, "type"), self.entry_line(entries, "default"), at,
-            self.entry_line(entries, "of"), resets, about=self.text(entries, "about"),
+            key,
+            self.entry_line(entries, "type"),
+            self.entry_line(entries, "default"),
+            at,
+            self.entry_line(entries, "of"),
+            resets,
+            about=self.text(entries, "about"),
         )
 
     def param(self, key: Scalar, node: Node) -> TypedDecl:
@@ -258,7 +180,10 @@ class _PackReader(Reader):
             return TypedDecl(key, None, self.line(node))
         entries = self.mapping(node, "param", f"the parameter `{key.text}`")
         return TypedDecl(
-            key, self.entry_line(entries, "type"), self.entry_line(entries, "default"), about=self.text(entries, "about")
+            key,
+            self.entry_line(entries, "type"),
+            self.entry_line(entries, "default"),
+            about=self.text(entries, "about"),
         )
 
     def streams(self, node: Node | None) -> tuple[StreamDecl, ...]:
@@ -268,7 +193,9 @@ class _PackReader(Reader):
                 entries = self.mapping(value, "stream", f"the stream `{key.text}`")
                 bits = self.number(entries, "bits", 16, 32) or 16
                 if bits not in (16, 32):
-                    self.reporter.error("PD110", "`bits` must be 16 or 32", entries["bits"][1].span, "neither of them")
+                    self.reporter.error(
+                        "PD110", "`bits` must be 16 or 32", entries["bits"][1].span, "neither of them"
+                    )
                     bits = 16
                 found.append(StreamDecl(key, bits))
             return tuple(found)
@@ -287,13 +214,25 @@ class _PackReader(Reader):
             parts = word.text.split()
             if not all(re.fullmatch(r"-?[0-9]{1,3}", part) for part in parts):
                 self.reporter.error(
-                    "PD110", "a kernel row that is not whole numbers", word.span, "not a row of weights", helps=['write "1 0 1"']
+                    "PD110",
+                    "a kernel row that is not whole numbers",
+                    word.span,
+                    "not a row of weights",
+                    helps=['write "1 0 1"'],
                 )
                 return None
             rows.append(tuple(int(part) for part in parts))
-        if not rows or len(rows) % 2 == 0 or len({len(row) for row in rows}) != 1 or len(rows[0]) % 2 == 0 or max(len(rows), len(rows[0])) > 31:
+        if (
+            not rows
+            or len(rows) % 2 == 0
+            or len({len(row) for row in rows}) != 1
+            or len(rows[0]) % 2 == 0
+            or max(len(rows), len(rows[0])) > 31
+        ):
             self.reporter.error(
-                "PD110", f"kernel `{key.text}` has no middle", key.span,
+                "PD110",
+                f"kernel `{key.text}` has no middle",
+                key.span,
                 f"{len(rows)} row{'s' * (len(rows) != 1)} of {', '.join(sorted({str(len(row)) for row in rows})) or 'no'} weights",
                 helps=["write an odd number of rows, each with the same odd number of weights, at most 31"],
             )
@@ -305,23 +244,41 @@ class _PackReader(Reader):
         color = self.scalar(entries, "color")
         if color is not None and not re.fullmatch(r"#[0-9A-Fa-f]{6}", color.text):
             helps = ['six hexadecimal digits in quotes: color: "#RRGGBB"']
-            self.reporter.error("PD110", f"`{color.text}` is not a colour", color.span, 'expected "#RRGGBB"', helps=helps)
+            self.reporter.error(
+                "PD110", f"`{color.text}` is not a colour", color.span, 'expected "#RRGGBB"', helps=helps
+            )
             color = None
         glyph = self.scalar(entries, "glyph")
-        if glyph is not None and not (len(glyph.text) == 1 and "!" <= glyph.text <= "~" and glyph.text != "?"):
-            self.reporter.error("PD110", f"`{glyph.text}` is not a glyph", glyph.span, "expected one printable ASCII character, not `?`", helps=['quote it: glyph: "#"'])
+        if glyph is not None and not (
+            len(glyph.text) == 1 and "!" <= glyph.text <= "~" and glyph.text != "?"
+        ):
+            self.reporter.error(
+                "PD110",
+                f"`{glyph.text}` is not a glyph",
+                glyph.span,
+                "expected one printable ASCII character, not `?`",
+                helps=['quote it: glyph: "#"'],
+            )
             glyph = None
         return ElementDecl(
-            key, self.number(entries, "id", 0, 255), self.scalar(entries, "id"), color.text.upper() if color else "#000000",
-            glyph.text if glyph else "", self.text(entries, "about"), self.words(entries.get("tags", (None, None))[1]),
-            self.open_values(entries, "element"), self.choice(entries, "override", ("yes", "no", "true", "false")) in ("yes", "true"),
+            key,
+            self.number(entries, "id", 0, 255),
+            self.scalar(entries, "id"),
+            color.text.upper() if color else "#000000",
+            glyph.text if glyph else "",
+            self.text(entries, "about"),
+            self.words(entries.get("tags", (None, None))[1]),
+            self.open_values(entries, "element"),
+            self.choice(entries, "override", ("yes", "no", "true", "false")) in ("yes", "true"),
         )
 
     def also(self, key: Scalar, node: Node) -> AlsoDecl:
         if isinstance(node, (Sequence, Scalar)):
             return AlsoDecl(key, self.words(node), ())
         entries = self.mapping(node, "also", f"`{key.text}`")
-        return AlsoDecl(key, self.words(entries.get("tags", (None, None))[1]), self.open_values(entries, "also"))
+        return AlsoDecl(
+            key, self.words(entries.get("tags", (None, None))[1]), self.open_values(entries, "also")
+        )
 
     def pass_(self, key: Scalar, node: Node) -> PassDecl:
         entries = self.mapping(node, "pass", f"the pass `{key.text}`")
@@ -329,8 +286,12 @@ class _PackReader(Reader):
         for name, value in self.named(entries.get("scratch", (None, None))[1], "a scratch field"):
             scratch.append(TypedDecl(name, self.line(value), None))
         return PassDecl(
-            key, self.text(entries, "about"), self.words(entries.get("after", (None, None))[1]),
-            self.words(entries.get("before", (None, None))[1]), tuple(scratch), self.block(entries, node),
+            key,
+            self.text(entries, "about"),
+            self.words(entries.get("after", (None, None))[1]),
+            self.words(entries.get("before", (None, None))[1]),
+            tuple(scratch),
+            self.block(entries, node),
         )
 
     def block(self, entries: dict[str, tuple[Scalar, Node]], node: Node) -> Block:
@@ -338,11 +299,19 @@ class _PackReader(Reader):
         for name, value in self.named(entries.get("let", (None, None))[1], "a value"):
             if line := self.line(value):
                 lets.append((name, line))
-        actions = [(key, value) for key, value in entries.values() if key.text == "do" or key.text.startswith(("for ", "repeat "))]
+        actions = [
+            (key, value)
+            for key, value in entries.values()
+            if key.text == "do" or key.text.startswith(("for ", "repeat "))
+        ]
         if len(actions) > 1:
             self.reporter.error(
-                "PD107", "a block with two actions", actions[1][0].span, "the second one",
-                secondary=[Label(actions[0][0].span, "the first one")], helps=["put what comes next under `then:`"],
+                "PD107",
+                "a block with two actions",
+                actions[1][0].span,
+                "the second one",
+                secondary=[Label(actions[0][0].span, "the first one")],
+                helps=["put what comes next under `then:`"],
             )
         header = None
         rules: tuple[Syntax, ...] = ()
@@ -353,14 +322,25 @@ class _PackReader(Reader):
                 header = parse_scalar(key, "header", self.reporter)
             rules, blocks = self.body(body)
         elif "then" not in entries and isinstance(node, Mapping) and len(entries) == len(node.entries):
-            self.reporter.error("PD109", "a block that does nothing", first_line(node), "it lacks `do:`, `for …:` or `repeat …:`", helps=["put the rules under `do:`"])
+            self.reporter.error(
+                "PD109",
+                "a block that does nothing",
+                first_line(node),
+                "it lacks `do:`, `for …:` or `repeat …:`",
+                helps=["put the rules under `do:`"],
+            )
         then: tuple[Block, ...] = ()
         if "then" in entries:
             then_rules, then_blocks = self.body(entries["then"][1])
             then = (Block((), None, then_rules, (), None, None, ()),) if then_rules else then_blocks
         return Block(
-            tuple(lets), header, rules, blocks, self.choice(entries, "symmetry", ("mirror", "rotations", "all")),
-            self.choice(entries, "conflicts", ("drop_both", "first_wins")), then,
+            tuple(lets),
+            header,
+            rules,
+            blocks,
+            self.choice(entries, "symmetry", ("mirror", "rotations", "all")),
+            self.choice(entries, "conflicts", ("drop_both", "first_wins")),
+            then,
         )
 
     def body(self, node: Node) -> tuple[tuple[Syntax, ...], tuple[Block, ...]]:
@@ -375,9 +355,14 @@ class _PackReader(Reader):
         if len(kinds) > 1:
             first = next(item for item in items if isinstance(item, Mapping) != isinstance(items[0], Mapping))
             self.reporter.error(
-                "PD204", "rules and blocks in one list", first_line(first), "not of the kind of the first item",
+                "PD204",
+                "rules and blocks in one list",
+                first_line(first),
+                "not of the kind of the first item",
                 notes=["a list of rules is one moment; a list of blocks happens one after the other"],
-                helps=["put each group of rules under a `- do:` of its own; quote a rule that has `: ` in it"],
+                helps=[
+                    "put each group of rules under a `- do:` of its own; quote a rule that has `: ` in it"
+                ],
             )
             return (), ()
         if True in kinds:
@@ -401,10 +386,30 @@ class _PackReader(Reader):
             if match:
                 steps = int(match[1])
             else:
-                self.reporter.error("PD110", "`after` says how many steps", after.span, "not a number of steps", helps=["write `50 steps`"])
+                self.reporter.error(
+                    "PD110",
+                    "`after` says how many steps",
+                    after.span,
+                    "not a number of steps",
+                    helps=["write `50 steps`"],
+                )
         always = entries.get("always", (None, None))[1]
-        lines = () if always is None else tuple(line for item in (always.items if isinstance(always, Sequence) else (always,)) if (line := self.line(item)))
+        lines = (
+            ()
+            if always is None
+            else tuple(
+                line
+                for item in (always.items if isinstance(always, Sequence) else (always,))
+                if (line := self.line(item))
+            )
+        )
         return TestDecl(
-            name.text, name, self.scalar(entries, "given"), tuple(legend), steps, self.scalar(entries, "expect"), lines,
+            name.text,
+            name,
+            self.scalar(entries, "given"),
+            tuple(legend),
+            steps,
+            self.scalar(entries, "expect"),
+            lines,
             self.number(entries, "seed", 0, 2**31 - 1),
         )

@@ -68,7 +68,7 @@ def _before(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
 
 def _after(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
     if rule.target.op == "const":
-        return {int(rule.target.value)}  # type: ignore[call-overload]
+        return {int(rule.target.value)}
     conditions = [(rule.mask, HERE)]
     return {
         number

@@ -6,6 +6,7 @@ The answer errs to one side only: False is a proof, True may mean "could not tel
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -60,7 +61,6 @@ class Facts:
     names: dict[int, str] = field(default_factory=dict, compare=False, repr=False)
     """Names of the elements by id, for examples in messages."""
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
-
 
     def relaxed(self) -> Facts:
         """The same cells, but with any element's properties: what a rule could meet in other packs."""
@@ -124,7 +124,12 @@ class Search:
             for node in condition.walk():
                 if node.op == "lt" and any(arg.kind.name == "draw" for arg in node.args):
                     draws = [n.value for arg in node.args for n in arg.walk() if n.op == "draw"]
-                    numbers = [float(n.value) for arg in node.args for n in arg.walk() if n.op == "const" and isinstance(n.value, (int, Fraction))]
+                    numbers = [
+                        float(n.value)
+                        for arg in node.args
+                        for n in arg.walk()
+                        if n.op == "const" and isinstance(n.value, (int, Fraction))
+                    ]
                     for stream in draws:
                         found.setdefault(stream, set()).update(number % 1 for number in numbers)
         return {stream: sorted(values) for stream, values in found.items()}
@@ -136,7 +141,11 @@ class Search:
         for keys in variables:
             for key in keys or ():
                 domains.setdefault(key, self._domain(key))
-        checks = [(c, at, keys) for (c, at), keys in zip(self.conditions, variables, strict=True) if keys is not None]
+        checks = [
+            (c, at, keys)
+            for (c, at), keys in zip(self.conditions, variables, strict=True)
+            if keys is not None
+        ]
         for condition, at, keys in checks:
             if not keys and not self._holds(condition, at, {}):
                 return False
@@ -158,17 +167,23 @@ class Search:
         keys = [key for key in self._domains if key[0] == "element"]
         return {key[2]: int(str(self._chosen.get(key, self._domains[key][0]))) for key in keys}
 
-    def _assign(self, order: list[Key], index: int, domains: dict[Key, list[object]], rest: list, chosen: Assignment) -> bool:
+    def _assign(
+        self, order: list[Key], index: int, domains: dict[Key, list[object]], rest: list, chosen: Assignment
+    ) -> bool:
         if index == len(order):
             return True
         key = order[index]
-        ready = [(c, at) for c, at, keys in rest if key in keys and all(k in chosen or k == key for k in keys)]
+        ready = [
+            (c, at) for c, at, keys in rest if key in keys and all(k in chosen or k == key for k in keys)
+        ]
         for value in domains[key]:
             self._steps += 1
             if self._steps > MAX_STEPS:
                 return True
             chosen[key] = value
-            if all(self._holds(c, at, chosen) for c, at in ready) and self._assign(order, index + 1, domains, rest, chosen):
+            if all(self._holds(c, at, chosen) for c, at in ready) and self._assign(
+                order, index + 1, domains, rest, chosen
+            ):
                 return True
         chosen.pop(key, None)
         return False
@@ -188,7 +203,7 @@ class Search:
             return [0, 1] if kind.name == "flag" else list(range(int(kind.lo), int(kind.hi) + 1))
         if what == "draw":
             cuts = [0.0, *self.thresholds.get(name, []), 1.0]
-            return [(a + b) / 2 for a, b in zip(cuts, cuts[1:], strict=False) if a < b]
+            return [(a + b) / 2 for a, b in itertools.pairwise(cuts) if a < b]
         assert isinstance(name, Expr)
         if name.kind.name in ("element", "direction"):
             return list(self.facts.ids) if name.kind.name == "element" else list(range(8))
@@ -299,17 +314,24 @@ def _opaque(node: Expr, at: Offset) -> Key:
 def _is_opaque(node: Expr) -> bool:
     """Whether a node is a variable of its own: a count, a field, or something that floats decide."""
     if node.op in ("field", "let", "count", "sum", "inside", "coordinate", "octant", "param"):
-        if node.kind.name in ("real", "vec2", "chance", "draw", "number") or node.kind.hi - node.kind.lo >= MAX_DOMAIN:
+        if (
+            node.kind.name in ("real", "vec2", "chance", "draw", "number")
+            or node.kind.hi - node.kind.lo >= MAX_DOMAIN
+        ):
             raise _Unknown
         return True
-    if node.op in ("eq", "lt", "le") and any(arg.kind.name in ("real", "vec2", "chance") and arg.op != "const" for arg in node.args):
+    if node.op in ("eq", "lt", "le") and any(
+        arg.kind.name in ("real", "vec2", "chance") and arg.op != "const" for arg in node.args
+    ):
         return True
     if node.op in ("to_real", "length", "vector", "row_part", "column_part", "div"):
         raise _Unknown
     return False
 
 
-def satisfiable(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None) -> bool:
+def satisfiable(
+    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None
+) -> bool:
     """False only if the conditions, each at its place, can never hold together."""
     try:
         facts.budget.spend(QUESTION)
@@ -321,7 +343,9 @@ def satisfiable(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: d
         return True
 
 
-def example(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr]) -> dict[Offset, int]:
+def example(
+    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr]
+) -> dict[Offset, int]:
     """Elements by place with which the conditions hold together, or nothing where none can be told."""
     try:
         search = Search(facts, lets)

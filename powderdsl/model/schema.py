@@ -140,7 +140,11 @@ class Reader:
         """Report a node of the wrong shape."""
         found = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
         self.reporter.error(
-            "PD107", f"expected {wanted}, found {found}", first_line(node), f"this is {found}", helps=[help_text] if help_text else []
+            "PD107",
+            f"expected {wanted}, found {found}",
+            first_line(node),
+            f"this is {found}",
+            helps=[help_text] if help_text else [],
         )
 
     def mapping(self, node: Node, context: str, what: str) -> dict[str, tuple[Scalar, Node]]:
@@ -158,7 +162,13 @@ class Reader:
             prefixed = key.text.startswith(PREFIXES.get(context, ())) and bool(PREFIXES.get(context))
             misspelt = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
             row = known.get(key.text)
-            if row and row.shape in VALUES and isinstance(value, Scalar) and value.style == "plain" and not value.text:
+            if (
+                row
+                and row.shape in VALUES
+                and isinstance(value, Scalar)
+                and value.style == "plain"
+                and not value.text
+            ):
                 self._no_value(key, value, row)
             elif row or prefixed or (context in OPEN and not misspelt):
                 entries[key.text] = (key, value)
@@ -167,7 +177,10 @@ class Reader:
             else:
                 missing -= set(misspelt)  # a key that is there under a wrong name is one mistake
                 self.reporter.error(
-                    "PD108", f"unknown key `{key.text}`", key.span, f"not a key of {what}",
+                    "PD108",
+                    f"unknown key `{key.text}`",
+                    key.span,
+                    f"not a key of {what}",
                     helps=self._key_help(key.text, context, what),
                 )
         for name in sorted(missing):
@@ -187,10 +200,14 @@ class Reader:
             start = key.span.end + line.index("#")
             comment = Span(key.span.source, start, key.span.end + len(line.rstrip()))
             cure = f'put quotes around it: {key.text}: "{comment.text}"'
-            self.reporter.error("PD109", f"`{key.text}` has no value", comment, "a comment, to YAML", helps=[cure])
+            self.reporter.error(
+                "PD109", f"`{key.text}` has no value", comment, "a comment, to YAML", helps=[cure]
+            )
             return
         cure = f"`{key.text}`: {row.about}"
-        self.reporter.error("PD109", f"`{key.text}` has no value", key.span, "nothing stands after it", helps=[cure])
+        self.reporter.error(
+            "PD109", f"`{key.text}` has no value", key.span, "nothing stands after it", helps=[cure]
+        )
 
     def _key_help(self, word: str, context: str, what: str) -> tuple[str, ...]:
         """The cure for an unknown key: what it should be called, where it belongs, or that it is a rule."""
@@ -218,7 +235,9 @@ class Reader:
             return
         if not isinstance(node, Mapping):
             noun = what.split(" ", 1)[-1]
-            self.shape(node, f"a mapping with an entry for each {noun}", "write `NAME: …`, each on a line of its own")
+            self.shape(
+                node, f"a mapping with an entry for each {noun}", "write `NAME: …`, each on a line of its own"
+            )
             return
         for key, value in node.entries:
             if self.name(key, what):
@@ -231,7 +250,10 @@ class Reader:
         clean = re.sub(r"[^A-Za-z0-9_]+", "_", key.text).strip("_")[:MAX_NAME]
         helps = [f"write `{clean}`"] if NAME.match(clean) else []
         self.reporter.error(
-            "PD111", f"`{key.text[:MAX_NAME]}` cannot name {what}", key.span, "letters, digits and `_`, a letter first",
+            "PD111",
+            f"`{key.text[:MAX_NAME]}` cannot name {what}",
+            key.span,
+            "letters, digits and `_`, a letter first",
             helps=helps,
         )
         return False
@@ -277,13 +299,18 @@ class Reader:
             return None
         return int(value.text)
 
-    def choice(self, entries: dict[str, tuple[Scalar, Node]], key: str, options: tuple[str, ...]) -> str | None:
+    def choice(
+        self, entries: dict[str, tuple[Scalar, Node]], key: str, options: tuple[str, ...]
+    ) -> str | None:
         value = self.scalar(entries, key)
         if value is None or value.text in options:
             return value.text if value else None
         listed = ", ".join(f"`{option}`" for option in options)
         self.reporter.error(
-            "PD110", f"`{key}` must be one of {listed}", value.span, "not one of them",
+            "PD110",
+            f"`{key}` must be one of {listed}",
+            value.span,
+            "not one of them",
             helps=suggest(value.text, options, "one of"),
         )
         return None

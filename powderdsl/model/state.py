@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from powderdsl.model.types import ELEMENT, Kind, Ruleset, Value
+from powderdsl.model.types import ELEMENT, Kind, Ruleset
 
 SNAP = 2.0**-20
 """Real fields are kept to multiples of nothing, but what is smaller than this is zero: motion dies out, and no
@@ -21,7 +22,7 @@ class Slot:
 
     name: str
     kind: Kind
-    default: Value
+    default: Any
     travels: bool
     resets: bool
     of: frozenset[int] | None
@@ -54,6 +55,15 @@ def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
     for item in ruleset.fields:
         planes = 2 if item.kind.name == "vec2" else 1
         found.append(
-            Slot(item.name, item.kind, item.default, item.at == "element", item.resets, item.of, storage(item.kind), planes)
+            Slot(
+                item.name,
+                item.kind,
+                item.default,
+                item.at == "element",
+                item.resets,
+                item.of,
+                storage(item.kind),
+                planes,
+            )
         )
     return tuple(found)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS, grid_kernel
-from powderdsl.model.literals import read_bounds
 from powderdsl.model.compose import Composition, Named
+from powderdsl.model.declarations import TypedDecl
+from powderdsl.model.literals import read_bounds
 from powderdsl.model.operands import (
     Coercer,
     Items,
@@ -15,7 +16,6 @@ from powderdsl.model.operands import (
     Place,
     SetOf,
 )
-from powderdsl.model.packs import TypedDecl
 from powderdsl.model.types import (
     CHANCE,
     DIRECTION,
@@ -61,12 +61,25 @@ class Symbols:
         """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbour."""
         if after_dot:
             return [*self.properties, *self.fields, *self.streams, *DIRECTIONS]
-        return [*self.constants, *self.properties, *self.fields, *self.streams, *(p.split(".")[1] for p in self.params)]
+        return [
+            *self.constants,
+            *self.properties,
+            *self.fields,
+            *self.streams,
+            *(p.split(".")[1] for p in self.params),
+        ]
 
     def is_declared(self, name: str, pack: str) -> bool:
         """Whether some pack declares the name, even if its declaration is wrong."""
         found = self.composition
-        tables = (found.properties, found.fields, found.streams, found.kernels, found.sets, found.element_decls)
+        tables = (
+            found.properties,
+            found.fields,
+            found.streams,
+            found.kernels,
+            found.sets,
+            found.element_decls,
+        )
         return any(name in table for table in tables) or f"{pack}.{name}" in found.params
 
 
@@ -77,10 +90,14 @@ def base_symbols(composition: Composition) -> Symbols:
     constants |= {name: Place(offset) for name, offset in DIRECTIONS.items()}
     constants |= {name: Items(tuple(Place(o) for o in offsets)) for name, offsets in DIRECTION_SETS.items()}
     constants |= KERNELS
-    constants |= {name: grid_kernel(name, k.decl.rows, k.decl.wrap) for name, k in composition.kernels.items()}
+    constants |= {
+        name: grid_kernel(name, k.decl.rows, k.decl.wrap) for name, k in composition.kernels.items()
+    }
     constants |= {name: SetOf((element.id,), name) for name, element in composition.elements.items()}
     constants |= {name: SetOf(tuple(sorted(ids))) for name, ids in composition.tags.items()}
-    symbols.streams |= {name: Stream(name, stream_ident(name), s.decl.bits) for name, s in composition.streams.items()}
+    symbols.streams |= {
+        name: Stream(name, stream_ident(name), s.decl.bits) for name, s in composition.streams.items()
+    }
     return symbols
 
 
@@ -103,7 +120,9 @@ _KINDS_ELSEWHERE = {
 
 def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
     """A kind as written: ``0..7``, ``flag``, ``element``, ``chance``, ``real(0..1)``, ``vec2(-10..10)``."""
-    helps: tuple[str, ...] = ("kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",)
+    helps: tuple[str, ...] = (
+        "kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",
+    )
     if syntax.kind == "range":
         lo, hi = read_bounds(syntax, coercer)
         return integer(lo, hi)
@@ -112,7 +131,13 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
         if plain is not None:
             return plain
         if syntax.text in ("real", "vec2"):
-            raise coercer.fail("PD401", f"`{syntax.text}` needs bounds", syntax.span, "no bounds", helps=(f"write `{syntax.text}(-100..100)`",))
+            raise coercer.fail(
+                "PD401",
+                f"`{syntax.text}` needs bounds",
+                syntax.span,
+                "no bounds",
+                helps=(f"write `{syntax.text}(-100..100)`",),
+            )
     if syntax.kind == "call" and syntax.text in ("real", "vec2") and len(syntax.children) == 1:
         lo, hi = read_bounds(syntax.children[0], coercer)
         return Kind(syntax.text, lo, hi)
@@ -154,8 +179,12 @@ def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
         name = qualified.split(".")[1]
         if name in spans:
             reporter.error(
-                "PD308", f"the parameter `{name}` hides another `{name}`", named.decl.name.span, "the same word",
-                secondary=[Label(spans[name], "this one")], helps=["rename the parameter"],
+                "PD308",
+                f"the parameter `{name}` hides another `{name}`",
+                named.decl.name.span,
+                "the same word",
+                secondary=[Label(spans[name], "this one")],
+                helps=["rename the parameter"],
             )
 
 
@@ -163,6 +192,6 @@ def number_value(expr: Expr, kind: Kind) -> Value:
     """The constant in an expression that `Coercer.of_kind` accepted."""
     if kind.name == "vec2":
         parts = [arg.value for arg in expr.args]
-        return (float(parts[0]), float(parts[1]))  # type: ignore[arg-type]
+        return (float(parts[0]), float(parts[1]))
     assert expr.op == "const"
-    return expr.value  # type: ignore[return-value]
+    return expr.value

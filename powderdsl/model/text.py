@@ -226,19 +226,19 @@ class _Printer:
             return f"{self.expr(args[0], left)} {sign} {self.expr(args[1], right)}", level
         match expr.op:
             case "const":
-                return show_value(rules, expr.kind, expr.value), _ATOM  # type: ignore[arg-type]
+                return show_value(rules, expr.kind, expr.value), _ATOM
             case "element":
                 return "element", _ATOM
             case "draw":  # a stream may be called like anything else
                 return f"draw({expr.value})", _ATOM
             case "coordinate":
-                return "{} mod {}".format(*expr.value), 6  # type: ignore[misc]
+                return "{} mod {}".format(*expr.value), 6
             case "inside":
-                return f"inside({show_offset(expr.value)})", _ATOM  # type: ignore[arg-type]
+                return f"inside({show_offset(expr.value)})", _ATOM
             case "look":
-                return f"{show_offset(expr.value)}.{self.expr(args[0], _ATOM)}", _ATOM  # type: ignore[arg-type]
+                return f"{show_offset(expr.value)}.{self.expr(args[0], _ATOM)}", _ATOM
             case "member":
-                return f"{self.expr(args[0], 5)} in {show_set(rules, expr.value)}", 4  # type: ignore[arg-type]
+                return f"{self.expr(args[0], 5)} in {show_set(rules, expr.value)}", 4
             case "not":
                 return f"not {self.expr(args[0], 3)}", 3
             case "neg":
@@ -246,7 +246,7 @@ class _Printer:
             case "mod":
                 return f"{self.expr(args[0], 6)} mod {expr.value}", 6
             case "count" | "sum":
-                kernel = self.kernel(expr.value)  # type: ignore[arg-type]
+                kernel = self.kernel(expr.value)
                 return f"{expr.op}({self.expr(args[0], 5)} in {kernel})", _ATOM
             case "choose":
                 return f"{self.expr(args[1], 1)} if {self.expr(args[0], 1)} else {self.expr(args[2])}", 0

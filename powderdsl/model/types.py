@@ -6,9 +6,11 @@ values directly, and `ir/lower.py` lowers them; neither looks at syntax again.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import Any
 
 from powderdsl.diagnostics import Span
 
@@ -59,7 +61,7 @@ class Expr:
     op: str
     kind: Kind
     args: tuple[Expr, ...] = ()
-    value: object = None
+    value: Any = None
     span: Span | None = field(default=None, compare=False, repr=False)
 
     def walk(self) -> Iterator[Expr]:
@@ -146,7 +148,7 @@ class Field:
 
     name: str
     kind: Kind
-    default: Value
+    default: Any
     at: str
     resets: bool
     of: frozenset[int] | None
@@ -169,7 +171,7 @@ class Param:
 
     name: str
     kind: Kind
-    default: Value
+    default: Any
     about: str
     span: Span = field(compare=False, repr=False)
 
@@ -197,7 +199,7 @@ class Assign:
     value: Expr
     mask: Expr | None
     """None for an effect: it happens where its rule happens."""
-    span: Span = field(compare=False, repr=False)
+    span: Span = dataclasses.field(compare=False, repr=False)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import frexp
 
 from powderdsl.ir.build import Builder
@@ -42,7 +43,7 @@ def _and_or(node: Node, build: Builder) -> Node | None:
             return build.flag(absorbing)
     if a.op == b.op == "in_set" and a.args[0] is b.args[0]:  # x in S and x in T = x in S ∩ T
         sets = (a.attr, b.attr)
-        joined = sets[0] | sets[1] if absorbing else sets[0] & sets[1]  # type: ignore[operator]
+        joined = sets[0] | sets[1] if absorbing else sets[0] & sets[1]
         return build.in_set(a.args[0], joined)
     return None
 
@@ -94,12 +95,12 @@ def _whole_constants(node: Node, build: Builder) -> Node | None:
     if node.type.name != "int" or node.op not in ("add", "sub", "mul", "min", "max", "neg", "abs", "mod"):
         return None
     if all(arg.op == "const" for arg in node.args):
-        values = [int(arg.attr) for arg in node.args]  # type: ignore[call-overload]
-        result = {
+        values = [int(arg.attr) for arg in node.args]
+        evaluate: dict[str, Callable[..., int]] = {
             "add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "min": min, "max": max,
             "neg": lambda a: -a, "abs": abs, "mod": lambda a: a % node.attr,
-        }[node.op](*values)  # fmt: skip
-        return build.whole(result)
+        }  # fmt: skip
+        return build.whole(evaluate[node.op](*values))
     if node.op in ("add", "sub"):
         a, b = node.args
         if b.op == "const" and b.attr == 0:  # a + 0 = a
@@ -108,7 +109,7 @@ def _whole_constants(node: Node, build: Builder) -> Node | None:
             return b
     if node.op == "mod":  # x mod n = x where 0 ≤ x < n
         (a,) = node.args
-        if a.type.lo >= 0 and a.type.hi < node.attr:  # type: ignore[operator]
+        if a.type.lo >= 0 and a.type.hi < node.attr:
             return a
     return None
 
@@ -151,10 +152,10 @@ def _movement(node: Node, build: Builder) -> Node | None:
 def _shift_of_constant(node: Node, build: Builder) -> Node | None:
     if node.op == "shift":
         (a,) = node.args
-        wraps = node.attr[2]  # type: ignore[index]
+        wraps = node.attr[2]
         if a.op in ("const", "param") and (wraps or (a.op == "const" and not a.attr)):
             return a
-        if a.op == "coordinate" and a.attr[0] == "step" and wraps:  # type: ignore[index]
+        if a.op == "coordinate" and a.attr[0] == "step" and wraps:
             return a
     return None
 
@@ -163,7 +164,7 @@ def _below(node: Node, build: Builder) -> Node | None:
     if node.op != "below":
         return None
     (limit,) = node.args
-    bits = node.attr[1]  # type: ignore[index]
+    bits = node.attr[1]
     if limit.type.hi <= 0:  # a chance of nothing
         return build.flag(False)
     if limit.type.lo >= 1 << bits:  # a certainty
@@ -174,7 +175,7 @@ def _below(node: Node, build: Builder) -> Node | None:
 def _divide(node: Node, build: Builder) -> Node | None:
     """x / 2^k = x · 2^-k, exactly."""
     if node.op == "div" and node.args[1].op == "const":
-        divisor = float(node.args[1].attr)  # type: ignore[arg-type]
+        divisor = float(node.args[1].attr)
         if divisor and frexp(abs(divisor))[0] == 0.5:
             return build.arithmetic("mul", node.args[0], build.real(1.0 / divisor))
     return None

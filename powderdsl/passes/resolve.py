@@ -23,7 +23,9 @@ def _table_compare(node: Node, build: Builder) -> Node | None:
         values = sorted(set(_values(a)))
         if len(values) <= MAX_VALUES:
             parts = [
-                build.and_(_where(a, lambda v, x=x: v == x, build), _where(b, lambda v, x=x: holds(x, v), build))  # type: ignore[misc]
+                build.and_(
+                    _where(a, lambda v, x=x: v == x, build), _where(b, lambda v, x=x: holds(x, v), build)
+                )
                 for x in values
             ]
             return build.any(parts)
@@ -59,7 +61,7 @@ def _where(table: Node, holds, build: Builder) -> Node:  # type: ignore[no-untyp
 
 def _table_of_constant(node: Node, build: Builder) -> Node | None:
     if node.op == "table" and node.args[0].op == "const":
-        return build.whole(node.attr[node.args[0].attr])  # type: ignore[index]
+        return build.whole(node.attr[node.args[0].attr])
     if node.op == "in_set" and node.args[0].op == "table":  # table(x) in S = x in {i : table[i] in S}
         members = node.attr
         assert isinstance(members, frozenset)
@@ -69,10 +71,10 @@ def _table_of_constant(node: Node, build: Builder) -> Node | None:
 
 def _shift_of_table(node: Node, build: Builder) -> Node | None:
     """shift(table(x)) = table(shift(x)), so that comparisons see the table."""
-    if node.op == "shift" and node.args[0].op == "table" and node.attr[2]:  # type: ignore[index]
-        dy, dx, _ = node.attr  # type: ignore[misc]
+    if node.op == "shift" and node.args[0].op == "table" and node.attr[2]:
+        dy, dx, _ = node.attr
         table = node.args[0]
-        return build.table(build.shift(table.args[0], (dy, dx)), table.attr)  # type: ignore[arg-type]
+        return build.table(build.shift(table.args[0], (dy, dx)), table.attr)
     return None
 
 
@@ -115,11 +117,14 @@ def _substitute(node: Node, known: dict[int, object], build: Builder) -> Node:
     """The condition with tables of known elements replaced; only looks through logic and comparisons."""
     if node.op == "table" and id(node.args[0]) in known:
         members = known[id(node.args[0])]
-        assert isinstance(members, frozenset) and isinstance(node.attr, tuple)
+        assert isinstance(members, frozenset)
+        assert isinstance(node.attr, tuple)
         values = {node.attr[i] for i in members if i < len(node.attr)}
         return build.whole(values.pop()) if len(values) == 1 else node
     # Not through shifts: what is known of this cell says nothing of its neighbours.
     if node.op not in ("and", "or", "not", "eq", "lt", "le") or not any(n.op == "table" for n in walk(node)):
         return node
     args = tuple(_substitute(arg, known, build) for arg in node.args)
-    return rebuild(node, args, build) if any(a is not b for a, b in zip(args, node.args, strict=True)) else node
+    return (
+        rebuild(node, args, build) if any(a is not b for a, b in zip(args, node.args, strict=True)) else node
+    )

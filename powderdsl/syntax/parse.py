@@ -18,6 +18,7 @@ MAX_LENGTH = 2000
 MAX_DEPTH = 48
 STARTS = ("rule", "expression", "header")
 
+
 @lru_cache(maxsize=1)
 def parser() -> Lark:
     """The one parser of the line language."""
@@ -46,7 +47,10 @@ def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | Non
     span = scalar.content
     if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
         reporter.error(
-            "PD203", "escapes in a quoted rule", scalar.span, "a backslash, or doubled quotes",
+            "PD203",
+            "escapes in a quoted rule",
+            scalar.span,
+            "a backslash, or doubled quotes",
             helps=["write the line without quotes, or without the escapes"],
         )
         return None
@@ -58,8 +62,11 @@ def parse_text(source: Source, begin: int, end: int, start: str, reporter: Repor
     whole = Span(source, begin, max(end, begin + 1))
     if end - begin > MAX_LENGTH:
         reporter.error(
-            "PD202", f"a line of {end - begin:,} characters", Span(source, begin, begin + 1),
-            f"longer than {MAX_LENGTH:,}", helps=["give parts of it names with `let:`"],
+            "PD202",
+            f"a line of {end - begin:,} characters",
+            Span(source, begin, begin + 1),
+            f"longer than {MAX_LENGTH:,}",
+            helps=["give parts of it names with `let:`"],
         )
         return None
     try:
@@ -71,8 +78,11 @@ def parse_text(source: Source, begin: int, end: int, start: str, reporter: Repor
         return _convert(tree, source, whole, 0)
     except _TooDeep:
         reporter.error(
-            "PD202", f"an expression nested more than {MAX_DEPTH} deep", Span(source, begin, begin + 1),
-            notes=["a long chain of `and`, `or` or `+` nests as well"], helps=["give parts of it names with `let:`"],
+            "PD202",
+            f"an expression nested more than {MAX_DEPTH} deep",
+            Span(source, begin, begin + 1),
+            notes=["a long chain of `and`, `or` or `+` nests as well"],
+            helps=["give parts of it names with `let:`"],
         )
         return None
 
@@ -96,7 +106,9 @@ def _convert(tree: Tree | Token, source: Source, fallback: Span, depth: int) -> 
     return Syntax(str(tree.data), nodes, text, span)
 
 
-def _report_syntax_error(error: UnexpectedInput, source: Source, begin: int, end: int, reporter: Reporter) -> None:
+def _report_syntax_error(
+    error: UnexpectedInput, source: Source, begin: int, end: int, reporter: Reporter
+) -> None:
     text = source.text
     if isinstance(error, UnexpectedCharacters):
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass

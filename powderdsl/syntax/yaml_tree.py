@@ -130,14 +130,24 @@ class _Builder:
     def _node(self, event, events, depth: int) -> Node:  # type: ignore[no-untyped-def]
         self.nodes += 1
         if depth > MAX_DEPTH or self.nodes > MAX_NODES:
-            what = f"nested more than {MAX_DEPTH} deep" if depth > MAX_DEPTH else f"of more than {MAX_NODES:,} values"
+            what = (
+                f"nested more than {MAX_DEPTH} deep"
+                if depth > MAX_DEPTH
+                else f"of more than {MAX_NODES:,} values"
+            )
             start = event.start_mark.index
-            self.reporter.error("PD106", f"document {what}", Span(self.source, start, start + 1), "here it is too much")
+            self.reporter.error(
+                "PD106", f"document {what}", Span(self.source, start, start + 1), "here it is too much"
+            )
             raise _Abort
         if isinstance(event, yaml.AliasEvent):
-            self._forbid(event, f"the alias `*{event.anchor}`", "write the value out: rule files have no anchors")
+            self._forbid(
+                event, f"the alias `*{event.anchor}`", "write the value out: rule files have no anchors"
+            )
         if event.anchor:
-            self._forbid(event, f"the anchor `&{event.anchor}`", "write the value out: rule files have no anchors")
+            self._forbid(
+                event, f"the anchor `&{event.anchor}`", "write the value out: rule files have no anchors"
+            )
         if event.tag is not None and event.tag != "!":
             self._forbid(event, f"the tag `{event.tag}`", "remove it: rule files are plain data")
         if isinstance(event, yaml.ScalarEvent):
@@ -149,11 +159,21 @@ class _Builder:
     def _scalar(self, event) -> Scalar:  # type: ignore[no-untyped-def]
         span = self._span(event)
         if event.style in ("'", '"'):
-            return Scalar(event.value, span, Span(self.source, span.start + 1, max(span.start + 1, span.end - 1)), "quoted")
+            return Scalar(
+                event.value,
+                span,
+                Span(self.source, span.start + 1, max(span.start + 1, span.end - 1)),
+                "quoted",
+            )
         if event.style in ("|", ">"):
             newline = self.source.text.find("\n", span.start)
             body = newline + 1 if newline >= 0 else span.end
-            return Scalar(event.value, Span(self.source, span.start, span.start + 1), Span(self.source, body, max(body, span.end)), "block")
+            return Scalar(
+                event.value,
+                Span(self.source, span.start, span.start + 1),
+                Span(self.source, body, max(body, span.end)),
+                "block",
+            )
         return Scalar(event.value, span, span, "plain")
 
     def _sequence(self, start, events, depth: int) -> Sequence:  # type: ignore[no-untyped-def]
@@ -175,16 +195,37 @@ class _Builder:
             key = self._node(event, events, depth + 1)
             value = self._node(next(events), events, depth + 1)
             if not isinstance(key, Scalar):
-                self._fail("PD107", "a key must be a word", key.span, "a list or a mapping", "write a name before the `:`")
+                self._fail(
+                    "PD107",
+                    "a key must be a word",
+                    key.span,
+                    "a list or a mapping",
+                    "write a name before the `:`",
+                )
             elif key.text == "<<" and key.style == "plain":
-                self._fail("PD105", "the merge key `<<` is not allowed", key.span, "not allowed", "write the entries out")
-            elif self._in_braces(start) and isinstance(value, Scalar) and value.style == "plain" and not value.text:
+                self._fail(
+                    "PD105",
+                    "the merge key `<<` is not allowed",
+                    key.span,
+                    "not allowed",
+                    "write the entries out",
+                )
+            elif (
+                self._in_braces(start)
+                and isinstance(value, Scalar)
+                and value.style == "plain"
+                and not value.text
+            ):
                 self._no_value(key, first=not seen)
             elif key.text in seen:
                 other = (Label(seen[key.text], "first time here"),)
                 self._fail(
-                    "PD104", f"key `{key.text}` stands twice in one mapping", key.span, "second time here",
-                    "keep one of them, or join them", other,
+                    "PD104",
+                    f"key `{key.text}` stands twice in one mapping",
+                    key.span,
+                    "second time here",
+                    "keep one of them, or join them",
+                    other,
                 )
             else:
                 seen[key.text] = key.span
@@ -195,7 +236,10 @@ class _Builder:
     def _no_value(self, key: Scalar, *, first: bool) -> None:
         """Nothing in `{…}` has a key without a value: most often a comma has cut a value in two."""
         if self.source.text[key.span.end :].lstrip().startswith(":"):
-            label, cure = "nothing stands after its `:`", 'write its value; one with `#` in it needs quotes: "#RRGGBB"'
+            label, cure = (
+                "nothing stands after its `:`",
+                'write its value; one with `#` in it needs quotes: "#RRGGBB"',
+            )
         elif first:
             label, cure = "a key without a `:`", "`{…}` holds `key: value` pairs; rules stand outside braces"
         else:

@@ -10,7 +10,8 @@ import numpy as np
 
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.check import check
-from powderdsl.model.packs import PackDecl, read_file
+from powderdsl.model.declarations import PackDecl
+from powderdsl.model.packs import read_file
 from powderdsl.model.state import SNAP, Slot, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.choices import Choices
@@ -56,11 +57,19 @@ class Start:
     def __str__(self) -> str:
         shape = "×".join(map(str, self.ids.shape))
         told = [f"worlds {shape}, seed {self.seed}, ids {self.ids.tolist() if self.ids.size <= 80 else '…'}"]
-        told += [f"{name} {values.tolist() if values.size <= 160 else '…'}" for name, values in self.fields.items()]
+        told += [
+            f"{name} {values.tolist() if values.size <= 160 else '…'}" for name, values in self.fields.items()
+        ]
         return "\n".join([*told, *(f"{name} = {values}" for name, values in self.params.items())])
 
 
-def random_start(ruleset: Ruleset, choices: Choices, shape: Sequence[int] | None = None, max_batch: int = 3, max_side: int = 65) -> Start:
+def random_start(
+    ruleset: Ruleset,
+    choices: Choices,
+    shape: Sequence[int] | None = None,
+    max_batch: int = 3,
+    max_side: int = 65,
+) -> Start:
     """Random worlds: any shape up to the bounds, any ids, and any values that the ruleset's fields can hold."""
     if shape is None:
         shape = (choices.whole(1, max_batch), *_sides(choices, max_side))
@@ -72,7 +81,11 @@ def random_start(ruleset: Ruleset, choices: Choices, shape: Sequence[int] | None
     for slot in slots(ruleset)[1:]:
         if not choices.maybe(15):  # else it stays fresh
             fields[slot.name] = _values(ruleset, slot, ids, fill)
-    params = {p.name: [_param(p.kind, choices) for _ in range(shape[0])] for p in ruleset.params} if choices.maybe(25) else {}
+    params = (
+        {p.name: [_param(p.kind, choices) for _ in range(shape[0])] for p in ruleset.params}
+        if choices.maybe(25)
+        else {}
+    )
     return Start(ids, fields, choices.below(1 << 31), params)
 
 
@@ -88,7 +101,9 @@ class _Fill:
     def __init__(self, choices: Choices, shape: tuple[int, ...]):
         self.choices = choices
         self.shape = shape
-        self.generator = None if np.prod(shape) <= FEW_CELLS else np.random.default_rng(choices.below(1 << 31))
+        self.generator = (
+            None if np.prod(shape) <= FEW_CELLS else np.random.default_rng(choices.below(1 << 31))
+        )
 
     def choose(self, options: Sequence[Any], planes: int = 1) -> np.ndarray:
         """An array of the shape (with an axis of planes, if there are two) whose cells are options."""
@@ -144,4 +159,6 @@ def _param(kind: Any, choices: Choices) -> float:
             return choices.pick([int(kind.lo), int(kind.hi), choices.whole(int(kind.lo), int(kind.hi))])
         case "chance":
             return choices.pick([0.5, 0.0, 1.0, 2.0**-16, 0.3])
-    return choices.pick([float(kind.lo), float(kind.hi), 0.1, kind.lo + (kind.hi - kind.lo) * choices.below(1000) / 999])
+    return choices.pick(
+        [float(kind.lo), float(kind.hi), 0.1, kind.lo + (kind.hi - kind.lo) * choices.below(1000) / 999]
+    )

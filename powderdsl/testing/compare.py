@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.model.types import Moment, Ruleset
 from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.testing.cases import Start, load_text
@@ -42,11 +41,15 @@ def find_difference(first: Mapping[str, Any], second: Mapping[str, Any]) -> Diff
     for slot in first:
         a, b = (_bits(_array(state[slot])) for state in (first, second))
         if a.dtype != b.dtype or a.shape != b.shape:
-            return Difference(slot, (), ((a.dtype.name, a.shape), (b.dtype.name, b.shape)), max(a.size, b.size))
+            return Difference(
+                slot, (), ((a.dtype.name, a.shape), (b.dtype.name, b.shape)), max(a.size, b.size)
+            )
         unequal = np.argwhere(a != b)
         if len(unequal):
             cell = tuple(int(i) for i in unequal[0])
-            return Difference(slot, cell, tuple(_array(state[slot])[cell].item() for state in (first, second)), len(unequal))
+            return Difference(
+                slot, cell, tuple(_array(state[slot])[cell].item() for state in (first, second)), len(unequal)
+            )
     return None
 
 
@@ -128,7 +131,12 @@ def _places(
 
 
 def _run_until(
-    rules: Ruleset, last: int, moments: int, sims: Sequence[Simulator], before: Sequence[World], options: dict[str, Any]
+    rules: Ruleset,
+    last: int,
+    moments: int,
+    sims: Sequence[Simulator],
+    before: Sequence[World],
+    options: dict[str, Any],
 ) -> Difference | None:
     """What differs after some passes, of the last of which only some moments run."""
     passes = [*rules.passes[:last], replace(rules.passes[last], moments=rules.passes[last].moments[:moments])]

@@ -10,7 +10,18 @@ from powderdsl.model.types import Kind
 from powderdsl.testing.choices import Choices
 from powderdsl.testing.vocabulary import CHANCES, Manner, Words
 
-PLACES = ("below", "left", "above", "right", "below.right", "above.left", "at(0, 2)", "at(-2, 1)", "at(3, 0)", "at(-7, -15)")
+PLACES = (
+    "below",
+    "left",
+    "above",
+    "right",
+    "below.right",
+    "above.left",
+    "at(0, 2)",
+    "at(-2, 1)",
+    "at(3, 0)",
+    "at(-7, -15)",
+)
 SIDES = ("below", "left", "above", "right", "below.left", "above.right")
 """Places that are directions too."""
 
@@ -60,7 +71,9 @@ class Phrases:
             case "int":
                 return self.whole(depth).text
             case "real":
-                return self.choices.weighted([(5, self.real), (1, self.whole), (1, self.flag), (1, self.draw)])(depth).text
+                return self.choices.weighted(
+                    [(5, self.real), (1, self.whole), (1, self.flag), (1, self.draw)]
+                )(depth).text
             case "vec2":
                 return self.choices.weighted([(9, self.vector), (1, lambda _: Phrase("0"))])(depth).text
             case "element":
@@ -85,7 +98,9 @@ class Phrases:
         loops = self.sides()
         if loops and self.choices.maybe(60):
             side = self.choices.pick(loops)
-            return self.choices.weighted([(6, side), (1, f"opposite({side})"), (1, f"below.{side}"), (1, f"{side}.left")])
+            return self.choices.weighted(
+                [(6, side), (1, f"opposite({side})"), (1, f"below.{side}"), (1, f"{side}.left")]
+            )
         return self.choices.pick(PLACES)
 
     def _locals(self, *kinds: str) -> list[str]:
@@ -126,23 +141,38 @@ class Phrases:
         names = [*self.words.elements, *self.words.groups, *self._locals("one")]
         one, other = choices.pick(names), choices.pick(names)
         return choices.weighted(
-            [(8, one), (2, f"(any but {one})"), (2, f"({one}, {other})"), (1, f"({one} or {other})"), (1, "any"), (1, f"({one}, missing?)")]
+            [
+                (8, one),
+                (2, f"(any but {one})"),
+                (2, f"({one}, {other})"),
+                (1, f"({one} or {other})"),
+                (1, "any"),
+                (1, f"({one}, missing?)"),
+            ]
         )
 
     def kernel(self) -> str | None:
         """A kernel's name, or None for the default."""
-        return self.choices.pick([*self.words.kernels] if not self.manner.borders else [None, *self.words.kernels])
+        return self.choices.pick(
+            [*self.words.kernels] if not self.manner.borders else [None, *self.words.kernels]
+        )
 
     def chance(self, depth: int) -> str:
         """What may stand after `with chance`."""
-        return self._one([(6, self._chance_literal), (4, self._chance_name), (1, self._real_chance)], depth).text
+        return self._one(
+            [(6, self._chance_literal), (4, self._chance_name), (1, self._real_chance)], depth
+        ).text
 
     def _chance_literal(self, depth: int) -> Phrase:
         return Phrase(self.choices.pick(CHANCES), fixed=True)
 
     def _chance_name(self, depth: int) -> Phrase | None:
         own = [name for name, kind in self.words.properties.items() if kind.name == "chance"]
-        names = [*[self._seen(name) for name in own], *(n for n, k in self.words.params.items() if k.name == "chance"), *self._locals("chance")]
+        names = [
+            *[self._seen(name) for name in own],
+            *(n for n, k in self.words.params.items() if k.name == "chance"),
+            *self._locals("chance"),
+        ]
         if not names:
             return None
         name = self.choices.pick(names)
@@ -160,7 +190,13 @@ class Phrases:
         """A condition. `bare`: a set of elements will do."""
         if bare and self.choices.maybe(25):
             return Phrase(self.group())
-        leaves = [(4, self._presence), (3, self._flag_name), (1, self._inside), (1, self._flag_param), (1, self._static)]
+        leaves = [
+            (4, self._presence),
+            (3, self._flag_name),
+            (1, self._inside),
+            (1, self._flag_param),
+            (1, self._static),
+        ]
         trees = [
             (4, self._compare_whole), (2, self._compare_draw), (2, self._compare_real), (3, self._both), (2, self._not),
             (1, self._same), (1, self._choose_flag), (1, self._quantified), (1, self._is_element), (1, self._is_direction),
@@ -198,7 +234,9 @@ class Phrases:
             lo, hi = sorted((choices.whole(-2, 6), choices.whole(-2, 6)))
             return Phrase(f"({left.text} {choices.pick(['in', 'not in'])} {lo}..{hi})")
         if choices.maybe(10):
-            return Phrase(f"({left.text} {choices.pick(['<', '<=', '>', '>=', '==', '!='])} {choices.pick(['1.5', '0.25', '-0.5'])})")
+            return Phrase(
+                f"({left.text} {choices.pick(['<', '<=', '>', '>=', '==', '!='])} {choices.pick(['1.5', '0.25', '-0.5'])})"
+            )
         middle = self.whole(depth - 1)
         text = f"{left.text} {choices.pick(['>', '<', '==', '>=', '<=', '!='])} {middle.text}"
         if choices.maybe(10):
@@ -210,10 +248,16 @@ class Phrases:
             return None
         draw = self.draw(depth)
         order = self.choices.pick(["<", ">", "<=", ">="])
-        other = self.chance(depth - 1) if (draw.lo, draw.hi) == (0, 1) else self.choices.pick(["0.5", "1", "0", "1.25", "-0.5", "2.999"])
+        other = (
+            self.chance(depth - 1)
+            if (draw.lo, draw.hi) == (0, 1)
+            else self.choices.pick(["0.5", "1", "0", "1.25", "-0.5", "2.999"])
+        )
         if (draw.lo, draw.hi) != (0, 1) and self.choices.maybe(40):
             other = self.whole(depth - 1).text
-        return Phrase(f"({draw.text} {order} {other})" if self.choices.maybe(70) else f"({other} {order} {draw.text})")
+        return Phrase(
+            f"({draw.text} {order} {other})" if self.choices.maybe(70) else f"({other} {order} {draw.text})"
+        )
 
     def draw(self, depth: int) -> Phrase:
         """A random number, maybe a neighbour's, maybe with a whole number added; with bounds."""
@@ -246,16 +290,22 @@ class Phrases:
         return Phrase(f"(not {self.flag(depth - 1, bare=True).text})")
 
     def _same(self, depth: int) -> Phrase:
-        return Phrase(f"({self.flag(depth - 1).text} {self.choices.pick(['==', '!='])} {self.flag(depth - 1).text})")
+        return Phrase(
+            f"({self.flag(depth - 1).text} {self.choices.pick(['==', '!='])} {self.flag(depth - 1).text})"
+        )
 
     def _choose_flag(self, depth: int) -> Phrase:
-        return Phrase(f"({self.flag(depth - 1).text} if {self.flag(depth - 1, bare=True).text} else {self.flag(depth - 1).text})")
+        return Phrase(
+            f"({self.flag(depth - 1).text} if {self.flag(depth - 1, bare=True).text} else {self.flag(depth - 1).text})"
+        )
 
     def _quantified(self, depth: int) -> Phrase:
         name = f"w{len(self.locals)}"
         kind, domain = self.domain()
         inner = self.bind(**{name: kind})
-        return Phrase(f"{self.choices.pick(['any', 'all'])}({inner.flag(depth - 1).text} for {name} in {domain})")
+        return Phrase(
+            f"{self.choices.pick(['any', 'all'])}({inner.flag(depth - 1).text} for {name} in {domain})"
+        )
 
     def _is_element(self, depth: int) -> Phrase:
         left = self._element_value(depth)
@@ -282,13 +332,20 @@ class Phrases:
     def _flag_there(self, depth: int) -> Phrase | None:
         """`left is CONDITION`: the condition as it is at a neighbour."""
         lets = self.lets("flag")
-        inner = self.choices.pick(lets) if lets and self.choices.maybe(70) else f"({self._compare_whole(depth).text} or {self.flag(0).text})"
+        inner = (
+            self.choices.pick(lets)
+            if lets and self.choices.maybe(70)
+            else f"({self._compare_whole(depth).text} or {self.flag(0).text})"
+        )
         return Phrase(f"({self.place()} is {inner})")
 
     def domain(self) -> tuple[Kind, str]:
         """What a loop may run over: the kind of its variable, and the text."""
         choices = self.choices
-        groups = [*self.words.groups, f"({choices.pick(self.words.elements)}, {choices.pick(self.words.elements)})"]
+        groups = [
+            *self.words.groups,
+            f"({choices.pick(self.words.elements)}, {choices.pick(self.words.elements)})",
+        ]
         return choices.weighted(
             [
                 (4, (SIDE, choices.pick(["(left, right)", "sides", "diagonals", "(below, above.left)"]))),
@@ -330,7 +387,9 @@ class Phrases:
         return Phrase(self.choices.pick(names), 0, 2, fixed=True) if names else None
 
     def _count(self, depth: int) -> Phrase:
-        arguments = [self.flag(depth - 1, bare=True).text for _ in range(self.choices.weighted([(4, 1), (1, 2)]))]
+        arguments = [
+            self.flag(depth - 1, bare=True).text for _ in range(self.choices.weighted([(4, 1), (1, 2)]))
+        ]
         kernel = self.kernel()
         weights = self.words.kernels[kernel or "box"]
         text = ", ".join(arguments) + (f" in {kernel}" if kernel else "")
@@ -382,11 +441,19 @@ class Phrases:
         choices = self.choices
         modulus = choices.pick([2, 3, 1, 4, 7, 64])
         step, column = ("step", "column") if self.manner.borders else ("step", "step")
-        inner = choices.pick(["row", "column", "step", "(row + step)", "(column - row)"]) if self.manner.borders else "step"
+        inner = (
+            choices.pick(["row", "column", "step", "(row + step)", "(column - row)"])
+            if self.manner.borders
+            else "step"
+        )
         if choices.maybe(50):
             value = self.whole(depth - 1)
             if not value.fixed:
-                inner = value.text if choices.maybe(60) else f"({value.text} {choices.pick('+-')} {choices.pick([step, column])})"
+                inner = (
+                    value.text
+                    if choices.maybe(60)
+                    else f"({value.text} {choices.pick('+-')} {choices.pick([step, column])})"
+                )
         return Phrase(f"({inner} mod {modulus})", 0, modulus - 1)
 
     def _choose_whole(self, depth: int) -> Phrase:
@@ -405,7 +472,12 @@ class Phrases:
         return self._one(leaves + (trees if depth > 0 else []), depth)
 
     def _decimal(self, depth: int) -> Phrase:
-        return Phrase(self.choices.pick(["0.5", "0.1", "1.5", "-0.25", "0.95", "3.3", "-7.125", "0.0001", "1e-7", "1000.5"]), fixed=True)
+        return Phrase(
+            self.choices.pick(
+                ["0.5", "0.1", "1.5", "-0.25", "0.95", "3.3", "-7.125", "0.0001", "1e-7", "1000.5"]
+            ),
+            fixed=True,
+        )
 
     def _real_name(self, depth: int) -> Phrase | None:
         name = self._named("real")
@@ -455,18 +527,30 @@ class Phrases:
 
     def _choose_real(self, depth: int) -> Phrase:
         a, b = self.real(depth - 1), self.choices.weighted([(3, self.real), (1, self.whole)])(depth - 1)
-        return Phrase(f"({a.text} if {self.flag(depth - 1, bare=True).text} else {b.text})", fixed=a.fixed or b.fixed)
+        return Phrase(
+            f"({a.text} if {self.flag(depth - 1, bare=True).text} else {b.text})", fixed=a.fixed or b.fixed
+        )
 
     def _scaled_draw(self, depth: int) -> Phrase | None:
         if not self.words.streams:
             return None
         if self.choices.maybe(30):
-            return Phrase(f"({self.draw(depth - 1).text} {self.choices.pick('+-')} {self._vary(self.real(depth - 1))})")
-        return Phrase(f"({self.draw(depth - 1).text} {self.choices.pick('*/')} {self.choices.pick(['0.7', '2.5', '0.001'])})")
+            return Phrase(
+                f"({self.draw(depth - 1).text} {self.choices.pick('+-')} {self._vary(self.real(depth - 1))})"
+            )
+        return Phrase(
+            f"({self.draw(depth - 1).text} {self.choices.pick('*/')} {self.choices.pick(['0.7', '2.5', '0.001'])})"
+        )
 
     def vector(self, depth: int) -> Phrase:
         leaves = [(6, self._vector_name), (2, self._pair)]
-        trees = [(3, self._vector_sum), (3, self._scaled), (1, self._opposed), (2, self._spread), (1, self._choose_vector)]
+        trees = [
+            (3, self._vector_sum),
+            (3, self._scaled),
+            (1, self._opposed),
+            (2, self._spread),
+            (1, self._choose_vector),
+        ]
         return self._one(leaves + (trees if depth > 0 else []), depth)
 
     def _vector_name(self, depth: int) -> Phrase | None:
@@ -474,16 +558,28 @@ class Phrases:
         return None if name is None else Phrase(name)
 
     def _pair(self, depth: int) -> Phrase:
-        parts = [self.choices.weighted([(2, self.real), (2, self.whole), (1, self.flag)])(depth - 1).text for _ in range(2)]
+        parts = [
+            self.choices.weighted([(2, self.real), (2, self.whole), (1, self.flag)])(depth - 1).text
+            for _ in range(2)
+        ]
         return Phrase(f"vector({parts[0]}, {parts[1]})")
 
     def _vector_sum(self, depth: int) -> Phrase:
-        return Phrase(f"({self.vector(depth - 1).text} {self.choices.pick('+-')} {self.vector(depth - 1).text})")
+        return Phrase(
+            f"({self.vector(depth - 1).text} {self.choices.pick('+-')} {self.vector(depth - 1).text})"
+        )
 
     def _scaled(self, depth: int) -> Phrase:
-        vector, factor = self.vector(depth - 1), self.choices.weighted([(2, self.real), (1, self.whole)])(depth - 1)
+        vector, factor = (
+            self.vector(depth - 1),
+            self.choices.weighted([(2, self.real), (1, self.whole)])(depth - 1),
+        )
         text = self.choices.pick(["2", "0.5", "3"]) if factor.fixed else factor.text
-        return Phrase(self.choices.pick([f"({vector.text} * {text})", f"({text} * {vector.text})", f"({vector.text} / {text})"]))
+        return Phrase(
+            self.choices.pick(
+                [f"({vector.text} * {text})", f"({text} * {vector.text})", f"({vector.text} / {text})"]
+            )
+        )
 
     def _opposed(self, depth: int) -> Phrase:
         return Phrase(f"(-{self.vector(depth - 1).text})")
@@ -493,7 +589,9 @@ class Phrases:
         return Phrase(f"sum({self.vector(depth - 1).text}{f' in {kernel}' if kernel else ''})")
 
     def _choose_vector(self, depth: int) -> Phrase:
-        return Phrase(f"({self.vector(depth - 1).text} if {self.flag(depth - 1, bare=True).text} else {self.vector(depth - 1).text})")
+        return Phrase(
+            f"({self.vector(depth - 1).text} if {self.flag(depth - 1, bare=True).text} else {self.vector(depth - 1).text})"
+        )
 
     # Elements and directions
 
@@ -508,7 +606,9 @@ class Phrases:
         options = [self.place(), "here"] if name is None else [name, name, self.place(), "here"]
         value = self.choices.pick(options)
         if depth > 0 and self.choices.maybe(20):
-            return Phrase(f"({value} if {self.flag(depth - 1, bare=True).text} else {self.element(depth - 1).text})")
+            return Phrase(
+                f"({value} if {self.flag(depth - 1, bare=True).text} else {self.element(depth - 1).text})"
+            )
         return Phrase(value)
 
     def direction(self, depth: int) -> Phrase:
@@ -522,6 +622,7 @@ class Phrases:
         if name is None or (depth > 0 and self.choices.maybe(30)):
             return Phrase(f"octant({self.vector(depth - 1).text})")
         if depth > 0 and self.choices.maybe(20):
-            return Phrase(f"({name} if {self.flag(depth - 1, bare=True).text} else {self.direction(depth - 1).text})")
+            return Phrase(
+                f"({name} if {self.flag(depth - 1, bare=True).text} else {self.direction(depth - 1).text})"
+            )
         return Phrase(name)
-

@@ -74,17 +74,26 @@ def _smaller_trees(tree: Tree) -> Iterator[Tree]:
         return
     keys = list(tree) if isinstance(tree, dict) else list(range(len(tree)))
     for key in reversed(keys):
-        yield {k: v for k, v in tree.items() if k != key} if isinstance(tree, dict) else [v for i, v in enumerate(tree) if i != key]
+        yield (
+            {k: v for k, v in tree.items() if k != key}
+            if isinstance(tree, dict)
+            else [v for i, v in enumerate(tree) if i != key]
+        )
     if isinstance(tree, dict):
         for key in keys:  # a loop's body once, a nested block's parts for the block
             if str(key).startswith(("for ", "repeat ")):
                 yield {("do" if k == key else k): v for k, v in tree.items()}
-                yield from ({(line if k == key else k): v for k, v in tree.items()} for line in _smaller_headers(str(key)))
+                yield from (
+                    {(line if k == key else k): v for k, v in tree.items()}
+                    for line in _smaller_headers(str(key))
+                )
     for key in keys:
         value = tree[key]  # type: ignore[index]
         if key in ("type", "pack"):  # another kind would be another case
             continue
-        inner: list[Tree] = [value[0]] if isinstance(value, list) and len(value) == 1 and isinstance(value[0], str) else []
+        inner: list[Tree] = (
+            [value[0]] if isinstance(value, list) and len(value) == 1 and isinstance(value[0], str) else []
+        )
         for smaller in (*inner, *_smaller_trees(value)):
             if isinstance(tree, dict):
                 yield {k: (smaller if k == key else v) for k, v in tree.items()}
@@ -101,7 +110,10 @@ def _smaller_headers(line: str) -> Iterator[str]:
 def _smaller_lines(text: str) -> Iterator[str]:
     """A rule or expression with a clause less, or an expression in it replaced by one of its parts or a plain one."""
     source = Source("line", text)
-    syntax = next((s for start in ("rule", "expression") if (s := parse_text(source, 0, len(text), start, Reporter()))), None)
+    syntax = next(
+        (s for start in ("rule", "expression") if (s := parse_text(source, 0, len(text), start, Reporter()))),
+        None,
+    )
     if syntax is None:
         return
     for clause in ("then", "chance", "condition", "where"):
@@ -130,7 +142,9 @@ def _smaller_starts(start: Start) -> Iterator[Start]:
     for i in range(batch) if batch > 1 else ():
         yield _cut(start, np.s_[i : i + 1, :, :], i)
     for axis, size in ((1, height), (2, width)):
-        for keep in (slice(size // 2), slice(size // 2, None), slice(size - 1), slice(1, None)) if size > 1 else ():
+        for keep in (
+            (slice(size // 2), slice(size // 2, None), slice(size - 1), slice(1, None)) if size > 1 else ()
+        ):
             yield _cut(start, np.s_[:, keep, :] if axis == 1 else np.s_[:, :, keep], None)
     for name in start.fields:
         yield replace(start, fields={k: v for k, v in start.fields.items() if k != name})
@@ -144,7 +158,10 @@ def _smaller_starts(start: Start) -> Iterator[Start]:
 
 def _cut(start: Start, where: tuple[slice, slice, slice], world: int | None) -> Start:
     fields = {
-        name: values[where[0], :, where[1], where[2]] if values.ndim == 4 else values[where] for name, values in start.fields.items()
+        name: values[where[0], :, where[1], where[2]] if values.ndim == 4 else values[where]
+        for name, values in start.fields.items()
     }
-    params = start.params if world is None else {name: [values[world]] for name, values in start.params.items()}
+    params = (
+        start.params if world is None else {name: [values[world]] for name, values in start.params.items()}
+    )
     return Start(start.ids[where], fields, start.seed, params)

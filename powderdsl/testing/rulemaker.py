@@ -9,7 +9,17 @@ from powderdsl.testing.choices import Choices
 from powderdsl.testing.phrases import Phrases
 from powderdsl.testing.vocabulary import Manner, Tree, Words, declare, some_range
 
-MOVER_PLACES = ("below", "right", "left", "above", "below.left", "above.right", "at(0, 2)", "at(-3, 1)", "at(5, 0)")
+MOVER_PLACES = (
+    "below",
+    "right",
+    "left",
+    "above",
+    "below.left",
+    "above.right",
+    "at(0, 2)",
+    "at(-3, 1)",
+    "at(5, 0)",
+)
 """Where swaps and moves may go: never here."""
 
 MAX_ROUNDS = 8
@@ -33,10 +43,22 @@ def ruleset_text(choices: Choices, manner: Manner) -> str:
 def write_yaml(tree: Tree, indent: str = "") -> str:
     """Block-style YAML of nested mappings, lists and texts."""
     if isinstance(tree, str):
-        plain = tree and tree[0] not in "#-%?@`\"'[]{}&*!|>,:" and ": " not in tree and " #" not in tree and not tree.endswith(":")
-        return f" {tree}\n" if plain or (len(tree) > 1 and tree[0] == "-" and tree[1] != " ") else f" '{tree}'\n"
+        plain = (
+            tree
+            and tree[0] not in "#-%?@`\"'[]{}&*!|>,:"
+            and ": " not in tree
+            and " #" not in tree
+            and not tree.endswith(":")
+        )
+        return (
+            f" {tree}\n" if plain or (len(tree) > 1 and tree[0] == "-" and tree[1] != " ") else f" '{tree}'\n"
+        )
     lines = []
-    pairs = [(f"{key}:", value) for key, value in tree.items()] if isinstance(tree, dict) else [("-", value) for value in tree]
+    pairs = (
+        [(f"{key}:", value) for key, value in tree.items()]
+        if isinstance(tree, dict)
+        else [("-", value) for value in tree]
+    )
     for head, value in pairs:
         body = write_yaml(value, indent + "  ")
         lines.append(f"{indent}{head}" + (body if isinstance(value, str) else "\n" + body))
@@ -60,7 +82,10 @@ class PassMaker:
         tree: dict[str, Tree] = {}
         if earlier and self.choices.maybe(30):
             tree["after"] = self.choices.pick([earlier[-1], [earlier[0], "nowhere?"]])
-        scratch = {self._name("x"): self._scratch_kind() for _ in range(self.choices.weighted([(4, 0), (2, 1), (1, 2)]))}
+        scratch = {
+            self._name("x"): self._scratch_kind()
+            for _ in range(self.choices.weighted([(4, 0), (2, 1), (1, 2)]))
+        }
         if scratch:
             tree["scratch"] = {name: str(kind) for name, kind in scratch.items()}
         phrases = Phrases(self.choices, self.words, self.manner, scratch, scratch)
@@ -80,7 +105,9 @@ class PassMaker:
 
     # Blocks
 
-    def block(self, phrases: Phrases, depth: int, rounds: int, policy: str | None, symmetric: bool) -> dict[str, Tree]:
+    def block(
+        self, phrases: Phrases, depth: int, rounds: int, policy: str | None, symmetric: bool
+    ) -> dict[str, Tree]:
         """A block; `rounds` says how often it may still be unrolled."""
         choices = self.choices
         tree: dict[str, Tree] = {}
@@ -100,7 +127,10 @@ class PassMaker:
             tree["let"] = lets
         header, inner, rounds_inside = self._header(phrases, rounds)
         if depth > 0 and choices.maybe(20):
-            body: Tree = [self.block(inner, depth - 1, rounds_inside, policy, symmetric) for _ in range(choices.whole(1, 2))]
+            body: Tree = [
+                self.block(inner, depth - 1, rounds_inside, policy, symmetric)
+                for _ in range(choices.whole(1, 2))
+            ]
         else:
             rules = self.moment(inner, policy, symmetric)
             body = rules[0] if len(rules) == 1 and choices.maybe(50) else [*rules]
@@ -141,7 +171,11 @@ class PassMaker:
         if kind.name == "int":
             return f"clamp({phrases.whole(2).text}, {kind.lo:g}, {kind.hi:g})"
         if kind.name == "real":
-            return f"({phrases.real(2).text} + 0.0 * {phrases.real(1).text})" if self.choices.maybe(10) else phrases.real(2).text
+            return (
+                f"({phrases.real(2).text} + 0.0 * {phrases.real(1).text})"
+                if self.choices.maybe(10)
+                else phrases.real(2).text
+            )
         if kind.name == "element":
             return phrases.element(1).text
         if kind.name == "direction":
@@ -161,12 +195,23 @@ class PassMaker:
                 "assign": (3, self._assign), "push": (1, self._push),
             }  # fmt: skip
             rows = [row for name, row in table.items() if name in forms]
-            found = [choices.weighted(rows)(phrases) for _ in range(choices.weighted([(3, 1), (3, 2), (2, 3), (1, 5)]))]
+            found = [
+                choices.weighted(rows)(phrases)
+                for _ in range(choices.weighted([(3, 1), (3, 2), (2, 3), (1, 5)]))
+            ]
             return [rule for rule in found if rule] or [self._fallback(phrases)]
         rules: list[str | None] = []
-        movers = [form for form in ("transform", "swap", "move") if form in forms and not (symmetric and form in ("swap", "move"))]
+        movers = [
+            form
+            for form in ("transform", "swap", "move")
+            if form in forms and not (symmetric and form in ("swap", "move"))
+        ]
         if movers and choices.maybe(80):
-            rules += {"transform": self._exclusive_transforms, "swap": self._guarded_swap, "move": self._lone_move}[choices.pick(movers)](phrases)
+            rules += {
+                "transform": self._exclusive_transforms,
+                "swap": self._guarded_swap,
+                "move": self._lone_move,
+            }[choices.pick(movers)](phrases)
         if "assign" in forms and (not rules or choices.maybe(40)):
             rules += [self._assign(phrases, steady=symmetric) for _ in range(choices.whole(1, 2))]
         if "push" in forms and choices.maybe(15):
@@ -203,7 +248,9 @@ class PassMaker:
 
     def _mover_place(self, phrases: Phrases) -> str:
         loops = phrases.sides()
-        return self.choices.pick(loops) if loops and self.choices.maybe(70) else self.choices.pick(MOVER_PLACES)
+        return (
+            self.choices.pick(loops) if loops and self.choices.maybe(70) else self.choices.pick(MOVER_PLACES)
+        )
 
     def _transform(self, phrases: Phrases) -> str:
         return f"{self._subject(phrases)} -> {phrases.element(1).text}{self._tail(phrases)}"
@@ -222,7 +269,9 @@ class PassMaker:
         return update and update + self._tail(phrases, "where", effects=False)
 
     def _push(self, phrases: Phrases) -> str | None:
-        vectors = [name for name, kind in {**self.words.fields, **phrases.scratch}.items() if kind.name == "vec2"]
+        vectors = [
+            name for name, kind in {**self.words.fields, **phrases.scratch}.items() if kind.name == "vec2"
+        ]
         if not vectors:
             return None
         amount = self.choices.weighted([(2, phrases.whole), (2, phrases.real)])(1).text
@@ -232,7 +281,11 @@ class PassMaker:
         """`field := value`, or `+=`, `-=`, here or at a neighbour. `steady`: the value is the same in every orientation."""
         choices = self.choices
         kinds = {**self.words.fields, **self.words.properties, **phrases.scratch}
-        targets = [name for name, kind in kinds.items() if kind.name != "chance" and (name not in self.assigned or kind.name in ("int", "real", "vec2"))]
+        targets = [
+            name
+            for name, kind in kinds.items()
+            if kind.name != "chance" and (name not in self.assigned or kind.name in ("int", "real", "vec2"))
+        ]
         if not targets:
             return None
         name = choices.pick(targets)
@@ -246,7 +299,9 @@ class PassMaker:
             return None
         if not effect:
             self.assigned.add(name)
-        if kind.name in ("int", "real") and kind.lo > kind.hi - 3:  # constants out of the range would be errors
+        if (
+            kind.name in ("int", "real") and kind.lo > kind.hi - 3
+        ):  # constants out of the range would be errors
             value = f"clamp({phrases.whole(2).text}, {kind.lo:g}, {kind.hi:g})"
         else:
             value = phrases.fitting(kind, choices.whole(0, 2))
@@ -259,7 +314,10 @@ class PassMaker:
         match choices.below(3):
             case 0:
                 target = choices.pick(elements)
-                return [f"{self._subject(phrases)} -> {target}{self._tail(phrases)}" for _ in range(choices.whole(1, 2))]
+                return [
+                    f"{self._subject(phrases)} -> {target}{self._tail(phrases)}"
+                    for _ in range(choices.whole(1, 2))
+                ]
             case 1:
                 subjects = choices.some(elements, 1, 3)
                 return [f"{subject} -> {choices.pick(elements)}{self._tail(phrases)}" for subject in subjects]

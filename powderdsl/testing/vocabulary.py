@@ -38,7 +38,9 @@ class Words:
 
     def of_kind(self, kind: str) -> list[str]:
         """Fields and properties of a kind."""
-        return [name for table in (self.fields, self.properties) for name, k in table.items() if k.name == kind]
+        return [
+            name for table in (self.fields, self.properties) for name, k in table.items() if k.name == kind
+        ]
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,10 @@ def declare(choices: Choices, manner: Manner) -> tuple[Words, dict[str, Tree]]:
     sections["fields"] = _fields(choices, words, manner)
     sections["streams"] = _streams(choices, words, manner)
     sections["kernels"] = _kernels(choices, words, manner)
-    sections["tags"] = {tag: "a tag" for tag in tags}
+    sections["tags"] = dict.fromkeys(tags, "a tag")
     sections["elements"] = {
-        name: _element(choices, words, identity, tags) for name, identity in zip(words.elements, words.ids, strict=True)
+        name: _element(choices, words, identity, tags)
+        for name, identity in zip(words.elements, words.ids, strict=True)
     }
     words.groups += tags
     sections["sets"] = _sets(choices, words)
@@ -93,7 +96,15 @@ def _params(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
     for i in range(choices.weighted([(3, 0), (3, 1), (2, 2), (1, 4)])):
         name = f"q{i}"
-        kind = choices.pick([CHANCE, integer(0, 7), FLAG, integer(-300, 300), *([Kind("real", -10, 10)] if manner.reals else [])])
+        kind = choices.pick(
+            [
+                CHANCE,
+                integer(0, 7),
+                FLAG,
+                integer(-300, 300),
+                *([Kind("real", -10, 10)] if manner.reals else []),
+            ]
+        )
         words.params[name] = kind
         value = _constant(choices, kind)
         inferred = kind == FLAG or value.endswith("%")
@@ -118,7 +129,10 @@ def _fields(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
     for i in range(choices.weighted([(3, 2), (2, 1), (3, 3), (2, 4), (1, 0), (1, 7)])):
         name = f"f{i}"
-        real, vector = (Kind(k, -b, b) for k, b in (("real", choices.pick([100, 1, 1000])), ("vec2", choices.pick([100, 2]))))
+        real, vector = (
+            Kind(k, -b, b)
+            for k, b in (("real", choices.pick([100, 1, 1000])), ("vec2", choices.pick([100, 2])))
+        )
         if choices.maybe(10):
             real = Kind("real", 0, 1)
         floats = [(3, real), (3, vector)] if manner.reals else []
@@ -130,9 +144,13 @@ def _fields(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
         elif kind.name != "vec2" and choices.maybe(40):
             entry["default"] = _constant(choices, kind)
         elif kind.name == "vec2" and choices.maybe(30):
-            entry["default"] = f"vector({choices.pick(['0', '1', '-0.5'])}, {choices.pick(['0', '-2', '0.25'])})"
+            entry["default"] = (
+                f"vector({choices.pick(['0', '1', '-0.5'])}, {choices.pick(['0', '-2', '0.25'])})"
+            )
         if entry["at"] == "element" and choices.maybe(40):
-            entry["of"] = choices.weighted([(3, choices.pick(words.elements)), (1, f"any but {choices.pick(words.elements)}")])
+            entry["of"] = choices.weighted(
+                [(3, choices.pick(words.elements)), (1, f"any but {choices.pick(words.elements)}")]
+            )
         if choices.maybe(20):
             entry["resets"] = "step"
         section[name] = entry
@@ -168,7 +186,11 @@ def _element(choices: Choices, words: Words, identity: int, tags: list[str]) -> 
         entry["tags"] = [*carried]
     for name, kind in words.properties.items():
         if choices.maybe(60):
-            alike = [param for param, k in words.params.items() if k.name == kind.name and kind.lo <= k.lo and k.hi <= kind.hi]
+            alike = [
+                param
+                for param, k in words.params.items()
+                if k.name == kind.name and kind.lo <= k.lo and k.hi <= kind.hi
+            ]
             entry[name] = choices.pick(alike) if alike and choices.maybe(30) else _constant(choices, kind)
     return entry
 
@@ -179,7 +201,14 @@ def _sets(choices: Choices, words: Words) -> dict[str, Tree]:
         known = [*words.elements, *words.groups]
         first, second = choices.pick(known), choices.pick(known)
         section[f"s{i}"] = choices.pick(
-            [f"({first}, {second})", f"any but {first}", f"{first} or {second}", f"any but ({first}, {second})", f"{first} and {second}", "any"]
+            [
+                f"({first}, {second})",
+                f"any but {first}",
+                f"{first} or {second}",
+                f"any but ({first}, {second})",
+                f"{first} and {second}",
+                "any",
+            ]
         )
         words.groups.append(f"s{i}")
     return section
@@ -201,6 +230,10 @@ def _constant(choices: Choices, kind: Kind) -> str:
             lo, hi = int(kind.lo), int(kind.hi)
             return str(choices.pick([min(max(0, lo), hi), lo, hi, choices.whole(lo, hi)]))
         case "real":
-            options = [text for text in ("0", "0.5", "1", "-1", "0.1", "-0.75", "9") if kind.lo <= float(text) <= kind.hi]
+            options = [
+                text
+                for text in ("0", "0.5", "1", "-1", "0.1", "-0.75", "9")
+                if kind.lo <= float(text) <= kind.hi
+            ]
             return choices.pick(options)
     return choices.pick(["right", "above", "left", "below.left"])

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.diagnostics.render import render_json, render_short, render_text
 from powderdsl.model.check import check
-from powderdsl.model.packs import PackDecl, RulesetDecl, read_file
+from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.packs import read_file
 from powderdsl.model.types import Ruleset
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -4,8 +4,6 @@ Three tables: whole files, sections of a small pack, and single rules. A row is 
 the text under the caret (its first line; None where it does not matter, or there is none).
 """
 
-# ruff: noqa: E501 - a row of a table is a line
-
 from __future__ import annotations
 
 import os
