@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from numbers import Integral
+from operator import index
 from typing import Any
 
 import torch
@@ -450,9 +450,13 @@ class Simulator:
 
 def _whole(value: Any, name: str) -> int:
     """A whole number of 0 or more, Python's or NumPy's."""
-    if not isinstance(value, Integral) or type(value) is bool or int(value) < 0:
+    try:
+        number = index(value)
+    except TypeError:
+        number = -1
+    if number < 0 or isinstance(value, bool):
         raise ValueError(f"{name} must be a whole number of 0 or more, found {value!r}")
-    return int(value)
+    return number
 
 
 def compile(
