@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import Node, PassGraph, walk
+from powderdsl.ir.ops import Node, PassGraph
 from powderdsl.ir.rewrite import Rewrite, rebuild, rewrite_pass
 
 MAX_VALUES = 16
@@ -81,22 +81,26 @@ def _shift_of_table(node: Node, build: Builder) -> Node | None:
 RESOLVE: tuple[Rewrite, ...] = (_shift_of_table, _table_of_constant, _table_compare)
 
 
+_LOGIC = ("and", "or", "not", "eq", "lt", "le")
+"""What a specialised condition is looked through. Not shifts: what is known here says nothing of neighbours."""
+
+
 def specialise(pass_: PassGraph) -> PassGraph:
     """In `x in {3} and P(table(x))`, the table has one value: P becomes simpler. Rules of loops look like this."""
-    return rewrite_pass(pass_, (_specialise,))
+    tables: dict[Node, frozenset[Node]] = {}
+    return rewrite_pass(pass_, (lambda node, build: _specialise(node, build, tables),))
 
 
-def _specialise(node: Node, build: Builder) -> Node | None:
-    if node.op != "and":
+def _specialise(node: Node, build: Builder, tables: dict[Node, frozenset[Node]]) -> Node | None:
+    if node.op != "and" or not _tables(node, tables):
         return None
     parts = _conjuncts(node)
-    known = {id(p.args[0]): p.attr for p in parts if p.op == "in_set"}
-    if not known:
-        return None
+    known = {p.args[0]: p.attr for p in parts if p.op == "in_set"}
     changed = False
+    done: dict[Node, Node] = {}
     result = []
     for part in parts:
-        new = _substitute(part, known, build) if part.op != "in_set" else part
+        new = _substitute(part, known, build, tables, done) if part.op != "in_set" else part
         changed = changed or new is not part
         result.append(new)
     if not changed:
@@ -107,24 +111,41 @@ def _specialise(node: Node, build: Builder) -> Node | None:
     return joined
 
 
+def _tables(node: Node, found: dict[Node, frozenset[Node]]) -> frozenset[Node]:
+    """The values whose tables a condition asks for. Graphs share nodes, so answers are kept in `found`."""
+    if node not in found:
+        if node.op == "table":
+            found[node] = frozenset(node.args)
+        else:
+            parts = [_tables(arg, found) for arg in node.args] if node.op in _LOGIC else []
+            found[node] = frozenset[Node]().union(*parts)
+    return found[node]
+
+
 def _conjuncts(node: Node) -> list[Node]:
     if node.op != "and":
         return [node]
     return [part for arg in node.args for part in _conjuncts(arg)]
 
 
-def _substitute(node: Node, known: dict[int, object], build: Builder) -> Node:
-    """The condition with tables of known elements replaced; only looks through logic and comparisons."""
-    if node.op == "table" and id(node.args[0]) in known:
-        members = known[id(node.args[0])]
+def _substitute(
+    node: Node,
+    known: dict[Node, object],
+    build: Builder,
+    tables: dict[Node, frozenset[Node]],
+    done: dict[Node, Node],
+) -> Node:
+    """The condition with tables of known elements replaced."""
+    if node.op == "table" and node.args[0] in known:
+        members = known[node.args[0]]
         assert isinstance(members, frozenset)
         assert isinstance(node.attr, tuple)
         values = {node.attr[i] for i in members if i < len(node.attr)}
         return build.whole(values.pop()) if len(values) == 1 else node
-    # Not through shifts: what is known of this cell says nothing of its neighbours.
-    if node.op not in ("and", "or", "not", "eq", "lt", "le") or not any(n.op == "table" for n in walk(node)):
+    if node.op not in _LOGIC or _tables(node, tables).isdisjoint(known):
         return node
-    args = tuple(_substitute(arg, known, build) for arg in node.args)
-    return (
-        rebuild(node, args, build) if any(a is not b for a, b in zip(args, node.args, strict=True)) else node
-    )
+    if node not in done:
+        args = tuple(_substitute(arg, known, build, tables, done) for arg in node.args)
+        same = all(a is b for a, b in zip(args, node.args, strict=True))
+        done[node] = node if same else rebuild(node, args, build)
+    return done[node]

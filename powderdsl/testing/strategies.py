@@ -1,0 +1,55 @@
+"""Hypothesis strategies for rulesets and start worlds. What they find, Hypothesis shrinks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from hypothesis import reject
+from hypothesis import strategies as st
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.model.types import Ruleset
+from powderdsl.testing.cases import Start, load_text, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.testing.rulemaker import ruleset_text
+from powderdsl.testing.vocabulary import Manner
+
+T = TypeVar("T")
+
+
+def worlds(
+    ruleset: Ruleset, max_batch: int = 3, max_side: int = 65, shape: tuple[int, int, int] | None = None
+) -> st.SearchStrategy[Start]:
+    """Start worlds of a ruleset: any ids, fields and parameters it allows, in odd shapes.
+
+    Args:
+        max_batch, max_side: bounds of worlds, rows and columns.
+        shape: (worlds, rows, columns), if it must be this one.
+    """
+    return _chosen(lambda choices: random_start(ruleset, choices, shape, max_batch, max_side))
+
+
+def rulesets(manner: Manner | None = None) -> st.SearchStrategy[Ruleset]:
+    """Random rulesets, made as text and read by the whole front end. `manner` leaves things out.
+
+    About one text in seventy is refused by the static checks, and passed over.
+    """
+
+    def make(choices: Choices) -> Ruleset:
+        try:
+            return load_text(ruleset_text(choices, manner or Manner()))
+        except CompileError:
+            reject()
+
+    return _chosen(make)
+
+
+def _chosen(make: Callable[[Choices], T]) -> st.SearchStrategy[T]:
+    """What a function makes of choices that Hypothesis takes: the plain option first, so that it shrinks to it."""
+
+    @st.composite
+    def strategy(draw: st.DrawFn) -> T:
+        return make(Choices(lambda count: draw(st.integers(0, count - 1)) if count > 1 else 0))
+
+    return strategy()

@@ -1,0 +1,114 @@
+"""Circuits against Python's whole numbers: every value of small ranges, by evaluating the gates."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+
+from powderdsl.ir.build import Builder
+from powderdsl.ir.gates import Bits, Gates, width
+from powderdsl.ir.ops import FLAG, Node
+
+RANGES = [(0, 1), (0, 5), (-3, 3), (-8, 7), (-2, 9), (3, 12)]
+
+
+def value_of(node: Node, inputs: dict[str, bool], known: dict[int, bool] | None = None) -> bool:
+    known = {} if known is None else known
+    if id(node) not in known:
+        known[id(node)] = evaluate(node, [value_of(arg, inputs, known) for arg in node.args], inputs)
+    return known[id(node)]
+
+
+def evaluate(node: Node, args: list[bool], inputs: dict[str, bool]) -> bool:
+    match node.op:
+        case "input":
+            return inputs[node.attr]
+        case "const":
+            return bool(node.attr)
+        case "not":
+            return not args[0]
+        case "and":
+            return args[0] and args[1]
+        case "or":
+            return args[0] or args[1]
+        case "xor":
+            return args[0] != args[1]
+        case "select":
+            return args[1] if args[0] else args[2]
+    raise AssertionError(node.op)
+
+
+def number_of(bits: Bits, inputs: dict[str, bool]) -> int:
+    known: dict[int, bool] = {}
+    total = sum(value_of(plane, inputs, known) << i for i, plane in enumerate(bits.planes))
+    if bits.signed and value_of(bits.planes[-1], inputs, known):
+        total -= 1 << len(bits.planes)
+    return total
+
+
+def variable(name: str, lo: int, hi: int, build: Builder) -> Bits:
+    count, signed = width(lo, hi)
+    return Bits(tuple(build.input(f"{name}{i}", FLAG) for i in range(count)), signed)
+
+
+def assignment(name: str, value: int, bits: Bits) -> dict[str, bool]:
+    return {f"{name}{i}": bool(value >> i & 1) for i in range(len(bits.planes))}
+
+
+@pytest.mark.parametrize("first", RANGES)
+@pytest.mark.parametrize("second", RANGES)
+def test_arithmetic(first: tuple[int, int], second: tuple[int, int]) -> None:
+    build = Builder()
+    gates = Gates(build)
+    a, b = variable("a", *first, build), variable("b", *second, build)
+    lo, hi = first[0] + second[0], first[1] + second[1]
+    total = gates.add(a, b, lo, hi)
+    difference = gates.sub(a, b, first[0] - second[1], first[1] - second[0])
+    less, same = gates.lt(a, b), gates.eq(a, b)
+    for x, y in product(range(first[0], first[1] + 1), range(second[0], second[1] + 1)):
+        inputs = assignment("a", x, a) | assignment("b", y, b)
+        assert number_of(total, inputs) == x + y
+        assert number_of(difference, inputs) == x - y
+        assert value_of(less, inputs) == (x < y)
+        assert value_of(same, inputs) == (x == y)
+
+
+@pytest.mark.parametrize("bounds", RANGES)
+def test_truth_tables(bounds: tuple[int, int]) -> None:
+    lo, hi = bounds
+    build = Builder()
+    gates = Gates(build)
+    a = variable("a", lo, hi, build)
+    count = len(a.planes)
+    every = 1 << (hi - lo + 1)
+    for members in range(0, every, max(1, every // 97)):
+        table: list[bool | None] = [None] * (1 << count)
+        for number in range(lo, hi + 1):
+            table[number & ((1 << count) - 1)] = bool(members >> (number - lo) & 1)
+        node = gates.truth_table(a.planes, table)
+        for number in range(lo, hi + 1):
+            assert value_of(node, assignment("a", number, a)) == bool(members >> (number - lo) & 1)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 9])
+def test_sums_of_flags(size: int) -> None:
+    build = Builder()
+    gates = Gates(build)
+    flags = [build.input(f"f{i}", FLAG) for i in range(size)]
+    planes = gates.total([list(flags)], size.bit_length())
+    for values in product((False, True), repeat=size):
+        inputs = {f"f{i}": v for i, v in enumerate(values)}
+        assert number_of(Bits(planes), inputs) == sum(values)
+
+
+def test_gates_fold() -> None:
+    build = Builder()
+    gates = Gates(build)
+    a, b = build.input("a", FLAG), build.input("b", FLAG)
+    assert gates.and_(a, gates.not_(a)) is gates.no
+    assert gates.or_(a, gates.not_(a)) is gates.yes
+    assert gates.xor(a, a) is gates.no
+    assert gates.not_(gates.not_(a)) is a
+    assert gates.mux(a, b, b) is b
+    assert gates.and_(a, b) is gates.and_(b, a)

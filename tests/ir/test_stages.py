@@ -1,0 +1,166 @@
+"""The IR of small packs after lowering and after every stage, as golden text; and the verifier, which must fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from powderdsl.compiler import load
+from powderdsl.ir.bits import lower_bits
+from powderdsl.ir.build import Builder
+from powderdsl.ir.lower import lower_ruleset
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Program, Step, nodes_of, whole
+from powderdsl.ir.rewrite import RewriteLoop, rewrite_pass
+from powderdsl.ir.text import print_program
+from powderdsl.ir.verify import InvalidIR, verify
+from powderdsl.passes import PIPELINE, run_passes
+
+GOLDEN = Path(__file__).parent / "golden"
+
+FALL = """\
+pack: fall
+properties: {weight: 0..3}
+elements:
+  air: {id: 0, color: "#FFFFFF", weight: 1}
+  grain: {id: 1, color: "#C0A000", weight: 3}
+  smoke: {id: 2, color: "#777777", weight: 0}
+passes:
+  sink:
+    for w in 0..3:
+      - swap below if weight == w > below.weight
+"""
+
+GLOW = """\
+pack: glow
+streams: [dice]
+params: {dim: 25%}
+elements:
+  dark: {id: 0, color: "#000000"}
+  lamp: {id: 1, color: "#FFFF00"}
+fields:
+  charge: {type: 0..3, at: element, of: lamp}
+  heat: {type: real(0..10), at: place}
+passes:
+  shine:
+    let: {near: count(lamp in plus) >= 2}
+    do:
+      - dark -> lamp if near and dice < dim, then charge := 3
+      - charge -= 1 where lamp and charge > 0
+    then:
+      - heat := heat / 2 + sum(heat in box) / 18 + (1 if lamp else 0)
+"""
+
+PACKS = {"fall": FALL, "glow": GLOW}
+
+
+def program_of(name: str, folder: Path) -> Program:
+    path = folder / f"{name}.yaml"
+    path.write_text(PACKS[name], encoding="utf-8")
+    program = lower_ruleset(load(path))
+
+    def here(node: Node) -> None:
+        """Golden texts do not hang on where the test put its file."""
+        object.__setattr__(node, "places", ())
+
+    for pass_ in program.passes:
+        for node in nodes_of(pass_):
+            here(node)
+    passes = tuple(replace(p, moments=tuple(replace(m, place="") for m in p.moments)) for p in program.passes)
+    return replace(program, passes=passes)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("name", list(PACKS))
+@pytest.mark.parametrize("stage", ["lower", *(stage.name for stage in PIPELINE), "bits"])
+def test_golden_ir(name: str, stage: str, tmp_path: Path, golden) -> None:  # type: ignore[no-untyped-def]
+    program = program_of(name, tmp_path)
+    if stage == "bits":
+        program = lower_bits(run_passes(program))
+        verify(program, "bits")
+    elif stage != "lower":
+        program = run_passes(program, until=stage)
+    golden(GOLDEN / f"{name}.{stage}.ir", print_program(program))
+
+
+def test_densities_become_sets_of_elements(tmp_path: Path) -> None:
+    """After `resolve` no property is looked up any more, and moments that cannot happen are gone."""
+    before = program_of("fall", tmp_path)
+    after = run_passes(before)
+    assert "table" in print_program(before)
+    assert "table" not in print_program(after)
+    assert len(before.passes[0].moments) == 4
+    assert len(after.passes[0].moments) == 2  # grains sink through air and smoke, air through smoke
+
+
+def test_planes_hold_no_whole_numbers(tmp_path: Path) -> None:
+    for name in PACKS:
+        planes = lower_bits(run_passes(program_of(name, tmp_path)))
+        assert {node.type.name for p in planes.passes for node in nodes_of(p)} <= {"flag", "real"}
+
+
+def a_pass(*outputs: tuple[str, Node]) -> PassGraph:
+    return PassGraph("p", "pack", (Step("", "", outputs, ()),), outputs)
+
+
+def a_program(*outputs: tuple[str, Node]) -> Program:
+    from powderdsl.ir.ops import SlotType
+
+    slots = (
+        SlotType("f", FLAG, 0, False),
+        SlotType("n", whole(0, 3), 0, False),
+        SlotType("r", REAL, 0.0, False),
+    )
+    return Program("broken", slots, (("q", "chance"),), (("s", 7, 16),), (a_pass(*outputs),))
+
+
+BUILD = Builder()
+F, N, R = BUILD.input("f", FLAG), BUILD.input("n", whole(0, 3)), BUILD.input("r", REAL)
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        (("f", Node("nand", FLAG, (F, F), None, 900)), "unknown operation"),
+        (("f", Node("and", FLAG, (F,), None, 901)), "has 1 arguments"),
+        (("f", Node("not", FLAG, (N,), None, 902)), "takes flag"),
+        (("f", Node("eq", FLAG, (N, R), None, 903)), "mixes"),
+        (("f", Node("shift", FLAG, (F,), None, 904)), "attribute"),
+        (("n", Node("add", REAL, (N, N), None, 905)), "gives real"),
+        (("n", BUILD.arithmetic("add", N, N)), "gets 0..6"),
+        (("f", N), "gets a 0..3"),
+        (("g", F), "unknown slot g"),
+        (("f", BUILD.input("h", FLAG)), "unknown slot h"),
+        (("f", BUILD.make("below", FLAG, N, attr=("t", 16))), "unknown stream"),
+        (("r", BUILD.make("param", REAL, attr=("z", "value"))), "unknown parameter"),
+        (("f", Node("and", FLAG, (Node("not", FLAG, (F,), None, 906), Node("not", FLAG, (F,), None, 907)), None, 908)), "interned"),
+    ],
+)  # fmt: skip
+def test_the_verifier_refuses(output: tuple[str, Node], message: str) -> None:
+    with pytest.raises(InvalidIR, match=message):
+        verify(a_program(output), "a test")
+
+
+def test_the_verifier_accepts() -> None:
+    verify(a_program(("f", BUILD.not_(F)), ("n", N), ("r", R)), "a test")
+
+
+def test_rules_that_undo_each_other_are_found() -> None:
+    def there(node: Node, build: Builder) -> Node | None:
+        return build.or_(*node.args) if node.op == "and" else None
+
+    def back(node: Node, build: Builder) -> Node | None:
+        return build.and_(*node.args) if node.op == "or" else None
+
+    build = Builder()
+    a, b = build.input("f", FLAG), build.input("g", FLAG)
+    with pytest.raises((RewriteLoop, RecursionError)):
+        rewrite_pass(a_pass(("f", build.and_(a, b))), (there, back))
+
+
+def test_every_operation_has_a_row_and_a_reason() -> None:
+    assert all(op.name == name for name, op in OPS.items())
+    assert all(
+        op.attr for op in OPS.values() if op.name in ("input", "const", "shift", "count", "mod", "swap")
+    )
