@@ -9,30 +9,17 @@ import torch
 from torch import Tensor
 
 from powderdsl import reference
+from powderdsl.backends.torch_job import Job
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.ir.ops import Program
 from powderdsl.model.types import Ruleset
-
-Clock = tuple[Tensor, Tensor, Tensor]
-"""Seed, world index and step of each world: int64 [B]."""
 
 
 class Runnable(Protocol):
     """A ruleset made executable."""
 
-    def run(
-        self,
-        state: Mapping[str, Tensor],
-        clock: Clock,
-        steps: int,
-        params: Mapping[str, Tensor],
-        draws: Mapping[str, Tensor],
-        passes: frozenset[str] | None,
-    ) -> Mapping[str, Tensor]:
-        """The state `steps` later; the argument is not changed.
-
-        `params` are float64 [B]; `draws` int64 [B, H, W] below 2^bits replace a stream's numbers.
-        """
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
         ...
 
 
@@ -43,26 +30,20 @@ class ReferenceProgram:
         self.ruleset = ruleset
         self._bits = {stream.name: stream.bits for stream in ruleset.streams}
 
-    def run(
-        self,
-        state: Mapping[str, Tensor],
-        clock: Clock,
-        steps: int,
-        params: Mapping[str, Tensor],
-        draws: Mapping[str, Tensor],
-        passes: frozenset[str] | None,
-    ) -> dict[str, Tensor]:
-        device = state["element"].device
-        seed, index, start = (part.cpu().numpy() for part in clock)
-        arrays = {name: value.cpu().numpy() for name, value in state.items()}
-        numbers = {name: value.cpu().numpy() for name, value in params.items()}
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        device = job.state["element"].device
+        seed, index, start = (part.cpu().numpy() for part in job.clock)
+        arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
+        numbers = {name: value.cpu().numpy() for name, value in job.params.items()}
         kinds = {param.name: param.kind.name for param in self.ruleset.params}
         dtypes = {"int": "int64", "flag": "bool", "real": "float32", "chance": "float64"}
         numbers = {name: value.astype(dtypes[kinds[name]]) for name, value in numbers.items()}
-        given = {name: (value.cpu().numpy() + 0.5) / 2.0 ** self._bits[name] for name, value in draws.items()}
-        for i in range(steps):
+        given = {
+            name: (value.cpu().numpy() + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()
+        }
+        for i in range(job.steps):
             at = reference.Clock(seed, index, start + i)
-            arrays = reference.step(self.ruleset, arrays, at, numbers, passes=passes, draws=given)
+            arrays = reference.step(self.ruleset, arrays, at, numbers, passes=job.passes, draws=given)
         return {name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()}
 
 
@@ -94,18 +75,10 @@ class TorchProgram:
         self._cells: Runnable = DenseProgram(program, device)
         self._planes: Runnable | None = None
 
-    def run(
-        self,
-        state: Mapping[str, Tensor],
-        clock: Clock,
-        steps: int,
-        params: Mapping[str, Tensor],
-        draws: Mapping[str, Tensor],
-        passes: frozenset[str] | None,
-    ) -> Mapping[str, Tensor]:
-        """The state `steps` later."""
-        big = state["element"].numel() >= PLANES_FROM
-        return (self.planes() if big else self._cells).run(state, clock, steps, params, draws, passes)
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        big = job.state["element"].numel() >= PLANES_FROM
+        return (self.planes() if big else self._cells).run(job)
 
     def planes(self) -> Runnable:
         """The program on packed words, made when first needed; on cells if planes cannot carry it."""
@@ -126,18 +99,10 @@ class CompiledProgram:
     def __init__(self, native: Runnable, rest: Runnable):
         self._native, self._rest = native, rest
 
-    def run(
-        self,
-        state: Mapping[str, Tensor],
-        clock: Clock,
-        steps: int,
-        params: Mapping[str, Tensor],
-        draws: Mapping[str, Tensor],
-        passes: frozenset[str] | None,
-    ) -> Mapping[str, Tensor]:
-        """The state `steps` later."""
-        runnable = self._rest if draws or passes is not None else self._native
-        return runnable.run(state, clock, steps, params, draws, passes)
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        runnable = self._rest if job.draws or job.passes is not None else self._native
+        return runnable.run(job)
 
 
 def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: int = 1) -> Runnable:

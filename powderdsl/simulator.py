@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.backends.torch_job import Job
 from powderdsl.compiler import BACKENDS, load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.state import SNAP, Slot, slots
@@ -393,14 +394,9 @@ class Simulator:
             raise KeyError(f"no pass `{unknown[0]}`; {'; '.join(suggest(unknown[0], self.passes, 'passes'))}")
         draws = self._draws(random or {}, world)
         chosen = None if passes is None else frozenset(passes)
-        state = self._program.run(
-            world.state,
-            (world.seed, world.index, world.step),
-            steps,
-            self._params(params or {}, len(world)),
-            draws,
-            chosen,
-        )
+        clock = (world.seed, world.index, world.step)
+        job = Job(world.state, clock, steps, self._params(params or {}, len(world)), draws, chosen)
+        state = self._program.run(job)
         return replace(world, sim=self, state=state, step=world.step + steps)
 
     def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Tensor]:

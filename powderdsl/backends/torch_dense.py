@@ -16,11 +16,11 @@ from torch import Tensor
 
 from powderdsl.backends import torch_random
 from powderdsl.backends.dense_source import pass_source
+from powderdsl.backends.torch_job import Job
 from powderdsl.ir.ops import Program
 
 SNAP = 2.0**-20
 
-Clock = tuple[Tensor, Tensor, Tensor]
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
 
 _DTYPES = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
@@ -180,25 +180,17 @@ class DenseProgram:
             (p.name, compiled(*pass_source(p, i), device)) for i, p in enumerate(program.passes)
         ]
 
-    def run(
-        self,
-        state: Mapping[str, Tensor],
-        clock: Clock,
-        steps: int,
-        params: Mapping[str, Tensor],
-        draws: Mapping[str, Tensor],
-        passes: frozenset[str] | None,
-    ) -> dict[str, Tensor]:
-        """The state `steps` later, in storage dtypes; no host sync, the argument is not changed."""
-        seed, index, start = clock
-        batch, height, width = state["element"].shape
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later in storage dtypes; no host sync."""
+        seed, index, start = job.clock
+        batch, height, width = job.state["element"].shape
         kernels = Kernels(
-            (batch, height, width), self.device, params, self._streams, draws,
+            (batch, height, width), self.device, job.params, self._streams, job.draws,
             torch_random.base_keys(seed, index), self._idents, start,
         )  # fmt: skip
-        planes = self._unpack(state)
+        planes = self._unpack(job.state)
         with torch.no_grad():
-            for i in range(steps):
+            for i in range(job.steps):
                 kernels.begin(start + i)
                 for name, slot in self._slots.items():
                     if slot.resets:
@@ -206,9 +198,9 @@ class DenseProgram:
                             kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
                         )
                 for name, function in self._functions:
-                    if passes is None or name in passes:
+                    if job.passes is None or name in job.passes:
                         planes.update(function(kernels, planes))
-        return self._pack(planes, state, kernels)
+        return self._pack(planes, job.state, kernels)
 
     def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """State slots as planes in working dtypes: vectors split, whole numbers widened."""

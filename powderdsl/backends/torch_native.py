@@ -11,7 +11,8 @@ from torch import Tensor
 
 from powderdsl.backends.native_build import build, load_library
 from powderdsl.backends.native_source import native_source
-from powderdsl.backends.torch_dense import Clock, Kernels
+from powderdsl.backends.torch_dense import Kernels
+from powderdsl.backends.torch_job import Job
 from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import Program, SlotType
 
@@ -57,30 +58,22 @@ class NativeProgram:
         self._kinds = dict(program.params)
         self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
 
-    def run(
-        self,
-        state: Mapping[str, Tensor],
-        clock: Clock,
-        steps: int,
-        params: Mapping[str, Tensor],
-        draws: Mapping[str, Tensor],
-        passes: frozenset[str] | None,
-    ) -> Mapping[str, Tensor]:
-        """The state `steps` later. Given draws and chosen passes are for other backends."""
-        assert not draws
-        assert passes is None
-        seed, index, start = (part.contiguous() for part in clock)
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later. Given draws and chosen passes are for other backends."""
+        assert not job.draws
+        assert job.passes is None
+        seed, index, start = (part.contiguous() for part in job.clock)
         batch = len(seed)
-        if isinstance(state, PackedState) and state.program is self:
-            handle = self.library.pd_copy(state.handle)
-            like = state.like
+        if isinstance(job.state, PackedState) and job.state.program is self:
+            handle = self.library.pd_copy(job.state.handle)
+            like = job.state.like
         else:
-            handle, like = self._pack(state)
-        planes, reals = self._parameters(params, batch)
+            handle, like = self._pack(job.state)
+        planes, reals = self._parameters(job.params, batch)
         packed = PackedState(self, handle, like)
         self.library.pd_run(
             handle,
-            steps,
+            job.steps,
             self.threads,
             _address(seed),
             _address(index),

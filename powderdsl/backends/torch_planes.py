@@ -13,7 +13,8 @@ from torch import Tensor
 
 from powderdsl.backends import torch_random, torch_words
 from powderdsl.backends.planes_source import planes_pass_source
-from powderdsl.backends.torch_dense import Clock, Kernels, PassFunction, compiled
+from powderdsl.backends.torch_dense import Kernels, PassFunction, compiled
+from powderdsl.backends.torch_job import Job
 from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import Program, SlotType
 
@@ -202,32 +203,24 @@ class PlanesProgram:
             (p.name, compiled(*planes_pass_source(p, i), device)) for i, p in enumerate(planes.passes)
         ]
 
-    def run(
-        self,
-        state: Mapping[str, Tensor],
-        clock: Clock,
-        steps: int,
-        params: Mapping[str, Tensor],
-        draws: Mapping[str, Tensor],
-        passes: frozenset[str] | None,
-    ) -> dict[str, Tensor]:
-        """The state `steps` later, in storage dtypes; no host sync, the argument is not changed."""
-        seed, index, start = clock
-        batch, height, width = state["element"].shape
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later in storage dtypes; no host sync."""
+        seed, index, start = job.clock
+        batch, height, width = job.state["element"].shape
         dense = Kernels(
-            (batch, height, width), self.device, params, self._streams, draws,
+            (batch, height, width), self.device, job.params, self._streams, job.draws,
             torch_random.base_keys(seed, index), self._idents, start, self._flags,
         )  # fmt: skip
         kernels = PlaneKernels(dense)
-        planes = self._unpack(state)
+        planes = self._unpack(job.state)
         with torch.no_grad():
-            for i in range(steps):
+            for i in range(job.steps):
                 kernels.begin(start + i)
                 self._reset(planes, kernels)
                 for name, function in self._functions:
-                    if passes is None or name in passes:
+                    if job.passes is None or name in job.passes:
                         planes.update(function(kernels, planes))
-        return self._pack(planes, state, kernels)
+        return self._pack(planes, job.state, kernels)
 
     def _reset(self, planes: dict[str, Tensor], kernels: PlaneKernels) -> None:
         for name, slot in self._defaults.items():

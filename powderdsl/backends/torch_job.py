@@ -1,0 +1,27 @@
+"""What a backend is asked to do: the one argument of every program's `run`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from torch import Tensor
+
+Clock = tuple[Tensor, Tensor, Tensor]
+"""Seed, world index and step of each world: int64 [B]."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Steps of a batch of worlds.
+
+    `state` has a tensor a slot, in storage dtypes, and is not changed. `params` are float64 [B]; `draws`, int64
+    [B, H, W] below 2^bits, stand in for a stream's own numbers; `passes` names those that run, None all of them.
+    """
+
+    state: Mapping[str, Tensor]
+    clock: Clock
+    steps: int
+    params: Mapping[str, Tensor]
+    draws: Mapping[str, Tensor]
+    passes: frozenset[str] | None
