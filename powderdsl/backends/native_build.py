@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-import platformdirs
+from powderdsl.user_cache import cache_folder
 
 FLAGS = (
     "-std=c++17", "-O2", "-march=native", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math",
@@ -36,21 +36,6 @@ class Compiler:
 
     command: tuple[str, ...]
     version: str
-
-
-def cache_folder() -> Path:
-    """The user's private folder of compiled libraries: mode 0700, since what lies there is executed.
-
-    Raises:
-        OSError: it cannot be made, or belongs to somebody else.
-    """
-    folder = Path(platformdirs.user_cache_dir("powderdsl")) / "native"
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    if hasattr(os, "getuid"):
-        if folder.stat().st_uid != os.getuid():
-            raise PermissionError(f"{folder} belongs to another user")
-        folder.chmod(0o700)
-    return folder
 
 
 @lru_cache(maxsize=1)
@@ -103,7 +88,7 @@ def build(source: str) -> Path:
     """
     compiler = find_compiler()
     try:
-        folder = cache_folder()
+        folder = cache_folder("native")
     except OSError as error:
         raise NoCompiler(f"no cache folder: {error}") from None
     target = folder / f"{cache_key(source, compiler)}.so"
@@ -167,13 +152,13 @@ class CachedLibrary:
 
 def cached_libraries() -> list[CachedLibrary]:
     """What lies in the cache, the last used first."""
-    found = [CachedLibrary(p.stem, p.stat().st_size, p.stat().st_mtime) for p in cache_folder().glob("*.so")]
+    found = [CachedLibrary(p.stem, p.stat().st_size, p.stat().st_mtime) for p in cache_folder("native").glob("*.so")]
     return sorted(found, key=lambda entry: -entry.used)
 
 
 def clear_cache() -> int:
     """Remove all compiled libraries and what killed builds left behind; returns how many libraries went."""
-    folder = cache_folder()
+    folder = cache_folder("native")
     libraries = list(folder.glob("*.so"))
     for path in libraries:
         path.unlink(missing_ok=True)

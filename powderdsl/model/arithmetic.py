@@ -138,7 +138,7 @@ def _compare_draw(
         other = Expr("const", kind, value=other.value, span=span)
         _check_resolution(typer, draw, other, place)
     if other.kind.name == "real":
-        draw = Expr("to_real", REAL, (draw,), span=span)
+        draw = typer.real(draw, span)
     elif other.kind.name not in ("chance", "number", "int"):
         raise typer.wrong(
             other, "a chance to compare the draw with", place, "such as `5%`, a parameter or a property"

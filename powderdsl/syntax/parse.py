@@ -6,6 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from lark import Lark, Token, Tree
+from lark import __version__ as lark_version
 from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
 from lark.utils import TextSlice
 
@@ -13,6 +14,7 @@ from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.hints import character_help, expected_words, token_help, was_cut
 from powderdsl.syntax.yaml_tree import Scalar
+from powderdsl.user_cache import cache_folder
 
 MAX_LENGTH = 2000
 MAX_DEPTH = 48
@@ -21,14 +23,20 @@ STARTS = ("rule", "expression", "header")
 
 @lru_cache(maxsize=1)
 def parser() -> Lark:
-    """The one parser of the line language."""
+    """The one parser of the line language. Its tables are kept in the user's cache: making them takes 0.1 s."""
+    grammar = Path(__file__).with_name("grammar.lark").read_text(encoding="utf-8")
+    try:
+        kept: str | bool = str(cache_folder("syntax") / f"grammar-{lark_version}.lark")
+    except (OSError, RuntimeError):  # no home folder, or one that cannot be written
+        kept = False
     return Lark(
-        Path(__file__).with_name("grammar.lark").read_text(encoding="utf-8"),
+        grammar,
         parser="lalr",
         lexer="basic",
         start=list(STARTS),
         propagate_positions=True,
         maybe_placeholders=False,
+        cache=kept,
     )
 
 
