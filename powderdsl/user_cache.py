@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import sys
+import platform
 from pathlib import Path
 
 
@@ -24,7 +24,7 @@ def cache_folder(name: str) -> Path:
 
 def _root() -> Path:
     """Where caches of this user live."""
-    if sys.platform == "linux":  # what platformdirs says too, without the time its import takes
+    if platform.system() == "Linux":  # what platformdirs says too, without the time its import takes
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     import platformdirs
 

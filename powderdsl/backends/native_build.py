@@ -152,7 +152,10 @@ class CachedLibrary:
 
 def cached_libraries() -> list[CachedLibrary]:
     """What lies in the cache, the last used first."""
-    found = [CachedLibrary(p.stem, p.stat().st_size, p.stat().st_mtime) for p in cache_folder("native").glob("*.so")]
+    found = [
+        CachedLibrary(p.stem, p.stat().st_size, p.stat().st_mtime)
+        for p in cache_folder("native").glob("*.so")
+    ]
     return sorted(found, key=lambda entry: -entry.used)
 
 

@@ -88,7 +88,9 @@ class _PassLowering:
             self.slots[item.name] = slot
             type = plane_type(item.kind, self.ruleset.slots)
             for name in plane_names(slot):
-                self.state[name] = build.const(0 if slot.planes == 2 else item.default, type)
+                # The nearest number to zero: the same in both parts of a vector.
+                default = item.default[0] if isinstance(item.default, tuple) else item.default
+                self.state[name] = build.const(default, type)
         steps = tuple(self._moment(moment, pass_) for moment in pass_.moments)
         outputs = []
         for name, type in self.types.items():

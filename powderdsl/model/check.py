@@ -24,6 +24,7 @@ from powderdsl.model.symbols import (
     field_from,
     number_value,
     read_kind,
+    settled,
 )
 from powderdsl.model.types import CHANCE, FLAG, Element, Kind, Param, Property, Ruleset, Stream, Value
 from powderdsl.syntax.ast import Syntax
@@ -237,6 +238,14 @@ def _values(
         except (Poisoned, Asleep):
             return default_of(prop.kind)
         if expr.op == "param":
+            if (
+                expr.kind.name != prop.kind.name
+                or not prop.kind.lo <= expr.kind.lo <= expr.kind.hi <= prop.kind.hi
+            ):
+                typer.fail(
+                    "PD402", f"the parameter may leave {prop.kind}", syntax.span, f"it is {expr.kind}",
+                    (f"declare it as {prop.kind}",),
+                )  # fmt: skip
             return str(expr.value)
         if expr.op != "const":
             typer.fail("PD405", "expected a constant or a parameter", syntax.span, "depends on the world")
@@ -263,7 +272,9 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
                 raise typer.fail(
                     "PD401", "a field cannot be a chance", decl.type.span, helps=("use `real(0..1)`",)
                 )
-            default = _constant(decl.default, kind, scope, typer) if decl.default else default_of(kind)
+            default = (
+                _constant(decl.default, kind, scope, typer) if decl.default else default_of(kind, symbols.ids)
+            )
             of = None
             if decl.of is not None:
                 of = frozenset(typer.set_of(typer.evaluate(decl.of, scope), decl.of.span).ids)
@@ -276,7 +287,7 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
                     )
         except Poisoned:
             continue
-        symbols.fields[name] = field_from(decl, named.pack, kind, default, of)
+        symbols.fields[name] = field_from(decl, named.pack, kind, settled(default, kind), of)
 
 
 def _sets(typer: Typer) -> None:

@@ -126,7 +126,14 @@ class Elaborator:
                 names[item.name.text] = Broken()
                 continue
             scratch[qualified] = Field(
-                qualified, kind, default_of(kind), "place", True, None, named.pack, item.name.span
+                qualified,
+                kind,
+                default_of(kind, self.typer.symbols.ids),
+                "place",
+                True,
+                None,
+                named.pack,
+                item.name.span,
             )
             names[item.name.text] = Expr("field", kind, value=qualified, span=item.name.span)
         self._scratch = scratch

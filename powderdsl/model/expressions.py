@@ -353,7 +353,10 @@ class Typer(Coercer):
                     ("choose another name",),
                 )
             self.used.add(variable.text)
-            domains.append([(variable.text, value) for value in self.domain(domain, scope)])
+            straight = replace(
+                scope, orientation=IDENTITY
+            )  # a variable is turned where it is used, and only there
+            domains.append([(variable.text, value) for value in self.domain(domain, straight)])
         rounds = prod(len(domain) for domain in domains)
         if rounds > MAX_ROUNDS:
             place = bindings[0].span.to(bindings[-1].span)

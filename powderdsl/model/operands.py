@@ -230,10 +230,13 @@ class Coercer:
             return Expr("const", REAL, value=float(value.value), span=span)
         if value.kind.name == "real":
             return value
-        if value.kind.name == "draw" and value.op in ("add", "sub"):  # as real numbers: a rounding an operation
+        if value.kind.name == "draw" and value.op in (
+            "add",
+            "sub",
+        ):  # as real numbers: a rounding an operation
             return Expr(value.op, REAL, tuple(self.real(arg, span) for arg in value.args), span=span)
         if value.kind.name == "draw" and value.op == "look":
-            return look(self.real(value.args[0], span), value.value, span)  # type: ignore[arg-type]
+            return look(self.real(value.args[0], span), value.value, span)
         if value.kind.name in ("int", "chance", "draw", "flag"):
             return Expr("to_real", REAL, (value,), span=span)
         raise self.wrong(value, "a number", span)

@@ -16,6 +16,7 @@ from powderdsl.model.operands import (
     Place,
     SetOf,
 )
+from powderdsl.model.state import SNAP
 from powderdsl.model.types import (
     CHANCE,
     DIRECTION,
@@ -150,14 +151,22 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
     raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", helps)
 
 
-def default_of(kind: Kind) -> Value:
-    """The value of something whose file gives no default: zero, or the nearest bound to it."""
-    if kind.name == "vec2":
-        return (0.0, 0.0)
-    if kind.name in ("int", "real"):
+def default_of(kind: Kind, ids: tuple[int, ...] = (0,)) -> Value:
+    """The value of something whose file gives no default: zero or the nearest bound to it; the first element."""
+    if kind.name in ("int", "real", "vec2"):
         zero = min(max(0, kind.lo), kind.hi)
-        return int(zero) if kind.name == "int" else float(zero)
-    return 0
+        return int(zero) if kind.name == "int" else float(zero) if kind.name == "real" else (zero, zero)
+    return ids[0] if kind.name == "element" else 0
+
+
+def settled(default: Value, kind: Kind) -> Value:
+    """A field's default as steps leave it: real numbers within bounds, and zero where they are smaller than SNAP."""
+    if kind.name not in ("real", "vec2"):
+        return default
+    parts = default if isinstance(default, tuple) else (default,)
+    kept = [min(max(float(part), kind.lo), kind.hi) for part in parts]
+    row, *column = [part if abs(part) >= SNAP else 0.0 for part in kept]
+    return (row, column[0]) if column else row
 
 
 def field_from(decl: TypedDecl, pack: str, kind: Kind, default: Value, of: frozenset[int] | None) -> Field:

@@ -2,43 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from powderdsl.model.builtins import MAX_MAGNITUDE
 from powderdsl.model.types import Kind
+from powderdsl.testing import real_phrases
 from powderdsl.testing.choices import Choices
+from powderdsl.testing.phrase import LIMIT, NUMBER, ONE, PLACE, PLACES, SIDE, SIDES, Phrase
 from powderdsl.testing.vocabulary import CHANCES, Manner, Words
-
-PLACES = (
-    "below",
-    "left",
-    "above",
-    "right",
-    "below.right",
-    "above.left",
-    "at(0, 2)",
-    "at(-2, 1)",
-    "at(3, 0)",
-    "at(-7, -15)",
-)
-SIDES = ("below", "left", "above", "right", "below.left", "above.right")
-"""Places that are directions too."""
-
-PLACE, SIDE, ONE, NUMBER = Kind("place"), Kind("side"), Kind("one"), Kind("number", 0, 2)
-"""Kinds of loop variables: a neighbour, one of the eight next to a cell, an element's name, a number."""
-
-LIMIT = MAX_MAGNITUDE // 2
-
-
-@dataclass(frozen=True)
-class Phrase:
-    """Text that stands as an operand anywhere. Whole numbers have bounds; `fixed`: it may be folded to a number."""
-
-    text: str
-    lo: float = 0
-    hi: float = 0
-    fixed: bool = False
 
 
 @dataclass(frozen=True)
@@ -55,7 +26,7 @@ class Phrases:
     def bind(self, **names: Kind) -> Phrases:
         return replace(self, locals={**self.locals, **names})
 
-    def _one(self, rows: list[tuple[int, Callable[[int], Phrase | None]]], depth: int) -> Phrase:
+    def _one(self, rows: Sequence[tuple[int, Callable[[int], Phrase | None]]], depth: int) -> Phrase:
         """One of the makers by weight; those that find nothing to say are passed over."""
         rows = list(rows)
         while True:
@@ -464,134 +435,10 @@ class Phrases:
     # Reals and vectors
 
     def real(self, depth: int) -> Phrase:
-        leaves = [(3, self._decimal), (4, self._real_name), (1, self._real_param)]
-        trees = [
-            (4, self._real_arithmetic), (2, self._divide), (1, self._real_unary), (1, self._real_extreme), (2, self._part),
-            (1, self._length), (1, self._real_sum), (1, self._choose_real), (1, self._scaled_draw),
-        ]  # fmt: skip
-        return self._one(leaves + (trees if depth > 0 else []), depth)
-
-    def _decimal(self, depth: int) -> Phrase:
-        return Phrase(
-            self.choices.pick(
-                ["0.5", "0.1", "1.5", "-0.25", "0.95", "3.3", "-7.125", "0.0001", "1e-7", "1000.5"]
-            ),
-            fixed=True,
-        )
-
-    def _real_name(self, depth: int) -> Phrase | None:
-        name = self._named("real")
-        return None if name is None else Phrase(name)
-
-    def _real_param(self, depth: int) -> Phrase | None:
-        name = self._param("real")
-        return None if name is None else Phrase(name)
-
-    def _real_arithmetic(self, depth: int) -> Phrase | None:
-        a, b = self.real(depth - 1), self.choices.weighted([(3, self.real), (1, self.whole)])(depth - 1)
-        if a.fixed and b.fixed:
-            return None
-        first, second = (a, b) if self.choices.maybe(70) else (b, a)
-        return Phrase(f"({first.text} {self.choices.pick('+-*')} {second.text})")
-
-    def _vary(self, phrase: Phrase) -> str:
-        """A real that is no constant: constants would have to be whole here."""
-        return f"(0.5 * length(vector({phrase.text}, {phrase.text})))" if phrase.fixed else phrase.text
-
-    def _divide(self, depth: int) -> Phrase | None:
-        a, b = (self.choices.weighted([(2, self.real), (1, self.whole)])(depth - 1) for _ in range(2))
-        if a.fixed and b.fixed:
-            return None
-        divisor = self.choices.pick(["2", "3", "18", "0.3"]) if b.fixed else b.text
-        return Phrase(f"({a.text} / {divisor})", fixed=a.fixed and b.fixed)
-
-    def _real_unary(self, depth: int) -> Phrase:
-        value = self.real(depth - 1)
-        return Phrase(self.choices.pick([f"abs({value.text})", f"(-{value.text})"]), fixed=value.fixed)
-
-    def _real_extreme(self, depth: int) -> Phrase:
-        a, b = self.real(depth - 1), self.choices.weighted([(2, self.real), (1, self.whole)])(depth - 1)
-        return Phrase(f"{self.choices.pick(['min', 'max'])}({a.text}, {b.text})", fixed=a.fixed and b.fixed)
-
-    def _part(self, depth: int) -> Phrase | None:
-        if not self.words.of_kind("vec2") and self.choices.maybe(50):
-            return None
-        return Phrase(f"{self.vector(depth - 1).text}.{self.choices.pick(['row', 'column'])}")
-
-    def _length(self, depth: int) -> Phrase:
-        return Phrase(f"length({self.vector(depth - 1).text})")
-
-    def _real_sum(self, depth: int) -> Phrase:
-        kernel = self.kernel()
-        return Phrase(f"sum({self.real(depth - 1).text}{f' in {kernel}' if kernel else ''})")
-
-    def _choose_real(self, depth: int) -> Phrase:
-        a, b = self.real(depth - 1), self.choices.weighted([(3, self.real), (1, self.whole)])(depth - 1)
-        return Phrase(
-            f"({a.text} if {self.flag(depth - 1, bare=True).text} else {b.text})", fixed=a.fixed or b.fixed
-        )
-
-    def _scaled_draw(self, depth: int) -> Phrase | None:
-        if not self.words.streams:
-            return None
-        if self.choices.maybe(30):
-            return Phrase(
-                f"({self.draw(depth - 1).text} {self.choices.pick('+-')} {self._vary(self.real(depth - 1))})"
-            )
-        return Phrase(
-            f"({self.draw(depth - 1).text} {self.choices.pick('*/')} {self.choices.pick(['0.7', '2.5', '0.001'])})"
-        )
+        return real_phrases.real(self, depth)
 
     def vector(self, depth: int) -> Phrase:
-        leaves = [(6, self._vector_name), (2, self._pair)]
-        trees = [
-            (3, self._vector_sum),
-            (3, self._scaled),
-            (1, self._opposed),
-            (2, self._spread),
-            (1, self._choose_vector),
-        ]
-        return self._one(leaves + (trees if depth > 0 else []), depth)
-
-    def _vector_name(self, depth: int) -> Phrase | None:
-        name = self._named("vec2")
-        return None if name is None else Phrase(name)
-
-    def _pair(self, depth: int) -> Phrase:
-        parts = [
-            self.choices.weighted([(2, self.real), (2, self.whole), (1, self.flag)])(depth - 1).text
-            for _ in range(2)
-        ]
-        return Phrase(f"vector({parts[0]}, {parts[1]})")
-
-    def _vector_sum(self, depth: int) -> Phrase:
-        return Phrase(
-            f"({self.vector(depth - 1).text} {self.choices.pick('+-')} {self.vector(depth - 1).text})"
-        )
-
-    def _scaled(self, depth: int) -> Phrase:
-        vector, factor = (
-            self.vector(depth - 1),
-            self.choices.weighted([(2, self.real), (1, self.whole)])(depth - 1),
-        )
-        text = self.choices.pick(["2", "0.5", "3"]) if factor.fixed else factor.text
-        return Phrase(
-            self.choices.pick(
-                [f"({vector.text} * {text})", f"({text} * {vector.text})", f"({vector.text} / {text})"]
-            )
-        )
-
-    def _opposed(self, depth: int) -> Phrase:
-        return Phrase(f"(-{self.vector(depth - 1).text})")
-
-    def _spread(self, depth: int) -> Phrase:
-        kernel = self.kernel()
-        return Phrase(f"sum({self.vector(depth - 1).text}{f' in {kernel}' if kernel else ''})")
-
-    def _choose_vector(self, depth: int) -> Phrase:
-        return Phrase(
-            f"({self.vector(depth - 1).text} if {self.flag(depth - 1, bare=True).text} else {self.vector(depth - 1).text})"
-        )
+        return real_phrases.vector(self, depth)
 
     # Elements and directions
 

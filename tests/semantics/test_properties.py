@@ -1,0 +1,402 @@
+"""What must hold for every ruleset and every world, whatever the rules say.
+
+Random rulesets come from seeds, as in test_differential.py; `Manner` leaves out of them what would break a property.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import powderdsl
+from powderdsl import reference
+from powderdsl.compiler import load
+from powderdsl.diagnostics import CompileError, Reporter, Source, Span
+from powderdsl.model.check import check
+from powderdsl.model.packs import PackDecl, read_file
+from powderdsl.model.state import SNAP, slots
+from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Ruleset, Swap
+from powderdsl.simulator import Simulator, World
+from powderdsl.simulator import compile as compile_ruleset
+from powderdsl.testing.cases import Start, load_text, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.testing.compare import find_difference
+from powderdsl.testing.rulemaker import random_ruleset_text
+from powderdsl.testing.vocabulary import Manner
+
+ANYTHING = Manner()
+STEADY = Manner(draws=False, borders=False, symmetry=False)
+"""Nothing random, nothing that knows where the grid ends."""
+SWAPS = Manner(forms=("swap",))
+
+MOVEMENT = ("stone", "gravity", "piling", "flow", "wind")
+"""The passes of powderworld that move elements and make none."""
+
+
+@cache
+def simulators(manner: Manner, seeds: range, backend: str = "torch") -> tuple[Simulator, ...]:
+    """Simulators of random rulesets; texts that the static checks refuse are left out."""
+    found = []
+    for seed in seeds:
+        try:
+            ruleset = load_text(random_ruleset_text(seed, manner), f"seed{seed}.yaml")
+        except CompileError:
+            continue
+        found.append(compile_ruleset(ruleset, backend=backend))
+    return tuple(found)
+
+
+def random_world(simulator: Simulator, seed: int, shape: tuple[int, int, int]) -> World:
+    return random_start(simulator.ruleset, Choices.seeded(seed), shape).world(simulator)
+
+
+def assert_equal(first: World, second: World) -> None:
+    difference = find_difference(first.state, second.state)
+    assert difference is None, f"{difference}\n{first.sim.ruleset.name}"
+
+
+CASES = [("torch", range(30)), ("dense", range(30, 45)), ("reference", range(45, 51))]
+
+
+# Batches and steps
+
+
+@pytest.mark.parametrize(("backend", "seeds"), CASES)
+def test_a_world_is_the_same_alone_and_in_a_batch(backend: str, seeds: range) -> None:
+    for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
+        start = random_start(simulator.ruleset, Choices.seeded(number), (3, 3, 34))
+        together = start.world(simulator)
+        after = simulator.step(together, 3)
+        for i in range(3):
+            assert_equal(simulator.step(together.select([i]), 3), after.select(i))
+            alone = simulator.world(start.ids[i : i + 1].astype(np.int64), seed=start.seed, index=[i])
+            alone = simulator.replace(alone, **{name: values[i : i + 1] for name, values in start.fields.items()})
+            assert_equal(simulator.step(alone, 3), after.select(i))
+        assert_equal(simulator.step(together.select([2, 0]), 3), after.select([2, 0]))
+
+
+@pytest.mark.parametrize(("backend", "seeds"), CASES)
+def test_steps_add_up_and_leave_their_argument_alone(backend: str, seeds: range) -> None:
+    for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
+        world = random_world(simulator, number, (2, 4, 33))
+        before = {name: value.clone() for name, value in world.state.items()}
+        one_by_one = world
+        for _ in range(3):
+            one_by_one = simulator.step(one_by_one)
+        at_once = simulator.step(world, 3)
+        assert_equal(at_once, one_by_one)
+        assert torch.equal(at_once.step, world.step + 3)
+        assert find_difference(world.state, before) is None
+        assert_equal(simulator.step(world, 0), world)
+        again = simulator.step(world, 3)
+        assert_equal(again, at_once)  # nothing is left over from the first time
+
+
+def test_a_saved_world_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+    chosen = [compile_ruleset(load("powderworld"), backend="torch"), *simulators(ANYTHING, range(60, 72))]
+    for number, simulator in enumerate(chosen):
+        middle = simulator.step(random_world(simulator, number, (2, 5, 33)), 2)
+        path = tmp_path / f"world{number}.npz"
+        powderdsl.save(middle, path)
+        loaded = powderdsl.load_world(path, simulator)
+        assert_equal(loaded, middle)
+        assert_equal(simulator.step(loaded, 3), simulator.step(middle, 3))
+
+
+# Space
+
+
+@pytest.mark.parametrize("shape", [(2, 5, 7), (1, 1, 40), (1, 33, 2)])
+def test_shifted_worlds_have_shifted_futures(shape: tuple[int, int, int]) -> None:
+    for number, simulator in enumerate(simulators(STEADY, range(40))):
+        world = random_world(simulator, number, shape)
+        dy, dx = 1 + number % 4, 1 + number % 33
+        after = simulator.step(world, 2)
+        shifted = {name: torch.roll(value, (dy, dx), (-2, -1)) for name, value in world.state.items()}
+        moved = simulator.step(World(simulator, shifted, world.seed, world.index, world.step), 2)
+        expected = {name: torch.roll(value, (dy, dx), (-2, -1)) for name, value in after.state.items()}
+        assert find_difference(moved.state, expected) is None
+
+
+SYMMETRIC = """
+pack: symmetric
+kernels:
+  corner: {rows: ["1 0 2", "0 0 0", "0 -1 0"], edges: wrap}
+  open: ["0 3 0", "0 0 1", "0 0 0"]
+fields: {heat: {type: 0..9, at: place}, mark: {type: flag, at: element}}
+elements:
+  a: {id: 0, color: "#000000"}
+  b: {id: 1, color: "#000001"}
+  c: {id: 2, color: "#000002"}
+passes:
+  one:
+    symmetry: SYMMETRY
+    do: a -> b if above.right is c and left is a
+    then:
+      - heat := 4 where any(side is c for side in (left, at(0, 2), above.right))
+      - mark := yes where all(opposite(side) is not b for side in (below, at(1, -2)))
+  two:
+    symmetry: SYMMETRY
+    conflicts: drop_both
+    do:
+      - c swaps above.left if below is a and count(b in corner) > 0
+      - b moves at(2, 1) leaving a if at(2, 1) is a and heat < 3
+      - a -> c if count(a in open) > 3 and mark
+  three:
+    symmetry: SYMMETRY
+    for side in (left, below.right):
+      - b -> a if side is c and opposite(side).heat >= heat
+"""
+
+
+@pytest.mark.parametrize("symmetry", ["mirror", "rotations", "all"])
+def test_symmetric_rules_treat_all_orientations_alike(symmetry: str) -> None:
+    simulator = compile_ruleset(load_text(SYMMETRIC.replace("SYMMETRY", symmetry)), backend="torch")
+    turns = {
+        "mirror": [lambda x: x.flip(-1)],
+        "rotations": [lambda x, k=k: torch.rot90(x, k, (-2, -1)) for k in (1, 2, 3)],
+        "all": [lambda x: x.flip(-1), lambda x: x.flip(-2), lambda x: torch.rot90(x, 1, (-2, -1)), lambda x: x.transpose(-1, -2)],
+    }[symmetry]  # fmt: skip
+    changed = False
+    for seed in range(12):
+        world = random_world(simulator, seed, (2, 9, 9))
+        after = simulator.step(world, 2)
+        changed = changed or find_difference(world.state, after.state) is not None
+        for turn in turns:
+            turned = {name: turn(value).contiguous() for name, value in world.state.items()}
+            result = simulator.step(World(simulator, turned, world.seed, world.index, world.step), 2)
+            assert find_difference(result.state, {name: turn(v) for name, v in after.state.items()}) is None
+    assert changed
+
+
+def test_changes_stay_within_reach() -> None:
+    side = 65
+    tried = 0
+    for number, simulator in enumerate(simulators(ANYTHING, range(100, 160))):
+        rows, columns = reach(simulator.ruleset)
+        if max(rows, columns) > side // 2 - 1:
+            continue
+        tried += 1
+        world = random_world(simulator, number, (1, side, side))
+        where = torch.zeros((side, side), dtype=torch.bool)
+        y, x = (number * 7) % side, (number * 11) % side
+        where[y, x] = True
+        names = [name for name in simulator.elements if simulator.ruleset.element(name).id != int(world.ids[0, y, x])]  # type: ignore[union-attr]
+        other = simulator.paint(world, element=(names or simulator.elements)[0], where=where)
+        first, second = simulator.step(world), simulator.step(other)
+        for slot, value in first.state.items():
+            unequal = (value != second.state[slot]).reshape(-1, side, side).any(0).nonzero()
+            for row, column in unequal.tolist():
+                assert min((row - y) % side, (y - row) % side) <= rows, (slot, simulator.ruleset.name)
+                assert min((column - x) % side, (x - column) % side) <= columns, (slot, simulator.ruleset.name)
+    assert tried >= 20
+
+
+def reach(ruleset: Ruleset) -> tuple[int, int]:
+    """How many rows and columns away a step may look and write: the sum over its moments."""
+    total = np.zeros(2, int)
+    for moment in (moment for pass_ in ruleset.passes for moment in pass_.moments):
+        seen = [np.zeros(2, int)]
+        claims = np.zeros(2, int)
+        for let in moment.lets:
+            seen.append(_seen(let.value))
+        for rule in moment.rules:
+            effects = () if isinstance(rule, Assign) else rule.effects
+            writes = [rule] if isinstance(rule, Assign) else list(effects)
+            own = np.zeros(2, int) if isinstance(rule, Assign) else np.abs(getattr(rule, "offset", (0, 0)))
+            claims += 2 * own if moment.policy != "prove" else 0
+            mask = np.zeros(2, int) if rule.mask is None else _seen(rule.mask)
+            seen.append(mask + own)
+            seen += [np.maximum(_seen(write.value), mask) + np.abs(write.offset) + own for write in writes]
+            if hasattr(rule, "target"):
+                seen.append(_seen(rule.target))
+        total += np.max(seen, axis=0) + claims
+    return int(total[0]), int(total[1])
+
+
+def _seen(expr: Expr) -> Any:
+    """How far an expression looks: rows and columns."""
+    inside = np.max([np.zeros(2, int), *(_seen(arg) for arg in expr.args)], axis=0)
+    if expr.op == "look":
+        return inside + np.abs(expr.value)
+    if isinstance(expr.value, Kernel) and expr.value.weights:
+        return inside + np.max(np.abs([(dy, dx) for dy, dx, _ in expr.value.weights]), axis=0)
+    return inside
+
+
+# Conservation
+
+
+def test_swaps_conserve_what_cells_hold() -> None:
+    """Swaps move an element with all its fields: the multiset of whole cells stays the same, in any shape."""
+    moved = 0
+    for number, simulator in enumerate(simulators(SWAPS, range(60))):
+        carried = [slot.name for slot in slots(simulator.ruleset) if slot.travels and not slot.resets]
+        for shape in ((2, 5, 9), (1, 1, 33), (2, 31, 1), (1, 2, 2)):
+            world = random_world(simulator, number, shape)
+            after = simulator.step(world, 2)
+            assert cells(world, carried) == cells(after, carried)
+            moved += not torch.equal(world.ids, after.ids)
+    assert moved >= 60
+
+
+def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:
+    """What the cells of each world hold, sorted."""
+    planes = [world.state[name].double() for name in names]
+    flat = [plane for value in planes for plane in (value.unbind(1) if value.ndim == 4 else (value,))]
+    stacked = torch.stack(flat, -1).reshape(len(world), -1, len(flat))
+    return [sorted(map(tuple, cells.tolist())) for cells in stacked]
+
+
+@pytest.mark.parametrize("walled", [False, True])
+@pytest.mark.parametrize("shape", [(4, 16, 24), (3, 1, 40), (3, 40, 1), (2, 33, 5)])
+def test_movement_of_powderworld_conserves_every_element(shape: tuple[int, int, int], walled: bool) -> None:
+    simulator = compile_ruleset(load("powderworld"), backend="torch")
+    for seed in range(3):
+        world = random_world(simulator, seed, shape)
+        if walled:
+            border = torch.ones(shape[1:], dtype=torch.bool)
+            border[1:-1, 1:-1] = False
+            world = simulator.paint(world, element="wall", where=border)
+        for _ in range(3):
+            for name in MOVEMENT:
+                after = simulator.step(world, passes=[name])
+                for one, other in zip(world.ids, after.ids, strict=True):
+                    assert torch.equal(one.flatten().bincount(minlength=14), other.flatten().bincount(minlength=14)), name
+                world = after
+
+
+# Ranges
+
+
+@pytest.mark.parametrize(("backend", "seeds"), [("torch", range(200, 260)), ("reference", range(260, 270))])
+def test_every_value_is_one_that_was_declared(backend: str, seeds: range) -> None:
+    for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
+        ruleset = simulator.ruleset
+        world = simulator.step(random_world(simulator, number, (2, 4, 33)), 3)
+        ids = {element.id for element in ruleset.elements}
+        for slot in slots(ruleset):
+            values = world.state[slot.name]
+            found = set(values.unique().tolist())
+            assert values.dtype == getattr(torch, slot.dtype)
+            match slot.kind.name:
+                case "element":
+                    assert found <= ids
+                case "flag":
+                    assert found <= {0, 1}
+                case "direction":
+                    assert found <= set(range(8))
+                case _:
+                    assert slot.kind.lo <= min(found)
+                    assert max(found) <= slot.kind.hi  # so there is no NaN either
+            if slot.is_real:
+                assert all(value == 0 or abs(value) >= SNAP for value in found)
+            if slot.of is not None:
+                elsewhere = ~torch.isin(world.ids, torch.tensor(sorted(slot.of), dtype=torch.uint8))
+                parts = values.unbind(1) if slot.planes == 2 else (values,)
+                usual = slot.default if isinstance(slot.default, tuple) else (slot.default,)
+                for part, default in zip(parts, usual, strict=True):
+                    assert bool((part[elsewhere] == torch.tensor(default).to(part.dtype)).all())
+        for prop in ruleset.properties:
+            if prop.stored and not any(isinstance(value, str) for value in prop.values):
+                table = torch.tensor([int(value) for value in prop.values])  # type: ignore[arg-type]
+                elsewhere = ~torch.isin(world.ids, torch.tensor(sorted(prop.stored), dtype=torch.uint8))
+                assert torch.equal(world[prop.name][elsewhere].long(), table[world.ids.long()][elsewhere])
+
+
+# What the static checks promise
+
+
+def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moments without a policy have no conflicts, and rules that "can never fire" (PD503) never fire."""
+    silent: set[Span] = set()
+    counts = {"claims": 0, "moments": 0, "silent": 0}
+    run_moment = reference.run_moment
+
+    def watched(moment: Moment, at: reference.Context, table: Any) -> reference.State:
+        lets = dict(at.lets)
+        for let in moment.lets:
+            at.lets[let.name] = reference.evaluate(let.value, at)
+        masks = [(rule, reference.evaluate(rule.mask, at)) for rule in moment.rules if rule.mask is not None]
+        for rule, mask in masks:
+            if rule.span in silent:
+                counts["silent"] += 1
+                assert not mask.any(), f"this rule fires: {rule.span.text}"
+        if moment.policy == "prove":
+            counts["moments"] += 1
+            for claimed in (_sources(masks), _targets(masks)):
+                for cells in claimed:
+                    counts["claims"] += int(cells.sum())
+                    assert cells.max(initial=0) <= 1, [rule.span.text for rule, _ in masks]
+        at.lets.clear()
+        at.lets.update(lets)
+        return run_moment(moment, at, table)
+
+    monkeypatch.setattr(reference, "run_moment", watched)
+    for seed in range(300, 420):
+        reporter = Reporter()
+        pack = read_file(Source(f"seed{seed}.yaml", random_ruleset_text(seed)), reporter)
+        assert isinstance(pack, PackDecl)
+        try:
+            ruleset = check([pack], None, reporter)
+        except CompileError:
+            continue
+        silent.clear()
+        silent |= {d.primary.span for d in reporter.diagnostics if d.code == "PD503" and d.primary.span}
+        simulator = compile_ruleset(ruleset, backend="reference")
+        for part, shape in enumerate(((3, 4, 6), (2, 1, 3))):
+            simulator.step(random_world(simulator, seed * 2 + part, shape), 2)
+    assert counts["moments"] > 300
+    assert counts["claims"] > 3000
+    assert counts["silent"] > 20
+
+
+def _sources(masks: list[tuple[Any, Any]]) -> Iterator[Any]:
+    """How often each cell is changed or left. Transforms to one target may meet; a swap claims both its cells."""
+    total: Any = 0
+    targets: dict[Any, Any] = {}
+    for rule, mask in masks:
+        if isinstance(rule, Swap):
+            back = (-rule.offset[0], -rule.offset[1])
+            total = total + mask.astype(int) + reference.look(mask, back).astype(int)
+        elif isinstance(rule, Move):
+            total = total + mask.astype(int)
+        elif not isinstance(rule, Assign):
+            targets[rule.target] = targets.get(rule.target, False) | mask
+    yield np.asarray(total + sum((mask.astype(int) for mask in targets.values()), np.zeros(1, int)))
+
+
+def _targets(masks: list[tuple[Any, Any]]) -> Iterator[Any]:
+    """How often something moves into each cell, and how often each field of it is assigned."""
+    arrivals: Any = np.zeros(1, int)
+    fields: dict[str, dict[Any, Any]] = {}
+    for rule, mask in masks:
+        offset = (-rule.offset[0], -rule.offset[1]) if hasattr(rule, "offset") else (0, 0)
+        if isinstance(rule, (Swap, Move)):
+            arrivals = arrivals + reference.look(mask, offset).astype(int)
+        elif isinstance(rule, Assign) and rule.op == ":=":
+            values = fields.setdefault(rule.field, {})
+            values[rule.value] = values.get(rule.value, False) | reference.look(mask, offset)
+    yield np.asarray(arrivals)
+    for values in fields.values():
+        yield np.asarray(sum((mask.astype(int) for mask in values.values()), np.zeros(1, int)))
+
+
+def test_the_empty_world_of_an_empty_pack_stays() -> None:
+    """A ruleset without passes changes nothing, and a rule with chance 0 % is no rule."""
+    head = "pack: p\nelements:\n  a: {id: 0, color: '#000000'}\n  b: {id: 1, color: '#000001'}\n"
+    never = "passes: {one: {do: 'a -> b, with chance 0%'}}\n"
+    always = "passes: {one: {do: 'a -> b, with chance 100%'}}\n"
+    start = Start(np.arange(12).reshape(1, 3, 4) % 2)
+    for text, changes in ((head, False), (head + never, False), (head + always, True)):
+        for backend in ("reference", "dense", "torch"):
+            simulator = compile_ruleset(load_text(text), backend=backend)
+            world = start.world(simulator)
+            ids = simulator.step(world, 4).ids
+            assert bool((ids == 1).all()) if changes else torch.equal(ids, world.ids)
