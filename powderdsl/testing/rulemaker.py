@@ -74,8 +74,12 @@ class PassMaker:
     manner: Manner
     number: int
     names: int = 0
-    assigned: set[str] = field(default_factory=set)
-    """Fields that this moment assigns already: a second `:=` could clash."""
+    taken: dict[bool, set[str]] = field(default_factory=dict)
+    """Fields that this moment's assignments (False) and effects (True) set already: a second `:=` could clash."""
+    proven: bool = True
+    """Whether this moment has no policy, so that it must be free of conflicts."""
+    steady: bool = False
+    """Whether it has a symmetry as well, so that a `:=` must not hang on the orientation."""
 
     def tree(self, earlier: list[str]) -> Tree:
         """The pass as YAML."""
@@ -187,7 +191,8 @@ class PassMaker:
     def moment(self, phrases: Phrases, policy: str | None, symmetric: bool) -> list[str]:
         """The rules of one moment: anything under a policy, else what can be shown to be free of conflicts."""
         choices = self.choices
-        self.assigned = set()
+        self.taken = {False: set(), True: set()}
+        self.proven, self.steady = policy is None, policy is None and symmetric
         forms = self.manner.forms
         if policy is not None:
             table = {
@@ -206,14 +211,16 @@ class PassMaker:
             for form in ("transform", "swap", "move")
             if form in forms and not (symmetric and form in ("swap", "move"))
         ]
-        if movers and choices.maybe(80):
+        if len(movers) == 3 and len(self.words.elements) > 2 and choices.maybe(25):
+            rules += self._separate_movers(phrases)
+        elif movers and choices.maybe(80):
             rules += {
                 "transform": self._exclusive_transforms,
                 "swap": self._guarded_swap,
                 "move": self._lone_move,
             }[choices.pick(movers)](phrases)
         if "assign" in forms and (not rules or choices.maybe(40)):
-            rules += [self._assign(phrases, steady=symmetric) for _ in range(choices.whole(1, 2))]
+            rules += [self._assign(phrases) for _ in range(choices.whole(1, 2))]
         if "push" in forms and choices.maybe(15):
             rules.append(self._push(phrases))
         return [rule for rule in rules if rule] or [self._fallback(phrases)]
@@ -264,8 +271,8 @@ class PassMaker:
         leaving = self.choices.pick([*self.words.elements, *phrases.ones()])
         return f"{self._subject(phrases)} moves {self._mover_place(phrases)} leaving {leaving}{self._tail(phrases)}"
 
-    def _assign(self, phrases: Phrases, steady: bool = False) -> str | None:
-        update = self._update(phrases, effect=False, steady=steady)
+    def _assign(self, phrases: Phrases) -> str | None:
+        update = self._update(phrases, effect=False)
         return update and update + self._tail(phrases, "where", effects=False)
 
     def _push(self, phrases: Phrases) -> str | None:
@@ -277,14 +284,15 @@ class PassMaker:
         amount = self.choices.weighted([(2, phrases.whole), (2, phrases.real)])(1).text
         return f"push {self.choices.pick(vectors)} by {amount} away from {phrases.flag(1, bare=True).text}{self._chance(phrases)}"
 
-    def _update(self, phrases: Phrases, effect: bool, steady: bool = False) -> str | None:
-        """`field := value`, or `+=`, `-=`, here or at a neighbour. `steady`: the value is the same in every orientation."""
+    def _update(self, phrases: Phrases, effect: bool) -> str | None:
+        """`field := value`, or `+=`, `-=`, here or at a neighbour."""
         choices = self.choices
+        taken = self.taken[effect] if self.proven else set()
         kinds = {**self.words.fields, **self.words.properties, **phrases.scratch}
         targets = [
             name
             for name, kind in kinds.items()
-            if kind.name != "chance" and (name not in self.assigned or kind.name in ("int", "real", "vec2"))
+            if kind.name != "chance" and (name not in taken or kind.name in ("int", "real", "vec2"))
         ]
         if not targets:
             return None
@@ -292,13 +300,12 @@ class PassMaker:
         kind = kinds[name]
         numeric = kind.name in ("int", "real", "vec2")
         place = f"{phrases.place()}." if choices.maybe(35) else ""
-        if numeric and (choices.maybe(40) or name in self.assigned or steady):
+        if numeric and (choices.maybe(40) or name in taken or self.steady):
             value = phrases.of_kind(Kind(kind.name, -100, 100), 2)
             return f"{place}{name} {choices.pick(['+=', '-='])} {value}"
-        if steady:
+        if self.steady:
             return None
-        if not effect:
-            self.assigned.add(name)
+        taken.add(name)
         if (
             kind.name in ("int", "real") and kind.lo > kind.hi - 3
         ):  # constants out of the range would be errors
@@ -341,6 +348,17 @@ class PassMaker:
         options.append(f"{group} swaps {place} if {place} is not {group}")
         more = f" and {phrases.flag(2).text}" if choices.maybe(60) else ""
         return [choices.pick(options) + more + self._chance(phrases) + self._effects(phrases)]
+
+    def _separate_movers(self, phrases: Phrases) -> list[str | None]:
+        """A transform beside a swap or a move, of cells that hold different elements."""
+        choices = self.choices
+        one, two, three = choices.some(self.words.elements, 3, 3)
+        place = self._mover_place(phrases)
+        verb = choices.pick([f"swaps {place}", f"moves {place} leaving {choices.pick(self.words.elements)}"])
+        condition = f"{place} is {three} and {phrases.flag(2).text}"
+        mover = f"{two} {verb} if {condition}{self._chance(phrases)}{self._effects(phrases)}"
+        rules: list[str | None] = [f"{one} -> {phrases.element(1).text}{self._tail(phrases)}", mover]
+        return rules if choices.maybe(50) else rules[::-1]
 
     def _lone_move(self, phrases: Phrases) -> list[str | None]:
         return [self._move(phrases)]

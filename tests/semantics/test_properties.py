@@ -21,7 +21,7 @@ from powderdsl.diagnostics import CompileError, Reporter, Source, Span
 from powderdsl.model.check import check
 from powderdsl.model.packs import PackDecl, read_file
 from powderdsl.model.state import SNAP, slots
-from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Ruleset, Swap
+from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Ruleset, Swap, Transform
 from powderdsl.simulator import Simulator, World
 from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.testing.cases import Start, load_text, random_start
@@ -76,7 +76,9 @@ def test_a_world_is_the_same_alone_and_in_a_batch(backend: str, seeds: range) ->
         for i in range(3):
             assert_equal(simulator.step(together.select([i]), 3), after.select(i))
             alone = simulator.world(start.ids[i : i + 1].astype(np.int64), seed=start.seed, index=[i])
-            alone = simulator.replace(alone, **{name: values[i : i + 1] for name, values in start.fields.items()})
+            alone = simulator.replace(
+                alone, **{name: values[i : i + 1] for name, values in start.fields.items()}
+            )
             assert_equal(simulator.step(alone, 3), after.select(i))
         assert_equal(simulator.step(together.select([2, 0]), 3), after.select([2, 0]))
 
@@ -187,14 +189,21 @@ def test_changes_stay_within_reach() -> None:
         where = torch.zeros((side, side), dtype=torch.bool)
         y, x = (number * 7) % side, (number * 11) % side
         where[y, x] = True
-        names = [name for name in simulator.elements if simulator.ruleset.element(name).id != int(world.ids[0, y, x])]  # type: ignore[union-attr]
+        names = [
+            name
+            for name in simulator.elements
+            if simulator.ruleset.element(name).id != int(world.ids[0, y, x])
+        ]  # type: ignore[union-attr]
         other = simulator.paint(world, element=(names or simulator.elements)[0], where=where)
         first, second = simulator.step(world), simulator.step(other)
         for slot, value in first.state.items():
             unequal = (value != second.state[slot]).reshape(-1, side, side).any(0).nonzero()
             for row, column in unequal.tolist():
                 assert min((row - y) % side, (y - row) % side) <= rows, (slot, simulator.ruleset.name)
-                assert min((column - x) % side, (x - column) % side) <= columns, (slot, simulator.ruleset.name)
+                assert min((column - x) % side, (x - column) % side) <= columns, (
+                    slot,
+                    simulator.ruleset.name,
+                )
     assert tried >= 20
 
 
@@ -268,7 +277,9 @@ def test_movement_of_powderworld_conserves_every_element(shape: tuple[int, int, 
             for name in MOVEMENT:
                 after = simulator.step(world, passes=[name])
                 for one, other in zip(world.ids, after.ids, strict=True):
-                    assert torch.equal(one.flatten().bincount(minlength=14), other.flatten().bincount(minlength=14)), name
+                    assert torch.equal(
+                        one.flatten().bincount(minlength=14), other.flatten().bincount(minlength=14)
+                    ), name
                 world = after
 
 
@@ -358,34 +369,42 @@ def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.Monkey
 
 
 def _sources(masks: list[tuple[Any, Any]]) -> Iterator[Any]:
-    """How often each cell is changed or left. Transforms to one target may meet; a swap claims both its cells."""
-    total: Any = 0
-    targets: dict[Any, Any] = {}
-    for rule, mask in masks:
-        if isinstance(rule, Swap):
-            back = (-rule.offset[0], -rule.offset[1])
-            total = total + mask.astype(int) + reference.look(mask, back).astype(int)
-        elif isinstance(rule, Move):
-            total = total + mask.astype(int)
-        elif not isinstance(rule, Assign):
-            targets[rule.target] = targets.get(rule.target, False) | mask
-    yield np.asarray(total + sum((mask.astype(int) for mask in targets.values()), np.zeros(1, int)))
+    """How often each cell is changed, swapped or left. Transforms to one target may meet."""
+    movers = [mask for rule, mask in masks if isinstance(rule, (Swap, Move))]
+    swapped = [_there(rule, mask) for rule, mask in masks if isinstance(rule, Swap)]
+    yield _total([*movers, *swapped, *_transformed(masks)])
 
 
 def _targets(masks: list[tuple[Any, Any]]) -> Iterator[Any]:
-    """How often something moves into each cell, and how often each field of it is assigned."""
-    arrivals: Any = np.zeros(1, int)
+    """How often each cell is changed, swapped or moved into, and how often each field of it is assigned."""
+    arrivals = [_there(rule, mask) for rule, mask in masks if isinstance(rule, (Swap, Move))]
+    swapped = [mask for rule, mask in masks if isinstance(rule, Swap)]
+    yield _total([*arrivals, *swapped, *_transformed(masks)])
     fields: dict[str, dict[Any, Any]] = {}
     for rule, mask in masks:
-        offset = (-rule.offset[0], -rule.offset[1]) if hasattr(rule, "offset") else (0, 0)
-        if isinstance(rule, (Swap, Move)):
-            arrivals = arrivals + reference.look(mask, offset).astype(int)
-        elif isinstance(rule, Assign) and rule.op == ":=":
+        if isinstance(rule, Assign) and rule.op == ":=":
             values = fields.setdefault(rule.field, {})
-            values[rule.value] = values.get(rule.value, False) | reference.look(mask, offset)
-    yield np.asarray(arrivals)
+            values[rule.value] = values.get(rule.value, False) | _there(rule, mask)
     for values in fields.values():
-        yield np.asarray(sum((mask.astype(int) for mask in values.values()), np.zeros(1, int)))
+        yield _total(list(values.values()))
+
+
+def _there(rule: Any, mask: Any) -> Any:
+    """The cells that a rule's offset points at."""
+    return reference.look(mask, (-rule.offset[0], -rule.offset[1]))
+
+
+def _transformed(masks: list[tuple[Any, Any]]) -> list[Any]:
+    """Cells that change, by what they become."""
+    targets: dict[Any, Any] = {}
+    for rule, mask in masks:
+        if isinstance(rule, Transform):
+            targets[rule.target] = targets.get(rule.target, False) | mask
+    return list(targets.values())
+
+
+def _total(masks: list[Any]) -> Any:
+    return np.sum(masks, axis=0) if masks else np.zeros(1, int)
 
 
 def test_the_empty_world_of_an_empty_pack_stays() -> None:
