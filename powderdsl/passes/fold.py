@@ -157,6 +157,9 @@ def _shift_of_constant(node: Node, build: Builder) -> Node | None:
             return a
         if a.op == "coordinate" and a.attr[0] == "step" and wraps:
             return a
+        if a.op in ("const", "param"):  # nothing outside: the same inside, else zero
+            inside = build.make("inside", FLAG, attr=node.attr[:2])
+            return build.select(inside, a, build.const(0, a.type))
     return None
 
 

@@ -2,6 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+import pytest
+
+from powderdsl.model.symbols import stream_ident
+from powderdsl.reference import Clock, draw
+from powderdsl.simulator import compile as compile_ruleset
+from powderdsl.testing.cases import load_text
+
+Shape = tuple[int, int]
+Planes = Any
+"""A NumPy array; what it holds is said where it is made."""
+
 
 def test_draws_are_uniform_and_unrelated(torch) -> None:  # type: ignore[no-untyped-def]
     """Bit planes of our randomness: fair, and uncorrelated with neighbours, steps, streams, seeds and worlds."""
@@ -27,3 +41,144 @@ def test_draws_are_uniform_and_unrelated(torch) -> None:  # type: ignore[no-unty
         assert (first * torch.roll(first, (dy, dx), (1, 2))).mean((1, 2)).abs().max() < bound
     between = torch.einsum("aij,bij->ab", first, first) / count
     assert (between - torch.eye(16)).abs().max() < bound
+
+
+DEVIATIONS = 6.0
+"""Standard deviations that a statistic may be off: by chance, 2 in 10^9 are."""
+
+IDENTS = (stream_ident("movement"), stream_ident("interact"), stream_ident("pack.pass#1"), 0, 1)
+
+
+def draws(
+    seed: int = 1,
+    index: int = 0,
+    step: int = 0,
+    ident: int = IDENTS[0],
+    bits: int = 32,
+    shape: Shape = (128, 160),
+) -> Planes:
+    """Draws of one world by the oracle, as whole numbers below 2^bits: uint64 [H, W]."""
+    clock = Clock(np.array([seed]), np.array([index]), np.array([step]))
+    return (draw(clock, ident, bits, *shape)[0] * 2.0**bits).astype(np.uint64)  # type: ignore[no-any-return]
+
+
+def planes(numbers: Planes, bits: int = 32) -> Planes:
+    """Bit planes as ±1: float64 [bits, cells…]."""
+    return np.stack([(numbers >> np.uint64(j)) & np.uint64(1) for j in range(bits)]).astype(float) * 2 - 1
+
+
+def assert_fair(signs: Planes) -> None:
+    """Each row of ±1 sums up to about nothing."""
+    flat = signs.reshape(len(signs), -1)
+    deviations = flat.sum(1) / np.sqrt(flat.shape[1])
+    assert np.abs(deviations).max() < DEVIATIONS, deviations
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+@pytest.mark.parametrize("ident", IDENTS)
+def test_every_bit_is_fair_and_alone(bits: int, ident: int) -> None:
+    signs = planes(draws(ident=ident, bits=bits), bits)
+    assert_fair(signs)
+    for i in range(1, bits):  # bits of one draw
+        assert_fair(signs[i:] * signs[:-i])
+    for dy, dx in ((0, 1), (0, 2), (1, 0), (1, 1), (1, -1), (0, 31), (0, 32), (0, 33), (2, 0), (64, 0)):
+        assert_fair(signs * np.roll(signs, (dy, dx), (1, 2)))
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ({"step": 0}, {"step": 1}),
+        ({"step": 7}, {"step": 1 << 20}),
+        ({"seed": 0}, {"seed": 1}),
+        ({"seed": 5}, {"seed": 5 + (1 << 32)}),
+        ({"seed": 3}, {"seed": (1 << 63) - 1}),
+        ({"index": 0}, {"index": 1}),
+        ({"index": 1, "step": 0}, {"index": 0, "step": 1}),
+        ({"seed": 1, "index": 0}, {"seed": 0, "index": 1}),
+        ({"ident": IDENTS[0]}, {"ident": IDENTS[1]}),
+        ({"ident": 0, "step": 1}, {"ident": 1, "step": 0}),
+    ],
+)  # fmt: skip
+def test_draws_of_other_clocks_have_nothing_in_common(one: dict[str, int], other: dict[str, int]) -> None:
+    first, second = draws(**one), draws(**other)
+    assert not np.array_equal(first, second)
+    assert_fair(planes(first) * planes(second))
+    # Not displaced either: the same numbers at other cells would make patterns that wander.
+    for dy, dx in ((0, 1), (1, 0), (0, 32), (1, 1)):
+        assert_fair(planes(first) * np.roll(planes(second), (dy, dx), (1, 2)))
+    assert len(np.intersect1d(first, second)) < 5  # 20,480 of 2^32 twice: 0.1 are expected in common
+
+
+def test_a_cell_over_time_is_as_fair_as_a_grid() -> None:
+    """One cell of many steps, worlds and seeds: what a single-cell world sees."""
+    count = 4096
+    for fixed in ("step", "index", "seed"):
+        values = {name: np.full(count, 9) for name in ("seed", "index", "step")} | {fixed: np.arange(count)}
+        numbers = (draw(Clock(**values), IDENTS[1], 32, 1, 1)[:, 0, 0] * 2.0**32).astype(np.uint64)
+        assert len(np.unique(numbers)) >= count - 2
+        signs = planes(numbers)
+        assert_fair(signs)
+        for lag in (1, 2, 3, 4, 8, 16, 64):
+            assert_fair(signs[:, lag:] * signs[:, :-lag])
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+def test_numbers_are_uniform(bits: int) -> None:
+    """Chi-square over 256 equal parts of the unit interval, of the highest and of the lowest bits, and of pairs."""
+    numbers = draws(bits=bits, shape=(256, 320))
+    right = np.roll(numbers, -1, 1)
+    for parts in (
+        numbers >> np.uint64(bits - 8),
+        numbers & np.uint64(255),
+        (numbers >> np.uint64(bits - 4)) * np.uint64(16) + (right >> np.uint64(bits - 4)),
+        (numbers >> np.uint64(bits - 4)) * np.uint64(16) + (np.roll(numbers, -1, 0) >> np.uint64(bits - 4)),
+    ):
+        found = np.bincount(parts.ravel().astype(int), minlength=256)
+        expected = numbers.size / 256
+        statistic = ((found - expected) ** 2 / expected).sum()
+        # Wilson and Hilferty: the cube root of χ²/k is nearly normal, here with k = 255.
+        deviations = ((statistic / 255) ** (1 / 3) - (1 - 2 / (9 * 255))) / np.sqrt(2 / (9 * 255))
+        assert abs(deviations) < DEVIATIONS, (statistic, deviations)
+
+
+def test_draws_lie_strictly_inside_and_half_way_between_multiples() -> None:
+    clock = Clock(np.array([0, 7]), np.array([0, 3]), np.array([0, 0]))
+    values = draw(clock, 5, 16, 40, 70)
+    assert values.shape == (2, 40, 70)
+    assert 0 < values.min() < values.max() < 1
+    assert np.array_equal(values * 2.0**17 % 2, np.ones_like(values))
+    # 16 bits are the first 16 of 32: a finer stream of the same name agrees as far as it goes.
+    assert np.array_equal(np.floor(draw(clock, 5, 32, 40, 70) * 2**16), np.floor(values * 2**16))
+
+
+@pytest.mark.parametrize("backend", ["reference", "dense", "torch"])
+def test_rules_fire_as_often_as_their_chance_says(backend: str) -> None:
+    """Two rules with chances of their own: each fires as often as it says, and they know nothing of each other."""
+    text = """
+pack: p
+streams: {coarse: {bits: 16}}
+fields: {one: {type: flag, at: place}, two: {type: flag, at: place}, three: {type: flag, at: place}}
+elements: {a: {id: 0, color: "#000000"}}
+passes:
+  first:
+    do:
+      - one := yes where a with chance 20%
+      - two := yes where a with chance 0.5%
+      - three := coarse < 37.5%
+"""
+    simulator = compile_ruleset(load_text(text), backend=backend)
+    world = simulator.step(simulator.world(np.zeros((4, 200, 250), int), seed=11))
+    one, two, three = (world[name].numpy().astype(bool) for name in ("one", "two", "three"))
+    for fired, chance in (
+        (one, 0.2), (two, 0.005), (three, 0.375), (one & two, 0.001), (one & three, 0.075), (two & three, 0.001875),
+        (one & np.roll(one, 1, 2), 0.04), (one[:-1] & one[1:], 0.04),
+    ):  # fmt: skip
+        spread = np.sqrt(fired.size * chance * (1 - chance)) * np.sqrt(
+            2
+        )  # overlapping pairs are not independent
+        assert abs(fired.sum() - fired.size * chance) < DEVIATIONS * spread
+    # The four worlds of one seed differ, and so do two steps.
+    assert len({one[i].tobytes() for i in range(4)}) == 4
+    again = simulator.step(simulator.replace(world, one=0, two=0))
+    assert not np.array_equal(again["one"].numpy().astype(bool), one)
