@@ -179,10 +179,12 @@ def is_clean(node: Node, have: Callable[[Node], bool]) -> bool:
 def prerequisites(node: Node, have: Callable[[Node], bool]) -> list[Node]:
     """Nodes that must stand in planes before a loop can compute this one."""
     found: dict[int, Node] = {}
+    seen: set[int] = set()
 
     def visit(node: Node, top: bool) -> None:
-        if have(node) or is_uniform(node):
+        if id(node) in seen or have(node) or is_uniform(node):
             return
+        seen.add(id(node))
         if not top and node.op in ANCHORS:
             found[id(node)] = node
             return
@@ -207,19 +209,30 @@ def prerequisites(node: Node, have: Callable[[Node], bool]) -> list[Node]:
     return list(found.values())
 
 
-def zero_with(node: Node, planes: dict[int, str]) -> frozenset[str] | None:
+def zero_with(
+    node: Node, planes: dict[int, str], known: dict[int, frozenset[str] | None] | None = None
+) -> frozenset[str] | None:
     """Planes such that if all of them are empty, the value is too; None if none are known."""
+    known = {} if known is None else known  # graphs share nodes: each is asked once
+    if id(node) not in known:
+        known[id(node)] = _zero_with(node, planes, known)
+    return known[id(node)]
+
+
+def _zero_with(
+    node: Node, planes: dict[int, str], known: dict[int, frozenset[str] | None]
+) -> frozenset[str] | None:
     if id(node) in planes:
         return frozenset({planes[id(node)]})
     if node.op == "const":
         return None if node.attr else frozenset()
     if node.op == "shift":
-        return zero_with(node.args[0], planes)
+        return zero_with(node.args[0], planes, known)
     if node.op == "and":
-        found = [names for arg in node.args if (names := zero_with(arg, planes)) is not None]
+        found = [names for arg in node.args if (names := zero_with(arg, planes, known)) is not None]
         return min(found, key=len, default=None)
     if node.op in ("or", "xor", "select"):
-        parts = [zero_with(arg, planes) for arg in node.args[node.op == "select" :]]
+        parts = [zero_with(arg, planes, known) for arg in node.args[node.op == "select" :]]
         return (
             None
             if any(part is None for part in parts)

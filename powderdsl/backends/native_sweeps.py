@@ -10,6 +10,8 @@ from powderdsl.backends.native_layout import Layout, literal, param_key
 from powderdsl.ir.ops import REAL, Node, PassGraph, walk
 
 RECOMPUTE = 2
+FAR = 100
+"""The cost of what cannot be recomputed."""
 _INFIX = {"add": "+", "sub": "-", "mul": "*"}
 _COMPARE = {"eq": "==", "lt": "<", "le": "<="}
 
@@ -19,10 +21,15 @@ def real_cost(node: Node, have: Callable[[Node], bool]) -> int:
     if have(node) or node.op in ("const", "param"):
         return 0
     if node.op in _INFIX or node.op == "neg":
-        return 1 + sum(real_cost(arg, have) for arg in node.args)
+        total = 1
+        for arg in node.args:
+            total += real_cost(arg, have)
+            if total >= FAR:  # graphs share nodes: counting on would take forever
+                return FAR
+        return total
     if node.op == "shift" and node.attr[2]:
         return real_cost(node.args[0], have)
-    return 100
+    return FAR
 
 
 def sweep_needs(node: Node, have: Callable[[Node], bool]) -> tuple[list[Node], list[Node]]:

@@ -15,7 +15,8 @@ from powderdsl.testing.cases import Start, load_text
 if TYPE_CHECKING:
     from powderdsl.simulator import Simulator, World
 
-BACKENDS = ("reference", "torch")
+BACKENDS = ("reference", "dense", "planes")
+"""What random rulesets are compared on: native code takes seconds to compile, `torch` is one of the last two."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from powderdsl.testing.compare import assert_same, find_difference
 from powderdsl.testing.rulemaker import random_ruleset_text
 from powderdsl.testing.strategies import rulesets, worlds
 
-BACKENDS = ("reference", "dense", "torch")
+BACKENDS = ("reference", "dense", "planes")
 FIRST, LAST = (int(seed) for seed in os.environ.get("POWDERDSL_SEEDS", "0..250").split(".."))
 CHUNK = 25
 CHUNKS = range(FIRST, LAST, CHUNK)

@@ -152,7 +152,7 @@ def test_draws_lie_strictly_inside_and_half_way_between_multiples() -> None:
     assert np.array_equal(np.floor(draw(clock, 5, 32, 40, 70) * 2**16), np.floor(values * 2**16))
 
 
-@pytest.mark.parametrize("backend", ["reference", "dense", "torch"])
+@pytest.mark.parametrize("backend", ["reference", "dense", "planes"])
 def test_rules_fire_as_often_as_their_chance_says(backend: str) -> None:
     """Two rules with chances of their own: each fires as often as it says, and they know nothing of each other."""
     text = """
