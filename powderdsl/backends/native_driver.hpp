@@ -35,7 +35,10 @@ static Context* new_context(const Grid& g) {
   for (int i = 0; i < g.cells(); i++) c->everything->data[i] = c->valid(i % g.words);
   c->calm = new Field{nullptr, aligned<uint8_t>(LANES * g.height), 1, true};
   c->nothing_row = aligned<V>(g.words);
+  c->change = aligned<V>(2 * g.words);
+  c->late = aligned<V>((MOVING + 1) * g.words);
   c->zeros = aligned<float>(g.stride + CHUNK);
+  for (float*& row : c->scratch) row = aligned<float>(g.stride + CHUNK);
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
     for (int y = 0; y < g.height; y++)
@@ -52,7 +55,10 @@ static void free_context(Context* c) {
   release(c->everything);
   release(c->calm);
   free(c->nothing_row);
+  free(c->change);
+  free(c->late);
   free(c->zeros);
+  for (float* row : c->scratch) free(row);
   for (V* p : c->fixed) free(p);
   c->~Context();
   operator delete(c, std::align_val_t(64));
@@ -80,14 +86,6 @@ static void put_back(Context* c) {
   }
 }
 
-static void own(Context& c, Plane*& p) {  // a plane of this group alone
-  if (p != c.nothing && p != c.everything && p->refs == 1) return;
-  Plane* copy = take(c);
-  if (!p->zero) memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
-  copy->zero = p->zero;
-  give(c, p);
-  p = copy;
-}
 static void own(Context& c, Field*& f) {
   if (f != c.calm && f->refs == 1) return;
   Field* copy = take_field(c);

@@ -18,27 +18,30 @@ def sweep_lanes(
         values: what the outputs are where nothing is going on, None if that is not known.
         masks: flags that must be empty for that.
     """
-    takes, row_start, stores, word_end, row_end, quiet_row = [], [], [], [], [], []
+    takes, row_start, stores, row_end, quiet_row = [], [], [], [], []
     for position, (node, name, value) in enumerate(outputs):
         if node.type == REAL:
             takes.append(f"{name} = take_field(c); bool some{name} = false;")
             row_start.append(
-                f"float* o{name} = {name}->data + ((size_t)l{name} * height + y) * c.g.stride + HALO; u32 n{name} = 0;"
+                f"float* o{name} = {name}->data + ((size_t)l{name} * height + y) * c.g.stride + HALO; I n{name} = {{}};"
             )
             stores.append(
-                f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= bits_of(o != splatf(0)) & inside; }}"
+                f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= (I)blend(inside, o, splatf(0)); }}"
             )
             row_end.append(
-                f"finish_row(c, o{name}); {name}->live[l{name} * height + y] = n{name} != 0; some{name} |= n{name} != 0;"
+                f"finish_row(c, o{name}); {{ const bool some = any((V)(n{name} + n{name})); {name}->live[l{name} * height + y] = some; some{name} |= some; }}"
             )
             quiet_row.append(f"{name}->live[l{name} * height + y] = 0;")
         else:
             takes.append(f"{name} = take(c); u64 a{name} = 0;")
-            row_start.append(f"u64 u{name} = 0;")
-            stores.append(f"u{name} |= (u64)({value}) << (x & 63);")
+            row_start.append(
+                f"if (width & 63) ((u64*){name}->data)[(y * words + words - 1) * LANES + l] = 0;"
+            )
+            stores.append(
+                f"{{ const u32 o = {value} & inside; put_bits((u64*){name}->data + (y * words + w) * LANES + l, x, o); a{name} |= o; }}"
+            )
             rest = bool(values[position]) if values else False
             word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q; a{name} |= q;"
-            word_end.append(f"{{ const u64 q = u{name} & c.valid(w)[l]; {word} u{name} = 0; }}")
             quiet_row.append(
                 f"for (int w = 0; w < words; w++) {{ const u64 q = {'c.valid(w)[l]' if rest else '0'}; {word} }}"
             )
@@ -56,32 +59,33 @@ def sweep_lanes(
         f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];"
         for plane, name in sweep.words.items()
     ]
-    words += [f"const u64 {name} = {joined};" for joined, name in sweep.joined.items()]
     check = ""
     asked: tuple[str, ...] | None = None
     if values is not None:
         read = rows_read([node for node, _, _ in outputs], sweep.have)
         busy = [_busy(sweep, node, dy, wraps) for node, dy, wraps in read]
-        gates = [
-            f"((const u64*){sweep.planes[id(m)]}->data)[(y * words + w) * LANES + l]"
-            for m in masks
-            if m.op != "param"
-        ]
-        scan = f"for (int w = 0; w < words; w++) some |= {' | '.join(gates)};" if gates else ""
+        planes = tuple(dict.fromkeys(sweep.planes[id(m)] for m in masks if m.op != "param"))
+        if planes in sweep.unions:
+            planes = (sweep.unions[planes],)
+        scan = " ".join(f"some |= row_bits({plane}, y * words, words, l);" for plane in planes)
         fixed = "true" if any(m.op == "param" for m in masks) else " || ".join(busy) or "false"
         check = f"{{ u64 some = ({fixed}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet_row)} continue; }} }}"
         if not any(m.op == "param" for m in masks):
             still = [f"{sweep.fields[id(node)]}->still" for node, _, _ in read]
             asked = (*still, *(f"{sweep.planes[id(m)]}->zero" for m in masks))
     body = "\n".join([
-        f"{check}\n{rows} {' '.join(row_start)}",
+        f"{check}\n{rows} {' '.join(row_start)}", *sweep.layers,
         f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
         "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {",
         "const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;",
-        *sweep.lines, *stores, "}", " ".join(word_end), "}", " ".join(row_end),
+        *sweep.lines, *stores, "} }", " ".join(row_end),
     ])  # fmt: skip
     written = tuple((name, bool(values[i]) if values else False) for i, (_, name, _) in enumerate(outputs))
-    return Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, asked)
+    unions = "".join(
+        f"\nPlane* {name} = any_plane(c, {{{', '.join(planes)}}});" for planes, name in sweep.unions.items()
+    )
+    ends += "".join(f" give(c, {name});" for name in sweep.unions.values())
+    return Lanes(written, f"{' '.join(takes)}\n{pads}{unions}", body, ends, asked)
 
 
 def _busy(sweep: Sweep, node: Node, dy: int, wraps: bool) -> str:

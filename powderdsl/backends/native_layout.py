@@ -18,6 +18,10 @@ class Layout:
     param_reals: dict[str, int] = field(default_factory=dict)
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
+    scratch: int = 0
+    """Rows of reals that the busiest sweep works on."""
+    moving: int = 0
+    """Planes that most movements carry along."""
     reach: int = 1
 
 

@@ -16,6 +16,7 @@ from powderdsl.backends.native_loops import (
     prerequisites,
     zero_with,
 )
+from powderdsl.backends.native_moves import Movement, depends, move_call, movements
 from powderdsl.backends.native_sweeps import (
     Sweep,
     leading,
@@ -41,15 +42,18 @@ class PassWriter:
         self.alive = {id(n) for n in nodes}
         self.all_comparisons = [n for n in nodes if n.op in ("eq", "lt", "le")]
         nothing = lambda node: node.op == "input"  # noqa: E731
-        sources = [n.args[0] for n in nodes if n.op == "shift" and n.type == REAL]
-        self.stored = {id(part) for n in sources for part in stored_parts(n, nothing) if part.op != "input"}
+        shifts = [n for n in nodes if n.op == "shift" and n.type == REAL]
+        sources = [p for n in shifts for p in (stored_parts(n.args[0], nothing) if n.attr[2] else n.args)]
+        self.stored = {id(part) for part in sources if part.op != "input"}
         self.leaders = {
             id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))
         }
-        self.slot_of = {id(n): str(n.attr) for n in nodes if n.op == "input"}
+        self.input_nodes = {id(n): n for n in nodes if n.op == "input"}
+        self.slot_of = {key: str(n.attr) for key, n in self.input_nodes.items()}
 
     def source(self) -> str:
         current: dict[str, Node] = {}
+        self.borrow()
         for step in self.pass_.moments:
             self.moment(step, current)
             current.update(step.writes)
@@ -67,6 +71,15 @@ class PassWriter:
 
     def have(self, node: Node) -> bool:
         return id(node) in self.planes or id(node) in self.fields
+
+    def borrow(self) -> None:
+        """Slots that the pass both reads and writes: nobody else holds their planes while it runs."""
+        written = {slot for slot, _ in self.pass_.outputs}
+        for key, node in self.input_nodes.items():
+            if node.type != REAL and self.slot_of[key] in written:
+                self.planes[key] = name = self.fresh("p")
+                place = f"c.slot[{self.layout.planes[self.slot_of[key]]}]"
+                self.block.statements.append(f"Plane* {name} = {place}; {place} = nullptr;")
 
     def have_input(self, node: Node) -> None:
         """Slots that the pass reads: borrowed from the context."""
@@ -113,15 +126,45 @@ class PassWriter:
             return
         self.inputs([*guards, *(node for _, node in writes)])
         condition = self.guards(guards)
-        olds = {}
-        for slot, node in writes:
-            old = current.get(slot)
-            olds[id(node)] = self.old(slot, old)
-        names = {id(node): self.fresh("p") for _, node in writes}
+        olds = {id(node): self.old(slot, current.get(slot)) for slot, node in writes}
+        moved = movements([node for _, node in writes], [self.before(slot, current) for slot, _ in writes])
+        carried = [node for _, node in writes if id(node) in moved]
+        others = [node for _, node in writes if id(node) not in moved]
+        if depends(others, moved):
+            self.move(carried, moved, olds)
+            self.change(others, olds, condition)
+        else:
+            self.change(others, olds, condition)
+            self.move(carried, moved, olds)
+
+    def before(self, slot: str, current: dict[str, Node]) -> Node | None:
+        """The node that a slot holds before a moment."""
+        if slot in current:
+            return current[slot]
+        return next((self.input_nodes[i] for i in self.slot_of if self.slot_of[i] == slot), None)
+
+    def move(self, nodes: list[Node], moved: dict[int, Movement], olds: dict[int, str]) -> None:
+        """Carry planes along, in place where nothing else needs what they held."""
+        if not nodes:
+            return
+        movers = moved[id(nodes[0])].movers
+        self.ensure([movers])
+        self.layout.moving = max(self.layout.moving, len(nodes))
+        names = {id(node): self.fresh("p") for node in nodes}
+        self.block.statements.append(" ".join(f"Plane* {name} = keep({olds[key]});" for key, name in names.items()))
+        rows = [(name, moved[key]) for key, name in names.items()]
+        self.block.statements.append(move_call(rows, self.planes[id(movers)]))
+        self.planes.update(names)
+
+    def change(self, nodes: list[Node], olds: dict[int, str], condition: str) -> None:
+        """New planes, if any mask of the moment holds anywhere; the old ones otherwise."""
+        if not nodes:
+            return
+        names = {id(node): self.fresh("p") for node in nodes}
         outer = (self.planes, self.fields, self.block)
         self.planes, self.fields, self.block = dict(self.planes), dict(self.fields), Block()
-        self.ensure([node for _, node in writes])
-        inner_names = {id(node): self.planes[id(node)] for _, node in writes}
+        self.ensure(nodes)
+        inner_names = {id(node): self.planes[id(node)] for node in nodes}
         for key, name in names.items():
             self.block.statements.append(f"{name} = keep({inner_names[key]});")
         text = self.block.text()
@@ -399,6 +442,7 @@ class PassWriter:
             else:
                 name = self.fresh("p")
                 outputs.append((node, name, sweep.comparison(node, self.leaders)))
+        sweep.close()
         lanes = sweep_lanes(outputs, sweep, values, masks)
         kept = [unchanged(node) for node in nodes]
         if all(kept) and all(self.have(base) for base, _ in kept):  # type: ignore[misc]
@@ -439,9 +483,8 @@ class PassWriter:
             kind, table, prefix = (
                 ("real", self.layout.reals, "r") if node.type == REAL else ("slot", self.layout.planes, "s")
             )
-            lines.append(
-                f"give(c, c.{kind}[{table[slot]}]); c.{kind}[{table[slot]}] = {prefix}{table[slot]};"
-            )
+            place = f"c.{kind}[{table[slot]}]"
+            lines.append(f"if ({place}) give(c, {place}); {place} = {prefix}{table[slot]};")
         self.block.statements.append("\n".join(lines))
 
 

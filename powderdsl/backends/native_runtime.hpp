@@ -38,6 +38,11 @@ ALWAYS bool any(V a) {
   return r != 0;
 #endif
 }
+ALWAYS bool any_word(const V* row, int words) {
+  V some = row[0];
+  for (int w = 1; w < words; w++) some |= row[w];
+  return any(some);
+}
 ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }
 
 // Sixteen flags as bits 0..15, and back as a choice between two vectors.
@@ -55,6 +60,15 @@ ALWAYS u32 bits_of(I m) {
   return r;
 #endif
 }
+// Comparisons of sixteen floats as bits 0..15.
+#if defined(__AVX512F__)
+#define COMPARE(name, kind, op) ALWAYS u32 name(F a, F b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, kind); }
+#else
+#define COMPARE(name, kind, op) ALWAYS u32 name(F a, F b) { return bits_of(a op b); }
+#endif
+COMPARE(bits_eq, _CMP_EQ_OQ, ==)
+COMPARE(bits_lt, _CMP_LT_OQ, <)
+COMPARE(bits_le, _CMP_LE_OQ, <=)
 ALWAYS F blend(u32 bits, F yes, F no) {
 #if defined(__AVX512F__)
   return (F)_mm512_mask_blend_ps((__mmask16)bits, (__m512)no, (__m512)yes);
@@ -76,6 +90,20 @@ ALWAYS F root(F a) {
 }
 ALWAYS F magnitude(F a) { return (F)((I)a & (I)splatu(0x7fffffff)); }
 ALWAYS F divide(F a, F b) { return choose(b == 0.0f, splatf(0), a / b); }
+// x / d, rounded as a division is: a product with 1/d, and one correction, are exact where nothing over- or underflows.
+ALWAYS F divide_by(F x, float d, float inverse) {
+#if defined(__AVX512F__)
+  const I size = (I)magnitude(x);
+  const I odd = (size < (I)splatf(0x1p-60f)) & (size != 0);
+  if (__builtin_expect(bits_of(odd | (size > (I)splatf(0x1p60f))), 0)) return x / splatf(d);
+  const __m512 q = _mm512_mul_ps((__m512)x, _mm512_set1_ps(inverse));
+  const __m512 rest = _mm512_fnmadd_ps(q, _mm512_set1_ps(d), (__m512)x);
+  return (F)_mm512_fmadd_ps(rest, _mm512_set1_ps(inverse), q);
+#else
+  (void)inverse;
+  return x / splatf(d);
+#endif
+}
 ALWAYS F smaller(F a, F b) { return choose(a < b, a, choose(a != a, a, b)); }
 ALWAYS F larger(F a, F b) { return choose(a > b, a, choose(a != a, a, b)); }
 ALWAYS F settle(F x, float lo, float hi, float snap) {
@@ -113,6 +141,8 @@ struct Context {
   Plane *nothing, *everything;
   Field* calm;  // no row of it is live
   V* nothing_row;
+  V *change, *late;  // two rows of words; a row for each plane that moves
+  float* scratch[SCRATCH_ROWS + 1];  // rows of reals that sweeps work on
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
   V step_bits[STEP_PLANES + 1];
@@ -341,6 +371,96 @@ OUTLINE Plane* arrive_plane(Context& c, Plane* content, const Plane* targets, Pl
   r->zero = !any(some);
   return r;
 }
+// A plane of this owner alone, to be written over.
+static void own(Context& c, Plane*& p) {
+  if (p != c.nothing && p != c.everything && p->refs == 1) return;
+  Plane* copy = take(c);
+  if (p->zero) memset(copy->data, 0, sizeof(V) * c.g.cells());
+  else memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
+  copy->zero = p->zero;
+  give(c, p);
+  p = copy;
+}
+// Planes that move together, in place. `leaves` is what movers leave behind.
+enum Leaves { NOTHING, EVERYTHING, SAME };
+struct Moving { Plane** plane; Leaves leaves; };
+static int own_all(Context& c, const Moving* all, int count, V** data, Leaves* leaves) {
+  int n = 0;
+  for (int k = 0; k < count; k++) {
+    Plane*& p = *all[k].plane;
+    if (p->zero && all[k].leaves != EVERYTHING) continue;
+    own(c, p);
+    p->zero = false;
+    data[n] = p->data;
+    leaves[n++] = all[k].leaves;
+  }
+  return n;
+}
+// Movers exchange what they hold with their targets. No cell is both.
+OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, const Moving* all, int count) {
+  if (movers->zero) return;
+  V* data[MOVING + 1];
+  Leaves leaves[MOVING + 1];
+  const int n = own_all(c, all, count, data, leaves), words = c.g.words, by = c.turn[dx + HALO], back = c.g.width - by;
+  for (int y = 0; y < c.g.height; y++) {
+    const V* m = movers->data + y * words;
+    if (words > 1 && dx) {
+      if (!any_word(m, words)) continue;
+      for (int k = 0; k < n; k++) {
+        V *here = data[k] + y * words, *there = data[k] + c.row(y + dy);
+        for (int w = 0; w < words; w++) c.change[w] = (here[w] ^ columns(c, there, w, dx)) & m[w];
+        for (int w = 0; w < words; w++) here[w] ^= c.change[w];
+        for (int w = 0; w < words; w++) there[w] ^= columns(c, c.change, w, -dx);
+      }
+      continue;
+    }
+    for (int w = 0; w < words; w++) {
+      if (!any(m[w])) continue;
+      const int here = y * words + w, there = c.row(y + dy) + w;
+      for (int k = 0; k < n; k++) {
+        const V a = data[k][here], b = data[k][there];
+        const V d = (a ^ (by ? (b >> by) | (b << back) : b)) & m[w];
+        data[k][here] = a ^ d;
+        data[k][there] ^= by ? ((d << by) | (d >> back)) & c.valid_last : d;  // read again: it may be the same row
+      }
+    }
+  }
+}
+ALWAYS V left(V a, V movers, Leaves leaves) {
+  return leaves == NOTHING ? a & ~movers : leaves == EVERYTHING ? a | movers : a;
+}
+// Movers go to their targets, at most a row away. A cell that is both holds what arrives: each row is read before
+// anything arrives there, and what goes around the edge arrives last.
+OUTLINE void arrive_planes(Context& c, const Plane* movers, int dy, int dx, const Moving* all, int count) {
+  if (movers->zero) return;
+  V* data[MOVING + 1];
+  Leaves leaves[MOVING + 1];
+  const int n = own_all(c, all, count, data, leaves), words = c.g.words, height = c.g.height;
+  V *targets = c.change, *moving = c.change + words;
+  for (int i = 0, y = dy > 0 ? height - 1 : 0; i < height; i++, y += dy > 0 ? -1 : 1) {
+    const V* m = movers->data + y * words;
+    if (!any_word(m, words)) continue;
+    const bool around = y + dy < 0 || y + dy >= height;
+    for (int w = 0; w < words; w++) targets[w] = dx ? columns(c, m, w, -dx) : m[w];
+    for (int k = 0; k < n; k++) {
+      V *here = data[k] + y * words, *there = around ? c.late + k * words : data[k] + c.row(y + dy);
+      for (int w = 0; w < words; w++) moving[w] = here[w] & m[w];
+      for (int w = 0; w < words; w++) here[w] = left(here[w], m[w], leaves[k]);
+      for (int w = 0; w < words; w++) {
+        const V arriving = dx ? columns(c, moving, w, -dx) : moving[w];
+        there[w] = around ? arriving : (there[w] & ~targets[w]) | arriving;
+      }
+    }
+  }
+  const int edge = dy > 0 ? height - 1 : 0;
+  const V* m = movers->data + edge * words;
+  if (!dy || !any_word(m, words)) return;
+  for (int w = 0; w < words; w++) targets[w] = dx ? columns(c, m, w, -dx) : m[w];
+  for (int k = 0; k < n; k++) {
+    V* there = data[k] + c.row(edge + dy);
+    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | c.late[k * words + w];
+  }
+}
 OUTLINE Plane* cleared(Context& c, Plane* old, const Plane* where) {  // old and not where
   if (old->zero || where->zero) return keep(old);
   Plane* r = take(c);
@@ -369,11 +489,37 @@ ALWAYS const float* real_row_or_nothing(const Context& c, const Field* f, int la
   return y >= 0 && y < c.g.height ? real_row(c, f, lane, y) : c.zeros + HALO;
 }
 ALWAYS F inside_columns(F value, int x, int dx, int width) {
+  if (__builtin_expect(x + dx >= 0 && x + dx + CHUNK <= width, 1)) return value;
   const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
   I at = lane + (x + dx);
   return (F)((I)value & (at >= 0) & (at < width));
 }
 ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
+// All columns of a world's row together.
+ALWAYS u64 row_bits(const Plane* p, int first, int words, int lane) {
+  u64 some = 0;
+  for (int w = 0; w < words; w++) some |= ((const u64*)p->data)[(first + w) * LANES + lane];
+  return some;
+}
+OUTLINE Plane* any_plane(Context& c, const std::initializer_list<const Plane*>& planes) {
+  Plane* r = take(c);
+  for (int i = 0, n = c.g.cells(); i < n; i++) r->data[i] = splat(0);
+  for (const Plane* p : planes)
+    if (!p->zero)
+      for (int i = 0, n = c.g.cells(); i < n; i++) r->data[i] |= p->data[i];
+  r->zero = false;
+  return r;
+}
+// Sixteen flags of one world's word, which is kept little end first.
+ALWAYS void put_bits(u64* word, int x, u32 bits) {
+#if __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
+  const uint16_t half = (uint16_t)bits;
+  memcpy((char*)word + (x & 63) / 8, &half, 2);
+#else
+  const int by = x & 63;
+  *word = (*word & ~(0xffffull << by)) | (u64)bits << by;
+#endif
+}
 // After the chunks of a row: nothing beyond the width, then the halo.
 ALWAYS void finish_row(const Context& c, float* row) {
   int w = c.g.width;

@@ -13,7 +13,6 @@ RECOMPUTE = 2
 FAR = 100
 """The cost of what cannot be recomputed."""
 _INFIX = {"add": "+", "sub": "-", "mul": "*"}
-_COMPARE = {"eq": "==", "lt": "<", "le": "<="}
 
 
 def real_cost(node: Node, have: Callable[[Node], bool]) -> int:
@@ -72,12 +71,18 @@ class Sweep:
         self.memo: dict[tuple[int, int, int], str] = {}
         self.rows: dict[str, str] = {}
         self.words: dict[str, str] = {}
-        self.joined: dict[str, str] = {}
         self.flags: dict[int, str] = {}
         self.wanted: list[Node] = []
         """Choices that this sweep will compute anyway."""
         self.used: set[str] = set()
         self.counter = [0]
+        self.layers: list[str] = []
+        """Loops over a whole row that come before the chunks: choices laid over each other, one after the other."""
+        self.scratch: list[str] = []
+        self.unions: dict[tuple[str, ...], str] = {}
+        """Planes joined before the sweep, and the variables that hold the result."""
+        self.led: dict[str, tuple[Sweep, list[str]]] = {}
+        """What is computed only where a comparison holds somewhere in the chunk, by its flag."""
 
     def have(self, node: Node) -> bool:
         return id(node) in self.fields or id(node) in self.planes
@@ -85,7 +90,14 @@ class Sweep:
     def inner(self) -> Sweep:
         nested = Sweep(self.planes, self.fields, self.layout)
         nested.memo, nested.counter = dict(self.memo), self.counter
-        nested.rows, nested.words, nested.used, nested.joined = self.rows, self.words, self.used, self.joined
+        nested.rows, nested.words, nested.used = self.rows, self.words, self.used
+        nested.layers, nested.scratch, nested.unions = self.layers, self.scratch, self.unions
+        return nested
+
+    def apart(self) -> Sweep:
+        """For a loop of its own over the row: only the pointers to rows are shared."""
+        nested = Sweep(self.planes, self.fields, self.layout)
+        nested.counter, nested.rows, nested.used = self.counter, self.rows, self.used
         return nested
 
     def row(self, field: str, dy: int, wraps: bool = True) -> str:
@@ -100,12 +112,14 @@ class Sweep:
             call = f"real_row(c, {field}, l{field}, y)"
         return self.rows.setdefault(call, f"r{len(self.rows)}")
 
-    def word(self, node: Node) -> str:
-        """The word of a flag's plane, read once a row and word."""
+    def word(self, node: Node, place: str = "") -> str:
+        """The word of a flag's plane, read once a row and word, or where it stands."""
         if node.op == "param":
             return f"c.param_bits[{self.layout.param_planes[param_key(node)]}][l]"
         plane = self.planes[id(node)]
         self.used.add(plane)
+        if place:
+            return f"((const u64*){plane}->data)[(y * words + {place}) * LANES + l]"
         return self.words.setdefault(plane, f"m{len(self.words)}")
 
     def mask(self, node: Node) -> str:
@@ -159,7 +173,7 @@ class Sweep:
             case "div":
                 divisor = args[1]
                 if divisor.op == "const" and divisor.attr:
-                    return self.temporary(f"{values[0]} / {values[1]}")
+                    return self.temporary(quotient(values[0], float(divisor.attr)))
                 return self.temporary(f"divide({values[0]}, {values[1]})")
             case "neg":
                 return self.temporary(f"-{values[0]}")
@@ -188,17 +202,23 @@ class Sweep:
         """Sixteen bits of a comparison; nothing is computed where the comparison that leads it fails everywhere."""
         leader = leaders.get(id(node))
         known = self.flags.get(id(leader)) if leader is not None else None
-        block = self.inner() if known else self
-        a, b = (block.value(arg) for arg in node.args)
-        bits = f"bits_of({a} {_COMPARE[node.op]} {b})"
         self.counter[0] += 1
         name = f"b{self.counter[0]}"
+        block, ends = self.led.setdefault(known, (self.inner(), [])) if known else (self, self.lines)
+        a, b = (block.value(arg) for arg in node.args)
+        bits = f"bits_{node.op}({a}, {b})"
         if known:
-            self.lines.append(f"u32 {name} = 0; if ({known}) {{ {' '.join(block.lines)} {name} = {bits}; }}")
+            self.lines.append(f"u32 {name} = 0;")
+            ends.append(f"{name} = {bits};")
         else:
             self.lines.append(f"const u32 {name} = {bits};")
         self.flags[id(node)] = name
         return name
+
+    def close(self) -> None:
+        """Write what hangs on comparisons."""
+        for known, (block, ends) in self.led.items():
+            self.lines.append(f"if ({known}) {{ {' '.join([*block.lines, *ends])} }}")
 
     def select(self, node: Node) -> str:
         """Choices laid over each other. Where no cell of the chunk is chosen, nothing of a choice is computed."""
@@ -211,6 +231,8 @@ class Sweep:
             if other is not node and (id(other), 0, 0) not in self.memo
         ]
         chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
+        if len(chain) > 2 and self.stands_alone(chains):
+            return self.lay(chains)
         names = []
         for one in chains:
             base = self.value(one[-1].args[2])
@@ -236,13 +258,70 @@ class Sweep:
         for one, name in zip(chains[1:], names[1:], strict=True):
             self.memo[id(one[0]), 0, 0] = name
         name = names[0]
-        lines = "\n".join(block.lines)
-        if len(chain) > 2:
-            words = " | ".join(dict.fromkeys(self.word(choice.args[0]) for choice in chain))
-            joined = self.joined.setdefault(words, f"j{len(self.joined)}")
-            lines = f"if ({joined} >> (x & 63) & 0xffff) {{\n{lines}\n}}"
-        self.lines.append(lines)
+        self.lines.append("\n".join(block.lines))
         return name
+
+    def stands_alone(self, chains: list[list[Node]]) -> bool:
+        """Whether choices can be laid row by row: over a stored row, and nothing in them is itself a choice or a draw."""
+        if not all(self.have(chain[-1].args[2]) for chain in chains) or any(
+            choice.args[0].op == "param" for choice in chains[0]
+        ):
+            return False
+        seen = {id(choice) for chain in chains for choice in chain}
+        stack = [part for chain in chains for choice in chain for part in choice.args[1:]]
+        while stack:
+            node = stack.pop()
+            if id(node) in seen or self.have(node):
+                continue
+            seen.add(id(node))
+            if node.op in ("select", "draw"):
+                return False
+            stack.extend(node.args)
+        return True
+
+    def lay(self, chains: list[list[Node]]) -> str:
+        """Choices laid over each other in rows of their own; a choice that holds nowhere in the row costs one test."""
+        rows = [f"q{len(self.scratch) + i}" for i in range(len(chains))]
+        self.scratch += rows
+        self.layout.scratch = max(self.layout.scratch, len(self.scratch))
+        bases = [self.row(self.fields[id(chain[-1].args[2])], 0) for chain in chains]
+        masks = tuple(dict.fromkeys(self.planes[id(choice.args[0])] for choice in chains[0]))
+        some = self.unions.setdefault(masks, f"any{len(self.unions)}")
+        declared = " ".join(f"const float* s{row} = {base};" for row, base in zip(rows, bases, strict=True))
+        starts = " ".join(f"float* {row} = c.scratch[{row[1:]}] + HALO; s{row} = {row};" for row in rows)
+        copies = " ".join(f"*(F*)({row} + x) = load({base}, x);" for row, base in zip(rows, bases, strict=True))
+        self.layers.append(
+            f"{declared}\nif (row_bits({some}, y * words, words, l)) {{ {starts}\n"
+            f"for (int x = 0; x < width; x += CHUNK) {{ {copies} }}"
+        )
+        for level in reversed(range(len(chains[0]))):
+            layer = self.apart()
+            olds = [layer.temporary(f"*(const F*)({row} + x)") for row in rows]
+            for chain, old in zip(chains, olds, strict=True):
+                layer.memo[id(chain[level].args[2]), 0, 0] = old
+            values = [layer.value(chain[level].args[1]) for chain in chains]
+            stores = [
+                f"*(F*)({row} + x) = blend(bits, {value}, {old});"
+                for row, value, old in zip(rows, values, olds, strict=True)
+            ]
+            word = self.apart().word(chains[0][level].args[0], "w")
+            self.layers.append(
+                f"for (int w = 0; w < words; w++) if (const u64 m = {word})\n"
+                "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) { const u32 bits = m >> (x & 63) & 0xffff;\n"
+                f"{' '.join([*layer.lines, *stores])} }}"
+            )
+        self.layers.append("}")
+        for chain, row in zip(chains, rows, strict=True):
+            self.memo[id(chain[0]), 0, 0] = self.temporary(f"load(s{row}, x)")
+        return self.memo[id(chains[0][0]), 0, 0]
+
+
+def quotient(value: str, divisor: float) -> str:
+    """A division by a constant. By a product, if the divisor's fraction is not all ones (Markstein 1990, theorem 8)."""
+    short = np.float32(divisor)
+    if short.view(np.uint32) & 0x7FFFFF == 0x7FFFFF or not 2.0**-60 < abs(divisor) < 2.0**60:
+        return f"{value} / splatf({literal(divisor)})"
+    return f"divide_by({value}, {literal(divisor)}, {literal(float(np.float32(1) / short))})"
 
 
 def leading(node: Node, comparisons: list[Node], pass_: PassGraph) -> Node | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import frexp
 
+import numpy as np
+
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, REAL, Node
 from powderdsl.ir.rewrite import Rewrite
@@ -184,6 +186,21 @@ def _divide(node: Node, build: Builder) -> Node | None:
     return None
 
 
+def _root(node: Node, build: Builder) -> Node | None:
+    """c < √x = c' < x, where c' is the last float whose root does not exceed c: roots are rounded, but never out of order."""
+    if node.op != "lt" or node.args[1].op != "sqrt" or node.args[0].op != "const":
+        return None
+    limit = np.float32(node.args[0].attr)
+    if not 0 <= limit < 1e18:  # its square must be finite
+        return None
+    square = np.float32(limit) * np.float32(limit)
+    while np.sqrt(square) > limit:
+        square = np.nextafter(square, np.float32(0))
+    while np.sqrt(after := np.nextafter(square, np.float32(np.inf))) <= limit:
+        square = after
+    return build.compare("lt", build.real(float(square)), node.args[1].args[0])
+
+
 def _count(node: Node, build: Builder) -> Node | None:
     if node.op == "count" and _is(node.args[0], False):
         return build.whole(0)
@@ -192,4 +209,5 @@ def _count(node: Node, build: Builder) -> Node | None:
 
 FOLD: tuple[Rewrite, ...] = (
     _not, _and_or, _xor, _in_set, _compare, _whole_constants, _select, _movement, _shift_of_constant, _below, _count, _divide,
+    _root,
 )  # fmt: skip
