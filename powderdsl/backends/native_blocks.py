@@ -19,6 +19,8 @@ class Lanes:
     after: str
     asked: tuple[str, ...] | None
     """Conditions under which all outputs are quiet, besides outputs of sweeps in the same loop; None: never."""
+    by_row: bool = True
+    """Whether `rows` is the body of a loop over rows `y`; else it has loops of its own."""
 
     @property
     def fields(self) -> set[str]:
@@ -82,7 +84,10 @@ def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
         f"const int l{name} = {'0' if name in written - seen_outside else 'l'};" for name in used
     )
     before = "\n".join(sweep.before for sweep in run)
-    rows = "\n".join(f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}" for sweep in run)
+    rows = "\n".join(
+        f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}" if sweep.by_row else f"{{\n{sweep.rows}\n}}"
+        for sweep in run
+    )
     after = "\n".join(sweep.after for sweep in run)
     loop = f"{before}\nfor (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
     outputs = [output for sweep in run for output in sweep.outputs]

@@ -38,7 +38,7 @@ static Context* new_context(const Grid& g) {
   c->change = aligned<V>(2 * g.words);
   c->late = aligned<V>((MOVING + 1) * g.words);
   c->zeros = aligned<float>(g.stride + CHUNK);
-  for (float*& row : c->scratch) row = aligned<float>(g.stride + CHUNK);
+  c->active = aligned<u64>((size_t)(ACTIVE + 1) * LANES * c->active_words());
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
     for (int y = 0; y < g.height; y++)
@@ -58,7 +58,7 @@ static void free_context(Context* c) {
   free(c->change);
   free(c->late);
   free(c->zeros);
-  for (float* row : c->scratch) free(row);
+  free(c->active);
   for (V* p : c->fixed) free(p);
   c->~Context();
   operator delete(c, std::align_val_t(64));

@@ -33,20 +33,20 @@ def sweep_lanes(
             )
             quiet_row.append(f"{name}->live[l{name} * height + y] = 0;")
         else:
-            takes.append(f"{name} = take(c); u64 a{name} = 0;")
+            takes.append(f"{name} = take(c);")
             row_start.append(
                 f"if (width & 63) ((u64*){name}->data)[(y * words + words - 1) * LANES + l] = 0;"
             )
             stores.append(
-                f"{{ const u32 o = {value} & inside; put_bits((u64*){name}->data + (y * words + w) * LANES + l, x, o); a{name} |= o; }}"
+                f"{{ const u32 o = {value}; put_bits((u64*){name}->data + (y * words + w) * LANES + l, x, o); }}"
             )
             rest = bool(values[position]) if values else False
-            word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q; a{name} |= q;"
+            word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q;"
             quiet_row.append(
                 f"for (int w = 0; w < words; w++) {{ const u64 q = {'c.valid(w)[l]' if rest else '0'}; {word} }}"
             )
     ends = " ".join(
-        f"{name}->zero = !a{name};" if node.type != REAL else f"{name}->still = !some{name};"
+        f"close_plane(c, {name});" if node.type != REAL else f"{name}->still = !some{name};"
         for node, name, _ in outputs
     )
     pads = " ".join(
@@ -65,8 +65,6 @@ def sweep_lanes(
         read = rows_read([node for node, _, _ in outputs], sweep.have)
         busy = [_busy(sweep, node, dy, wraps) for node, dy, wraps in read]
         planes = tuple(dict.fromkeys(sweep.planes[id(m)] for m in masks if m.op != "param"))
-        if planes in sweep.unions:
-            planes = (sweep.unions[planes],)
         scan = " ".join(f"some |= row_bits({plane}, y * words, words, l);" for plane in planes)
         fixed = "true" if any(m.op == "param" for m in masks) else " || ".join(busy) or "false"
         check = f"{{ u64 some = ({fixed}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet_row)} continue; }} }}"
@@ -74,18 +72,14 @@ def sweep_lanes(
             still = [f"{sweep.fields[id(node)]}->still" for node, _, _ in read]
             asked = (*still, *(f"{sweep.planes[id(m)]}->zero" for m in masks))
     body = "\n".join([
-        f"{check}\n{rows} {' '.join(row_start)}", *sweep.layers,
+        f"{check}\n{rows} {' '.join(row_start)}",
         f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
         "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {",
         "const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;",
         *sweep.lines, *stores, "} }", " ".join(row_end),
     ])  # fmt: skip
     written = tuple((name, bool(values[i]) if values else False) for i, (_, name, _) in enumerate(outputs))
-    unions = "".join(
-        f"\nPlane* {name} = any_plane(c, {{{', '.join(planes)}}});" for planes, name in sweep.unions.items()
-    )
-    ends += "".join(f" give(c, {name});" for name in sweep.unions.values())
-    return Lanes(written, f"{' '.join(takes)}\n{pads}{unions}", body, ends, asked)
+    return Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, asked)
 
 
 def _busy(sweep: Sweep, node: Node, dy: int, wraps: bool) -> str:

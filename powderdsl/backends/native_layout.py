@@ -18,8 +18,8 @@ class Layout:
     param_reals: dict[str, int] = field(default_factory=dict)
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
-    scratch: int = 0
-    """Rows of reals that the busiest sweep works on."""
+    active: int = 0
+    """Lists of active rows that the busiest pass keeps."""
     moving: int = 0
     """Planes that most movements carry along."""
     reach: int = 1

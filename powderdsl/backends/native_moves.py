@@ -63,9 +63,16 @@ def depends(nodes: list[Node], on: dict[int, Movement]) -> bool:
     return any(id(inner) in on for node in nodes for inner in walk(node))
 
 
-def move_call(moved: list[tuple[str, Movement]], movers: str) -> str:
-    """The statement that moves variables in place; each owns its plane, or gets one of its own."""
+def move_calls(moved: list[tuple[str, Movement]], movers: str) -> str:
+    """The statements that move variables in place; each owns its plane, or gets one of its own."""
     first = moved[0][1]
-    rows = ", ".join(f"{{&{name}, {movement.leaves}}}" for name, movement in moved)
-    call = f"{first.op}_planes(c, {movers}, {first.offset[0]}, {first.offset[1]}, all, {len(moved)})"
-    return f"{{ const Moving all[] = {{{rows}}}; {call}; }}"
+    kinds: dict[str, list[str]] = {}
+    for name, movement in moved:
+        kinds.setdefault(movement.leaves, []).append(f"&{name}")
+    dy, dx = first.offset
+    calls = []
+    for leaves, names in kinds.items():
+        function = "swap_planes" if first.op == "swap" else f"arrive_planes<{leaves}>"
+        call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(names)});"
+        calls.append(f"{{ Plane** const all[] = {{{', '.join(names)}}}; {call} }}")
+    return " ".join(calls)

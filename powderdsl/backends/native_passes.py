@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from powderdsl.backends.native_blocks import Block, Lanes, lane_loop
 from powderdsl.backends.native_lanes import sweep_lanes
+from powderdsl.backends.native_layers import choices, layer_lanes
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_loops import (
     ANCHORS,
@@ -16,7 +17,7 @@ from powderdsl.backends.native_loops import (
     prerequisites,
     zero_with,
 )
-from powderdsl.backends.native_moves import Movement, depends, move_call, movements
+from powderdsl.backends.native_moves import Movement, depends, move_calls, movements
 from powderdsl.backends.native_sweeps import (
     Sweep,
     leading,
@@ -38,6 +39,7 @@ class PassWriter:
         self.block = Block()
         self.targets: dict[tuple[int, int, int], str] = {}
         self.count = 0
+        self.active = 0
         nodes = list({id(n): n for _, root in pass_.outputs for n in walk(root)}.values())
         self.alive = {id(n) for n in nodes}
         self.all_comparisons = [n for n in nodes if n.op in ("eq", "lt", "le")]
@@ -153,7 +155,7 @@ class PassWriter:
         names = {id(node): self.fresh("p") for node in nodes}
         self.block.statements.append(" ".join(f"Plane* {name} = keep({olds[key]});" for key, name in names.items()))
         rows = [(name, moved[key]) for key, name in names.items()]
-        self.block.statements.append(move_call(rows, self.planes[id(movers)]))
+        self.block.statements.append(move_calls(rows, self.planes[id(movers)]))
         self.planes.update(names)
 
     def change(self, nodes: list[Node], olds: dict[int, str], condition: str) -> None:
@@ -321,9 +323,12 @@ class PassWriter:
             i for n in reals for i in walk(n) if id(i) in self.stored and not self.have(i) and i not in reals
         ]
         reals = list(dict.fromkeys(reals))
+        laid = [n for n in reals if self.is_laid(n)]
         moves = [n for n in wanted if n.op in ("swap", "arrive") and n.type == FLAG]
         loops = [n for n in wanted if n not in reals and n not in moves]
-        if reals:
+        if laid:
+            self.lay(laid)
+        if reals := [n for n in reals if n not in laid]:
             self.sweep(reals)
         if loops:
             self.loop(loops)
@@ -332,7 +337,12 @@ class PassWriter:
 
     def direct_needs(self, node: Node) -> list[Node]:
         if node.type == REAL or node.op in ("eq", "lt", "le"):
-            flags, reals = sweep_needs(node, self.have)
+            if self.is_laid(node):
+                chain = choices(node, self.have)
+                parts = [part for choice in chain for part in sweep_needs(choice.args[1], self.have)]
+                needs = [choice.args[0] for choice in chain] + [need for part in parts for need in part]
+                return [need for need in (*needs, chain[-1].args[2]) if not self.have(need) and need not in chain]
+            flags, reals = sweep_needs(node, self.have, self.is_laid if not unchanged(node) else lambda _: False)
             return [*flags, *reals]
         if node.op in ("swap", "arrive"):
             content, movers, rest = node.args
@@ -451,6 +461,23 @@ class PassWriter:
             self.block.statements.append(lanes)
         for node, name, _ in outputs:
             (self.fields if node.type == REAL else self.planes)[id(node)] = name
+
+    def is_laid(self, node: Node) -> bool:
+        """Whether a real is made of choices laid over each other."""
+        return node.type == REAL and node.op == "select" and bool(choices(node, self.have))
+
+    def lay(self, nodes: list[Node]) -> None:
+        """Choices in fields of their own; those that hang on the same masks together."""
+        groups: dict[tuple[int, ...], list[list[Node]]] = {}
+        for node in nodes:
+            chain = choices(node, self.have)
+            groups.setdefault(tuple(id(choice.args[0]) for choice in chain), []).append(chain)
+        for chains in groups.values():
+            names = [self.fresh("f") for _ in chains]
+            lanes = layer_lanes(chains, names, self.planes, self.fields, self.layout, self.active)
+            self.active += len(chains[0]) + 1
+            self.block.statements.append(lanes)
+            self.fields.update({id(chain[0]): name for chain, name in zip(chains, names, strict=True)})
 
     def changed_rows(
         self, outputs: list[tuple[Node, str, str]], kept: list[tuple[Node, list[Node]]], sweep: Lanes

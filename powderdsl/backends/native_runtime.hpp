@@ -38,6 +38,15 @@ ALWAYS bool any(V a) {
   return r != 0;
 #endif
 }
+ALWAYS uint8_t lanes_of(V a) {  // a bit for each world that has any
+#if defined(__AVX512F__)
+  return _mm512_test_epi64_mask((__m512i)a, (__m512i)a);
+#else
+  uint8_t r = 0;
+  for (int i = 0; i < LANES; i++) r |= (uint8_t)(a[i] != 0) << i;
+  return r;
+#endif
+}
 ALWAYS bool any_word(const V* row, int words) {
   V some = row[0];
   for (int w = 1; w < words; w++) some |= row[w];
@@ -107,10 +116,15 @@ ALWAYS F divide_by(F x, float d, float inverse) {
 ALWAYS F smaller(F a, F b) { return choose(a < b, a, choose(a != a, a, b)); }
 ALWAYS F larger(F a, F b) { return choose(a > b, a, choose(a != a, a, b)); }
 ALWAYS F settle(F x, float lo, float hi, float snap) {
+#if defined(__AVX512F__)
+  const __mmask16 some = _mm512_cmp_ps_mask((__m512)magnitude(x), _mm512_set1_ps(snap), _CMP_GE_OQ);  // not for a NaN
+  return (F)_mm512_maskz_max_ps(some, _mm512_min_ps((__m512)x, _mm512_set1_ps(hi)), _mm512_set1_ps(lo));
+#else
   x = choose(x == x, x, splatf(0));
   x = choose(x < lo, splatf(lo), x);
   x = choose(x > hi, splatf(hi), x);
   return choose(magnitude(x) < snap, splatf(0), x);
+#endif
 }
 
 struct Plane {
@@ -142,7 +156,7 @@ struct Context {
   Field* calm;  // no row of it is live
   V* nothing_row;
   V *change, *late;  // two rows of words; a row for each plane that moves
-  float* scratch[SCRATCH_ROWS + 1];  // rows of reals that sweeps work on
+  u64* active;  // lists of rows, a bit each: [ACTIVE][LANES][active_words]
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
   V step_bits[STEP_PLANES + 1];
@@ -156,6 +170,7 @@ struct Context {
   V valid(int w) const { return w == g.words - 1 ? valid_last : splat(~0ull); }
   int row(int y) const { return wrapped[y + HALO]; }
   int line(int y) const { return lines[y + HALO]; }
+  int active_words() const { return (g.height + 63) / 64; }
 };
 
 template <class T> static T* aligned(size_t count) {
@@ -381,27 +396,20 @@ static void own(Context& c, Plane*& p) {
   give(c, p);
   p = copy;
 }
-// Planes that move together, in place. `leaves` is what movers leave behind.
-enum Leaves { NOTHING, EVERYTHING, SAME };
-struct Moving { Plane** plane; Leaves leaves; };
-static int own_all(Context& c, const Moving* all, int count, V** data, Leaves* leaves) {
-  int n = 0;
-  for (int k = 0; k < count; k++) {
-    Plane*& p = *all[k].plane;
-    if (p->zero && all[k].leaves != EVERYTHING) continue;
-    own(c, p);
-    p->zero = false;
-    data[n] = p->data;
-    leaves[n++] = all[k].leaves;
-  }
-  return n;
-}
+// Planes that move together, in place.
+enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
 // Movers exchange what they hold with their targets. No cell is both.
-OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, const Moving* all, int count) {
+OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
   if (movers->zero) return;
   V* data[MOVING + 1];
-  Leaves leaves[MOVING + 1];
-  const int n = own_all(c, all, count, data, leaves), words = c.g.words, by = c.turn[dx + HALO], back = c.g.width - by;
+  int n = 0;
+  for (int k = 0; k < count; k++) {
+    Plane*& p = *planes[k];
+    if (p->zero) continue;
+    own(c, p);
+    data[n++] = p->data;
+  }
+  const int words = c.g.words, by = c.turn[dx + HALO], back = c.g.width - by;
   for (int y = 0; y < c.g.height; y++) {
     const V* m = movers->data + y * words;
     if (words > 1 && dx) {
@@ -426,31 +434,54 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, const 
     }
   }
 }
-ALWAYS V left(V a, V movers, Leaves leaves) {
-  return leaves == NOTHING ? a & ~movers : leaves == EVERYTHING ? a | movers : a;
-}
 // Movers go to their targets, at most a row away. A cell that is both holds what arrives: each row is read before
 // anything arrives there, and what goes around the edge arrives last.
-OUTLINE void arrive_planes(Context& c, const Plane* movers, int dy, int dx, const Moving* all, int count) {
+template <Leaves LEAVES, bool AROUND>
+ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, int there, const V* m, const V* targets, int dx) {
+  const int words = c.g.words, by = c.turn[-dx + HALO], back = c.g.width - by;
+  if (__builtin_expect(words == 1, 1)) {
+    const V gone = m[0], keeps = ~targets[0], valid = c.valid_last;
+    for (int k = 0; k < count; k++) {
+      const V a = data[k][here], moving = a & gone;
+      const V arriving = by ? ((moving >> by) | (moving << back)) & valid : moving;
+      if (LEAVES == NOTHING) data[k][here] = a & ~gone;
+      if (LEAVES == EVERYTHING) data[k][here] = a | gone;
+      if (AROUND) c.late[k] = arriving;
+      else data[k][there] = (data[k][there] & keeps) | arriving;
+    }
+    return;
+  }
+  V* moving = c.change + words;
+  for (int k = 0; k < count; k++) {
+    for (int w = 0; w < words; w++) moving[w] = data[k][here + w] & m[w];
+    if (LEAVES == NOTHING) for (int w = 0; w < words; w++) data[k][here + w] &= ~m[w];
+    if (LEAVES == EVERYTHING) for (int w = 0; w < words; w++) data[k][here + w] |= m[w];
+    for (int w = 0; w < words; w++) {
+      const V arriving = dx ? columns(c, moving, w, -dx) : moving[w];
+      if (AROUND) c.late[k * words + w] = arriving;
+      else data[k][there + w] = (data[k][there + w] & ~targets[w]) | arriving;
+    }
+  }
+}
+template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
   if (movers->zero) return;
   V* data[MOVING + 1];
-  Leaves leaves[MOVING + 1];
-  const int n = own_all(c, all, count, data, leaves), words = c.g.words, height = c.g.height;
-  V *targets = c.change, *moving = c.change + words;
+  int n = 0;
+  for (int k = 0; k < count; k++) {
+    Plane*& p = *planes[k];
+    if (p->zero && LEAVES != EVERYTHING) continue;
+    own(c, p);
+    p->zero = false;
+    data[n++] = p->data;
+  }
+  const int words = c.g.words, height = c.g.height;
+  V* targets = c.change;
   for (int i = 0, y = dy > 0 ? height - 1 : 0; i < height; i++, y += dy > 0 ? -1 : 1) {
     const V* m = movers->data + y * words;
     if (!any_word(m, words)) continue;
-    const bool around = y + dy < 0 || y + dy >= height;
     for (int w = 0; w < words; w++) targets[w] = dx ? columns(c, m, w, -dx) : m[w];
-    for (int k = 0; k < n; k++) {
-      V *here = data[k] + y * words, *there = around ? c.late + k * words : data[k] + c.row(y + dy);
-      for (int w = 0; w < words; w++) moving[w] = here[w] & m[w];
-      for (int w = 0; w < words; w++) here[w] = left(here[w], m[w], leaves[k]);
-      for (int w = 0; w < words; w++) {
-        const V arriving = dx ? columns(c, moving, w, -dx) : moving[w];
-        there[w] = around ? arriving : (there[w] & ~targets[w]) | arriving;
-      }
-    }
+    if (y + dy < 0 || y + dy >= height) arrive_row<LEAVES, true>(c, data, n, y * words, 0, m, targets, dx);
+    else arrive_row<LEAVES, false>(c, data, n, y * words, (y + dy) * words, m, targets, dx);
   }
   const int edge = dy > 0 ? height - 1 : 0;
   const V* m = movers->data + edge * words;
@@ -501,15 +532,48 @@ ALWAYS u64 row_bits(const Plane* p, int first, int words, int lane) {
   for (int w = 0; w < words; w++) some |= ((const u64*)p->data)[(first + w) * LANES + lane];
   return some;
 }
-OUTLINE Plane* any_plane(Context& c, const std::initializer_list<const Plane*>& planes) {
-  Plane* r = take(c);
-  for (int i = 0, n = c.g.cells(); i < n; i++) r->data[i] = splat(0);
-  for (const Plane* p : planes)
-    if (!p->zero)
-      for (int i = 0, n = c.g.cells(); i < n; i++) r->data[i] |= p->data[i];
-  r->zero = false;
-  return r;
+static void close_plane(const Context& c, Plane* p) {  // nothing beyond the width; and is there anything at all?
+  V some = splat(0);
+  for (int y = 0, i = 0; y < c.g.height; y++)
+    for (int w = 0; w < c.g.words; w++, i++) some |= p->data[i] &= c.valid(w);
+  p->zero = !any(some);
 }
+// Which rows of which world a plane has cells in.
+OUTLINE void active_rows(Context& c, const Plane* p, int list) {
+  const int many = c.active_words();
+  u64* out = c.active + (size_t)list * LANES * many;
+  memset(out, 0, sizeof(u64) * LANES * many);
+  if (p->zero) return;
+  for (int first = 0; first < c.g.height; first += 64) {
+    alignas(64) uint8_t worlds[64] = {};  // a bit for each world
+    for (int y = first; y < first + 64 && y < c.g.height; y++) {
+      V some = p->data[y * c.g.words];
+      for (int w = 1; w < c.g.words; w++) some |= p->data[y * c.g.words + w];
+      worlds[y - first] = lanes_of(some);
+    }
+    for (int l = 0; l < LANES; l++) {
+#if defined(__AVX512BW__)
+      out[l * many + first / 64] = _mm512_test_epi8_mask(_mm512_load_si512(worlds), _mm512_set1_epi8((char)(1 << l)));
+#else
+      for (int i = 0; i < 64; i++) out[l * many + first / 64] |= (u64)(worlds[i] >> l & 1) << i;
+#endif
+    }
+  }
+}
+static void active_together(Context& c, int first, int count) {  // into the list behind them
+  const size_t size = (size_t)LANES * c.active_words();
+  u64 *lists = c.active + first * size, *all = lists + count * size;
+  for (size_t i = 0; i < size; i++) {
+    all[i] = 0;
+    for (int k = 0; k < count; k++) all[i] |= lists[k * size + i];
+  }
+}
+ALWAYS bool is_active(const Context& c, int list, int lane, int y) {
+  return c.active[((size_t)list * LANES + lane) * c.active_words() + y / 64] >> (y & 63) & 1;
+}
+#define EACH_ACTIVE(list) /* of the sixteen rows that begin at `from` */ \
+  for (u32 rest = c.active[((size_t)(list) * LANES + l) * c.active_words() + from / 64] >> (from & 63) & 0xffff; rest; rest &= rest - 1) \
+    if (const int y = from + __builtin_ctz(rest); true)
 // Sixteen flags of one world's word, which is kept little end first.
 ALWAYS void put_bits(u64* word, int x, u32 bits) {
 #if __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
@@ -532,6 +596,20 @@ ALWAYS void finish_row(const Context& c, float* row) {
   }
 }
 
+ALWAYS float* row_of(const Context& c, const Field* f, int lane, int y) {
+  return f->data + ((size_t)lane * c.g.height + y) * c.g.stride + HALO;
+}
+// A row that choices will be laid over, or that stays as it is; whether it is live.
+ALWAYS bool lay_row(const Context& c, Field* to, int to_lane, const Field* from, int from_lane, int y, bool chosen) {
+  const bool live = chosen || from->live[from_lane * c.g.height + y];
+  to->live[to_lane * c.g.height + y] = live;
+  if (!live) return false;
+  float* out = row_of(c, to, to_lane, y);
+  const float* in = real_row(c, from, from_lane, y);
+  for (int x = 0; x < c.g.width; x += CHUNK) *(F*)(out + x) = load(in, x);
+  if (!chosen) finish_row(c, out);
+  return true;
+}
 ALWAYS bool copy_row(const Context& c, Field* to, const Field* from, int lane, int y) {
   size_t at = lane * (size_t)c.g.height + y;
   to->live[at] = from->live[at];

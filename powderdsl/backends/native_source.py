@@ -40,7 +40,7 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"#define SLOTS {len(layout.planes)}",
         f"#define REALS {len(layout.reals)}",
         f"#define MOVING {layout.moving}",
-        f"#define SCRATCH_ROWS {layout.scratch}",
+        f"#define ACTIVE {layout.active}",
         f"#define REACH {layout.reach}",
         f"#define SNAP {literal(SNAP)}",
         f"#define PASSES {len(program.passes)}",

@@ -31,8 +31,13 @@ def real_cost(node: Node, have: Callable[[Node], bool]) -> int:
     return FAR
 
 
-def sweep_needs(node: Node, have: Callable[[Node], bool]) -> tuple[list[Node], list[Node]]:
-    """Flags and reals that must stand in planes before a sweep can compute this node."""
+def sweep_needs(
+    node: Node, have: Callable[[Node], bool], apart: Callable[[Node], bool] = lambda node: False
+) -> tuple[list[Node], list[Node]]:
+    """Flags and reals that must stand in planes before a sweep can compute this node.
+
+    `apart` tells of reals that are made in another way.
+    """
     flags: dict[int, Node] = {}
     reals: dict[int, Node] = {}
     seen: set[int] = set()
@@ -42,7 +47,9 @@ def sweep_needs(node: Node, have: Callable[[Node], bool]) -> tuple[list[Node], l
         if id(top) in seen or (top is not node and have(top)):
             continue
         seen.add(id(top))
-        if top.type != REAL and top is not node:
+        if top is not node and apart(top):
+            reals[id(top)] = top
+        elif top.type != REAL and top is not node:
             if top.op == "param":
                 continue
             flags[id(top)] = top
@@ -76,11 +83,6 @@ class Sweep:
         """Choices that this sweep will compute anyway."""
         self.used: set[str] = set()
         self.counter = [0]
-        self.layers: list[str] = []
-        """Loops over a whole row that come before the chunks: choices laid over each other, one after the other."""
-        self.scratch: list[str] = []
-        self.unions: dict[tuple[str, ...], str] = {}
-        """Planes joined before the sweep, and the variables that hold the result."""
         self.led: dict[str, tuple[Sweep, list[str]]] = {}
         """What is computed only where a comparison holds somewhere in the chunk, by its flag."""
 
@@ -91,13 +93,6 @@ class Sweep:
         nested = Sweep(self.planes, self.fields, self.layout)
         nested.memo, nested.counter = dict(self.memo), self.counter
         nested.rows, nested.words, nested.used = self.rows, self.words, self.used
-        nested.layers, nested.scratch, nested.unions = self.layers, self.scratch, self.unions
-        return nested
-
-    def apart(self) -> Sweep:
-        """For a loop of its own over the row: only the pointers to rows are shared."""
-        nested = Sweep(self.planes, self.fields, self.layout)
-        nested.counter, nested.rows, nested.used = self.counter, self.rows, self.used
         return nested
 
     def row(self, field: str, dy: int, wraps: bool = True) -> str:
@@ -112,14 +107,12 @@ class Sweep:
             call = f"real_row(c, {field}, l{field}, y)"
         return self.rows.setdefault(call, f"r{len(self.rows)}")
 
-    def word(self, node: Node, place: str = "") -> str:
-        """The word of a flag's plane, read once a row and word, or where it stands."""
+    def word(self, node: Node) -> str:
+        """The word of a flag's plane, read once a row and word."""
         if node.op == "param":
             return f"c.param_bits[{self.layout.param_planes[param_key(node)]}][l]"
         plane = self.planes[id(node)]
         self.used.add(plane)
-        if place:
-            return f"((const u64*){plane}->data)[(y * words + {place}) * LANES + l]"
         return self.words.setdefault(plane, f"m{len(self.words)}")
 
     def mask(self, node: Node) -> str:
@@ -231,8 +224,6 @@ class Sweep:
             if other is not node and (id(other), 0, 0) not in self.memo
         ]
         chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
-        if len(chain) > 2 and self.stands_alone(chains):
-            return self.lay(chains)
         names = []
         for one in chains:
             base = self.value(one[-1].args[2])
@@ -260,60 +251,6 @@ class Sweep:
         name = names[0]
         self.lines.append("\n".join(block.lines))
         return name
-
-    def stands_alone(self, chains: list[list[Node]]) -> bool:
-        """Whether choices can be laid row by row: over a stored row, and nothing in them is itself a choice or a draw."""
-        if not all(self.have(chain[-1].args[2]) for chain in chains) or any(
-            choice.args[0].op == "param" for choice in chains[0]
-        ):
-            return False
-        seen = {id(choice) for chain in chains for choice in chain}
-        stack = [part for chain in chains for choice in chain for part in choice.args[1:]]
-        while stack:
-            node = stack.pop()
-            if id(node) in seen or self.have(node):
-                continue
-            seen.add(id(node))
-            if node.op in ("select", "draw"):
-                return False
-            stack.extend(node.args)
-        return True
-
-    def lay(self, chains: list[list[Node]]) -> str:
-        """Choices laid over each other in rows of their own; a choice that holds nowhere in the row costs one test."""
-        rows = [f"q{len(self.scratch) + i}" for i in range(len(chains))]
-        self.scratch += rows
-        self.layout.scratch = max(self.layout.scratch, len(self.scratch))
-        bases = [self.row(self.fields[id(chain[-1].args[2])], 0) for chain in chains]
-        masks = tuple(dict.fromkeys(self.planes[id(choice.args[0])] for choice in chains[0]))
-        some = self.unions.setdefault(masks, f"any{len(self.unions)}")
-        declared = " ".join(f"const float* s{row} = {base};" for row, base in zip(rows, bases, strict=True))
-        starts = " ".join(f"float* {row} = c.scratch[{row[1:]}] + HALO; s{row} = {row};" for row in rows)
-        copies = " ".join(f"*(F*)({row} + x) = load({base}, x);" for row, base in zip(rows, bases, strict=True))
-        self.layers.append(
-            f"{declared}\nif (row_bits({some}, y * words, words, l)) {{ {starts}\n"
-            f"for (int x = 0; x < width; x += CHUNK) {{ {copies} }}"
-        )
-        for level in reversed(range(len(chains[0]))):
-            layer = self.apart()
-            olds = [layer.temporary(f"*(const F*)({row} + x)") for row in rows]
-            for chain, old in zip(chains, olds, strict=True):
-                layer.memo[id(chain[level].args[2]), 0, 0] = old
-            values = [layer.value(chain[level].args[1]) for chain in chains]
-            stores = [
-                f"*(F*)({row} + x) = blend(bits, {value}, {old});"
-                for row, value, old in zip(rows, values, olds, strict=True)
-            ]
-            word = self.apart().word(chains[0][level].args[0], "w")
-            self.layers.append(
-                f"for (int w = 0; w < words; w++) if (const u64 m = {word})\n"
-                "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) { const u32 bits = m >> (x & 63) & 0xffff;\n"
-                f"{' '.join([*layer.lines, *stores])} }}"
-            )
-        self.layers.append("}")
-        for chain, row in zip(chains, rows, strict=True):
-            self.memo[id(chain[0]), 0, 0] = self.temporary(f"load(s{row}, x)")
-        return self.memo[id(chains[0][0]), 0, 0]
 
 
 def quotient(value: str, divisor: float) -> str:
