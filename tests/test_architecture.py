@@ -27,7 +27,7 @@ MAX_LINES = 500
 
 _MODEL = ("diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
-_SCREEN = (*_COMPILER, "programs", "simulator", "worlds", "draw", "media", "terminal")
+_SCREEN = (*_COMPILER, "programs", "draw", "observe", "simulator", "worlds", "media", "terminal")
 _EVERYTHING = (*_SCREEN, "pack_tests", "testing", "envs", "web", "experiments", "cli")
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -43,10 +43,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "backends": ("diagnostics", "ir", "user_cache"),
     "compiler": _COMPILER[:-1],
     "programs": _COMPILER,
-    "simulator": (*_COMPILER, "programs"),
+    "draw": _MODEL,
+    "observe": (*_COMPILER, "draw"),
+    "simulator": (*_COMPILER, "programs", "observe"),
     "worlds": _MODEL,
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
-    "draw": _SCREEN[: _SCREEN.index("draw")],
     "media": _SCREEN[: _SCREEN.index("media")],
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
     "pack_tests": _SCREEN,
@@ -69,7 +70,7 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("backends.torch_*", "programs", "simulator", "testing", "envs", "experiments")
+_TORCH = ("backends.torch_*", "programs", "observe", "simulator", "testing", "envs", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),

@@ -157,9 +157,12 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_free": (None, [pointer]),
         "pd_copy": (pointer, [pointer]),
         "pd_load": (None, [pointer, integer, integer, integer, pointer]),
-        "pd_store": (None, [pointer, integer, integer, integer, integer, pointer]),
+        "pd_store": (None, [pointer, integer, integer, integer, integer, pointer, long]),
         "pd_load_real": (None, [pointer, integer, pointer, long]),
         "pd_store_real": (None, [pointer, integer, pointer, long]),
+        "pd_rgb": (None, [pointer, integer, integer, pointer, pointer, long]),
+        "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
+        "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
         "pd_run": (None, [pointer, long, integer, pointer, pointer, pointer, pointer, pointer]),
     }
     for name, (result, arguments) in signatures.items():

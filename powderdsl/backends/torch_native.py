@@ -29,8 +29,30 @@ class PackedState(Mapping[str, Tensor]):
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._tensors:
-            self._tensors[name] = self.program.unpack(self, name)
+            dtype, shape = self.like[name]
+            self._tensors[name] = self.write(name, torch.empty(shape, dtype=dtype))
         return self._tensors[name]
+
+    def has(self, name: str) -> bool:
+        """Whether a slot's tensor is there already."""
+        return name in self._tensors
+
+    def write(self, name: str, out: Tensor) -> Tensor:
+        """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
+        program = self.program
+        if out.dtype == torch.float32:
+            parts = (f"{name}.row", f"{name}.column") if out.ndim == 4 else (name,)
+            for i, part in enumerate(parts):
+                first = out[:, i] if out.ndim == 4 else out
+                program.library.pd_store_real(
+                    self.handle, program.layout.reals[part], address(first), out.stride(0)
+                )
+        else:
+            slot, bits, signed = program.planes_of(name)
+            program.library.pd_store(
+                self.handle, slot, bits, signed, out.element_size(), address(out), out.stride(0)
+            )
+        return out
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.like)
@@ -75,11 +97,11 @@ class NativeProgram:
             handle,
             job.steps,
             self.threads,
-            _address(seed),
-            _address(index),
-            _address(start),
-            _address(planes),
-            _address(reals),
+            address(seed),
+            address(index),
+            address(start),
+            address(planes),
+            address(reals),
         )
         return packed
 
@@ -119,39 +141,22 @@ class NativeProgram:
                 for i, part in enumerate(parts):
                     first = value[:, i] if value.ndim == 4 else value
                     self.library.pd_load_real(
-                        handle, self.layout.reals[part], _address(first), value.stride(0)
+                        handle, self.layout.reals[part], address(first), value.stride(0)
                     )
             else:
-                slot, bits, _ = self._where(name)
-                self.library.pd_load(handle, slot, bits, value.element_size(), _address(value))
+                slot, bits, _ = self.planes_of(name)
+                self.library.pd_load(handle, slot, bits, value.element_size(), address(value))
         return handle, like
 
-    def _where(self, name: str) -> tuple[int, int, bool]:
-        """First plane, number of planes, and whether the last is a sign."""
+    def planes_of(self, name: str) -> tuple[int, int, bool]:
+        """First plane of a slot, number of planes, and whether the last is a sign."""
         type = self._slots[name].type
         if type.name == "flag":
             return self.layout.planes[name], 1, False
         bits, signed = planes_of(type.lo, type.hi)
         return self.layout.planes[f"{name}:0"], bits, signed
 
-    def unpack(self, state: PackedState, name: str) -> Tensor:
-        """One slot as a tensor in its storage dtype."""
-        dtype, shape = state.like[name]
-        value = torch.empty(shape, dtype=dtype)
-        if dtype == torch.float32:
-            parts = (f"{name}.row", f"{name}.column") if len(shape) == 4 else (name,)
-            for i, part in enumerate(parts):
-                first = value[:, i] if len(shape) == 4 else value
-                self.library.pd_store_real(
-                    state.handle, self.layout.reals[part], _address(first), value.stride(0)
-                )
-        else:
-            slot, bits, signed = self._where(name)
-            self.library.pd_store(
-                state.handle, slot, bits, int(signed), value.element_size(), _address(value)
-            )
-        return value
 
-
-def _address(tensor: Tensor) -> ctypes.c_void_p:
+def address(tensor: Tensor) -> ctypes.c_void_p:
+    """Where a tensor's data begin, for C."""
     return ctypes.c_void_p(tensor.data_ptr())
