@@ -81,15 +81,14 @@ class TorchProgram:
         return (self.planes() if big else self._cells).run(job)
 
     def planes(self) -> Runnable:
-        """The program on packed words, made when first needed; on cells if planes cannot carry it."""
+        """The program on packed words, made when first needed; passes that planes cannot carry run on cells."""
+        from powderdsl.backends.torch_mixed import packed_program
         from powderdsl.backends.torch_planes import PlanesProgram
-        from powderdsl.ir.bits import NotBits, lower_bits
 
         if self._planes is None:
-            try:
-                self._planes = PlanesProgram(self.program, lower_bits(self.program), self.device)
-            except NotBits:
-                self._planes = self._cells
+            self._planes = packed_program(
+                self.program, self.device, lambda cells, planes: PlanesProgram(cells, planes, self.device)
+            )
         return self._planes
 
 
@@ -129,14 +128,16 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
 
 def _native(program: Program, device: torch.device, threads: int) -> Runnable:
     from powderdsl.backends.native_build import NoCompiler
+    from powderdsl.backends.torch_mixed import packed_program
     from powderdsl.backends.torch_native import NativeProgram
-    from powderdsl.ir.bits import NotBits, lower_bits
 
     problem = "native code runs on the CPU" if device.type != "cpu" else ""
     try:
         if not problem:
-            return NativeProgram(program, lower_bits(program), threads)
-    except (NoCompiler, NotBits) as error:
+            return packed_program(
+                program, device, lambda cells, planes: NativeProgram(cells, planes, threads)
+            )
+    except NoCompiler as error:
         problem = str(error)
     reporter = Reporter()
     helps = ["run on the backend `torch`, or install g++, clang++ or `pip install ziglang`"]
