@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.backends.torch_job import Job
+from powderdsl.backends.torch_laps import profile_of
 from powderdsl.compiler import BACKENDS, load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.state import SNAP, Slot
@@ -399,6 +400,16 @@ class Simulator:
         job = Job(world.state, clock, steps, self._params(params or {}, len(world)), draws, chosen)
         state = self._program.run(job)
         return replace(world, sim=self, state=state, step=world.step + steps)
+
+    def profile(self, world: World, steps: int = 1) -> dict[str, float]:
+        """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot say.
+
+        Native code counts processor time on one thread, and is compiled once more for it.
+        """
+        clock = (world.seed, world.index, world.step)
+        job = Job(world.state, clock, _whole(steps, "steps"), self._params({}, len(world)), {}, None)
+        seconds = profile_of(self._program, job)
+        return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
     def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Tensor]:
         """Draws as whole numbers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""

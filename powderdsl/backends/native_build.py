@@ -168,6 +168,8 @@ def load_library(path: Path) -> ctypes.CDLL:
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
+    if hasattr(library, "pd_profile"):  # only where it was built with clocks
+        library.pd_profile.restype, library.pd_profile.argtypes = None, [pointer]
     return library
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from powderdsl.backends.torch_dense import DenseProgram
 from powderdsl.backends.torch_job import Job
+from powderdsl.backends.torch_laps import profile_of
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
 
@@ -41,6 +42,19 @@ class MixedProgram:
             for part in self.parts:
                 state = part.run(replace(job, state=state, clock=(seed, index, start + i), steps=1))
         return state
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`; what packing and unpacking between the parts costs is left out."""
+        seed, index, start = job.clock
+        state = job.state
+        seconds: dict[str, float] = {}
+        for i in range(job.steps):
+            for part in self.parts:
+                turn = replace(job, state=state, clock=(seed, index, start + i), steps=1)
+                for name, spent in profile_of(part, turn).items():
+                    seconds[name] = seconds.get(name, 0.0) + spent
+                state = part.run(turn)
+        return seconds
 
 
 def packed_program(program: Program, device: torch.device, make: MakePacked) -> Part:

@@ -67,15 +67,18 @@ class NativeProgram:
     Args:
         program: the numeric program, whose slots are the state's.
         planes: the same program from `ir.bits.lower_bits`.
+        clocks: count the time of each pass, for `profile`; such a program runs on one thread.
 
     Raises:
         native_build.NoCompiler: there is no C++ compiler, or it failed.
     """
 
-    def __init__(self, program: Program, planes: Program, threads: int = 1):
+    def __init__(self, program: Program, planes: Program, threads: int = 1, *, clocks: bool = False):
         source, self.layout = native_source(planes)
-        self.library = load_library(build(source))
-        self.threads = threads
+        self.library = load_library(build(f"#define PROFILE\n{source}" if clocks else source))
+        self.threads = 1 if clocks else threads
+        self._programs = program, planes
+        self._with_clocks: NativeProgram | None = None
         self._slots: dict[str, SlotType] = {slot.name: slot for slot in program.slots}
         self._kinds = dict(program.params)
         self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
@@ -104,6 +107,21 @@ class NativeProgram:
             address(reals),
         )
         return packed
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds of processor time by pass over `job.steps`, on one thread.
+
+        The first call compiles the program once more, with clocks in it. Raises NoCompiler if that fails.
+        """
+        if self._with_clocks is None:
+            self._with_clocks = NativeProgram(*self._programs, clocks=True)
+        passes = self._programs[1].passes
+        seconds = (ctypes.c_double * len(passes))()
+        library = self._with_clocks.library
+        library.pd_profile(seconds)  # what earlier runs have left
+        self._with_clocks.run(job)
+        library.pd_profile(seconds)
+        return {pass_.name: spent for pass_, spent in zip(passes, seconds, strict=True)}
 
     def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
         """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
