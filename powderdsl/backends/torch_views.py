@@ -59,7 +59,8 @@ def write_rgb(state: State, palette: Tensor, out: Tensor) -> None:
         slot, bits, _ = state.program.planes_of("element")
         state.program.library.pd_rgb(state.handle, slot, bits, address(palette), address(out), out.stride(0))
     else:
-        out.copy_(palette[state["element"].int(), :3])
+        ids = state["element"].flatten().int()
+        out.copy_(palette[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
 
 
 def write_channels(state: State, channels: Sequence[Channel], tables: Tensor, out: Tensor) -> None:
