@@ -86,5 +86,4 @@ def emulated_simulator(
     simulator = compile_ruleset(ruleset, backend="dense")
     program = lower(ruleset)
     simulator._program = CudaProgram(program, lower_bits(program), compiler_for(folder, order), shared_limit)
-    simulator.backend = "cuda"
     return simulator
