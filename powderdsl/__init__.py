@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from powderdsl.compiler import load
     from powderdsl.diagnostics import CompileError
+    from powderdsl.ledgers.book import ledger
     from powderdsl.simulator import Simulator, World, compile
     from powderdsl.worlds.store import load_world, save
 
@@ -16,13 +17,14 @@ _HOMES = {
     "load": "powderdsl.compiler",
     "compile": "powderdsl.simulator",
     "CompileError": "powderdsl.diagnostics",
+    "ledger": "powderdsl.ledgers.book",
     "Simulator": "powderdsl.simulator",
     "World": "powderdsl.simulator",
     "save": "powderdsl.worlds.store",
     "load_world": "powderdsl.worlds.store",
 }
 
-__all__ = ["CompileError", "Simulator", "World", "compile", "load", "load_world", "save"]
+__all__ = ["CompileError", "Simulator", "World", "compile", "ledger", "load", "load_world", "save"]
 
 
 def __getattr__(name: str) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from powderdsl import reference
 from powderdsl.backends.torch_job import Job
+from powderdsl.backends.torch_laps import Laps, profile_of, unwatched
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.ir.ops import Program
 from powderdsl.model.types import Ruleset
@@ -31,6 +32,16 @@ class ReferenceProgram:
         self._bits = {stream.name: stream.bits for stream in ruleset.streams}
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        return self._run(job, unwatched)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`. The first pass is charged with what a step begins with."""
+        laps = Laps(torch.device("cpu"))
+        self._run(job, laps)
+        return laps.passes()
+
+    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
         device = job.state["element"].device
         seed, index, start = (part.cpu().numpy() for part in job.clock)
         arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
@@ -43,7 +54,10 @@ class ReferenceProgram:
         }
         for i in range(job.steps):
             at = reference.Clock(seed, index, start + i)
-            arrays = reference.step(self.ruleset, arrays, at, numbers, passes=job.passes, draws=given)
+            lap("")
+            arrays = reference.step(
+                self.ruleset, arrays, at, numbers, passes=job.passes, draws=given, lap=lap
+            )
         return {name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()}
 
 
@@ -77,19 +91,25 @@ class TorchProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
+        return self._fit_for(job).run(job)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`."""
+        return profile_of(self._fit_for(job), job)
+
+    def _fit_for(self, job: Job) -> Runnable:
         big = job.state["element"].numel() >= PLANES_FROM
-        return (self.planes() if big else self._cells).run(job)
+        return self.planes() if big else self._cells
 
     def planes(self) -> Runnable:
-        """The program on packed words, made when first needed; on cells if planes cannot carry it."""
+        """The program on packed words, made when first needed; passes that planes cannot carry run on cells."""
+        from powderdsl.backends.torch_mixed import packed_program
         from powderdsl.backends.torch_planes import PlanesProgram
-        from powderdsl.ir.bits import NotBits, lower_bits
 
         if self._planes is None:
-            try:
-                self._planes = PlanesProgram(self.program, lower_bits(self.program), self.device)
-            except NotBits:
-                self._planes = self._cells
+            self._planes = packed_program(
+                self.program, self.device, lambda cells, planes: PlanesProgram(cells, planes, self.device)
+            )
         return self._planes
 
 
@@ -103,6 +123,10 @@ class CompiledProgram:
         """The state `job.steps` later."""
         runnable = self._rest if job.draws or job.passes is not None else self._native
         return runnable.run(job)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`, of the native code."""
+        return profile_of(self._native, job)
 
 
 def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: int = 1) -> Runnable:
@@ -129,14 +153,16 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
 
 def _native(program: Program, device: torch.device, threads: int) -> Runnable:
     from powderdsl.backends.native_build import NoCompiler
+    from powderdsl.backends.torch_mixed import packed_program
     from powderdsl.backends.torch_native import NativeProgram
-    from powderdsl.ir.bits import NotBits, lower_bits
 
     problem = "native code runs on the CPU" if device.type != "cpu" else ""
     try:
         if not problem:
-            return NativeProgram(program, lower_bits(program), threads)
-    except (NoCompiler, NotBits) as error:
+            return packed_program(
+                program, device, lambda cells, planes: NativeProgram(cells, planes, threads)
+            )
+    except NoCompiler as error:
         problem = str(error)
     reporter = Reporter()
     helps = ["run on the backend `torch`, or install g++, clang++ or `pip install ziglang`"]

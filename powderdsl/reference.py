@@ -6,7 +6,7 @@ are int64 here, reals float32 with one rounding an operation, draws float64.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -434,6 +434,7 @@ def step(
     *,
     passes: frozenset[str] | None = None,
     draws: Mapping[str, Array] | None = None,
+    lap: Callable[[str], None] | None = None,
 ) -> State:
     """One step of every world.
 
@@ -443,6 +444,7 @@ def step(
         params: [B] arrays by qualified name.
         passes: names of the passes to run; all of them by default.
         draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
+        lap: called with the name of each pass when it is done.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
     wide = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
@@ -457,4 +459,6 @@ def step(
     for pass_ in ruleset.passes:
         if passes is None or pass_.name in passes:
             at.state = run_pass(pass_, at, table)
+            if lap is not None:
+                lap(pass_.name)
     return {name: value.astype(table[name].dtype) for name, value in at.state.items()}

@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 
 from powderdsl.backends.torch_job import Job
+from powderdsl.backends.torch_laps import profile_of
 from powderdsl.compiler import BACKENDS, load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
-from powderdsl.model.state import SNAP, Slot, slots
+from powderdsl.model.state import SNAP, Slot
 from powderdsl.model.types import Ruleset
+from powderdsl.observe import Observer
 from powderdsl.programs import find_device, make_program
 
 MAX_CELLS = 1 << 31
@@ -65,9 +67,21 @@ class World:
         chosen = {name: value[keys] for name, value in self.state.items()}
         return replace(self, state=chosen, seed=self.seed[keys], index=self.index[keys], step=self.step[keys])
 
-    def matrix(self) -> Tensor:
+    def read(self, name: str, out: Tensor | None = None) -> Tensor:
+        """`world[name]`, written into `out`. This and the methods below are those of `Simulator`."""
+        return self.sim.read(self, name, out)
+
+    def matrix(self, out: Tensor | None = None) -> Tensor:
         """All channels of the ruleset's `matrix:` as float32 [B, C, H, W]: elements one-hot, then fields."""
-        return self.sim.matrix(self)
+        return self.sim.matrix(self, out)
+
+    def rgb(self, out: Tensor | None = None) -> Tensor:
+        """Pictures, a pixel a cell: uint8 [B, H, W, 3]."""
+        return self.sim.rgb(self, out)
+
+    def planes(self, out: Tensor | None = None) -> Tensor:
+        """The packed planes int64 [B, P, H, ⌈W/64⌉]; `Simulator.plane_names` says what they are."""
+        return self.sim.planes(self, out)
 
 
 class Simulator:
@@ -77,7 +91,8 @@ class Simulator:
         self.ruleset = ruleset
         self.backend = backend
         self.device = find_device(device)
-        self._slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
+        self._observer = Observer(ruleset, self.device)
+        self._slots: dict[str, Slot] = self._observer.slots
         self._program = make_program(ruleset, backend, self.device, threads)
         self._defaults: tuple[int, dict[str, Tensor]] | None = None
         self._known = torch.zeros(256, dtype=torch.bool, device=self.device)
@@ -142,20 +157,11 @@ class Simulator:
         prop = self.ruleset.property(slot.name)
         dtype = getattr(torch, slot.dtype)
         if prop is not None:
-            return self._table(prop.name)[ids.long()].to(dtype)
+            return self._observer.table(prop.name)[ids.long()].to(dtype)
         if slot.planes == 2:
             default = torch.tensor(slot.default, dtype=dtype, device=self.device)
             return default[None, :, None, None].expand(len(ids), 2, *ids.shape[1:]).clone()
         return torch.full(ids.shape, slot.default, dtype=dtype, device=self.device)
-
-    def _table(self, name: str) -> Tensor:
-        """A property's values by id, parameters at their defaults."""
-        prop = self.ruleset.property(name)
-        assert prop is not None
-        defaults = {param.name: param.default for param in self.ruleset.params}
-        values = [float(defaults[v]) if isinstance(v, str) else float(v) for v in prop.values]  # type: ignore[arg-type]
-        values += [0.0] * (256 - len(values))
-        return torch.tensor(values, dtype=torch.float64, device=self.device)
 
     def _tensor(self, value: Any, name: str) -> Tensor:
         flags = getattr(value, "flags", None)
@@ -193,25 +199,38 @@ class Simulator:
 
     # Reading and changing worlds
 
-    def read(self, world: World, name: str) -> Tensor:
-        """What `World.__getitem__` returns."""
-        if name in self._slots:
-            return world.state[name]
-        prop = self.ruleset.property(name)
-        if prop is None:
-            known = [*self._slots, *(p.name for p in self.ruleset.properties)]
-            raise KeyError(
-                f"{self.ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}"
-            )
-        table = self._table(name)
-        dtype = (
-            torch.float32
-            if prop.kind.name == "chance"
-            else torch.int16
-            if prop.kind.name == "int"
-            else torch.uint8
-        )
-        return table[world.ids.long()].to(dtype)
+    def read(self, world: World, name: str, out: Tensor | None = None) -> Tensor:
+        """What `World.__getitem__` returns.
+
+        Args:
+            out: written to and returned, instead of a new tensor or the world's own: of the same shape, dtype and
+                device, each of its worlds contiguous. `matrix`, `rgb` and `planes` take one too.
+
+        Raises:
+            KeyError: an unknown name. TypeError, ValueError: `out` is no tensor, or does not fit.
+        """
+        return self._observer.read(world.state, name, out)
+
+    def matrix(self, world: World, out: Tensor | None = None) -> Tensor:
+        """What `World.matrix` returns."""
+        return self._observer.matrix(world.state, out)
+
+    def rgb(self, world: World, out: Tensor | None = None) -> Tensor:
+        """Pictures uint8 [B, H, W, 3] in the elements' colours, a pixel a cell."""
+        return self._observer.rgb(world.state, out)
+
+    def planes(self, world: World, out: Tensor | None = None) -> Tensor:
+        """Flags and whole numbers in bits: int64 [B, P, H, ⌈W/64⌉].
+
+        Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of `plane_names`.
+        Real fields have none: `read` them.
+        """
+        return self._observer.planes(world.state, out)
+
+    @property
+    def plane_names(self) -> tuple[str, ...]:
+        """What the planes are: a flag's name, or ``name:bit`` from bit 0; the last bit of a signed number is its sign."""
+        return self._observer.plane_names
 
     def replace(self, world: World, **fields: Any) -> World:
         """The world with these fields set. New ids make fresh cells; other fields are set after that.
@@ -243,7 +262,7 @@ class Simulator:
                     self.read(world, name)
                 if not torch.equal(
                     self._shaped(value, name, world.shape, False).double(),
-                    self._table(name)[state["element"].long()],
+                    self._observer.table(name)[state["element"].long()],
                 ):
                     raise ValueError(
                         f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
@@ -288,7 +307,7 @@ class Simulator:
         limited = prop.stored if prop is not None else slot.of
         if limited is not None:
             usual = (
-                self._table(slot.name)[ids.long()].long()
+                self._observer.table(slot.name)[ids.long()].long()
                 if prop is not None
                 else torch.full_like(whole, int(slot.default))
             )
@@ -339,23 +358,6 @@ class Simulator:
             world = self.replace(world, **{name: painted})
         return world
 
-    def matrix(self, world: World) -> Tensor:
-        """What `World.matrix` returns."""
-        channels: list[Tensor] = []
-        zeros = torch.zeros(world.shape, dtype=torch.float32, device=self.device)
-        for name in self.ruleset.matrix:
-            base, _, part = name.partition(".")
-            if name == "elements":
-                ids = torch.arange(self.ruleset.slots, device=self.device, dtype=torch.uint8)
-                channels.extend((world.ids[:, None] == ids[None, :, None, None]).float().unbind(1))
-            elif base not in self._slots and self.ruleset.property(base) is None:
-                channels.append(zeros)
-            else:
-                value = world[base].float()
-                parts = value.unbind(1) if value.ndim == 4 else (value,)
-                channels.extend(parts if not part else (parts[("row", "column").index(part)],))
-        return torch.stack(channels, 1)
-
     # Running
 
     def step(
@@ -398,6 +400,16 @@ class Simulator:
         job = Job(world.state, clock, steps, self._params(params or {}, len(world)), draws, chosen)
         state = self._program.run(job)
         return replace(world, sim=self, state=state, step=world.step + steps)
+
+    def profile(self, world: World, steps: int = 1) -> dict[str, float]:
+        """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot say.
+
+        Native code counts processor time on one thread, and is compiled once more for it.
+        """
+        clock = (world.seed, world.index, world.step)
+        job = Job(world.state, clock, _whole(steps, "steps"), self._params({}, len(world)), {}, None)
+        seconds = profile_of(self._program, job)
+        return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
     def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Tensor]:
         """Draws as whole numbers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""

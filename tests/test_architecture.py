@@ -27,8 +27,8 @@ MAX_LINES = 500
 
 _MODEL = ("diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
-_SCREEN = (*_COMPILER, "programs", "simulator", "worlds", "draw", "media", "terminal")
-_EVERYTHING = (*_SCREEN, "pack_tests", "testing", "envs", "web", "experiments", "cli")
+_SCREEN = (*_COMPILER, "programs", "draw", "observe", "simulator", "worlds", "media", "terminal")
+_EVERYTHING = (*_SCREEN, "ledgers", "pack_tests", "testing", "envs", "web", "experiments", "cli")
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
@@ -36,6 +36,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "diagnostics": (),
     "syntax": ("diagnostics", "user_cache"),
     "model": ("diagnostics", "syntax"),
+    "ledgers": _MODEL,  # decides from the model alone: no world is run
     "reference": _MODEL,  # never ir: an oracle that shares the lowering cannot see a bug in it
     "ir": ("diagnostics",),
     "ir.lower*": _MODEL,  # the one door from the model into the IR
@@ -43,18 +44,19 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "backends": ("diagnostics", "ir", "user_cache"),
     "compiler": _COMPILER[:-1],
     "programs": _COMPILER,
-    "simulator": (*_COMPILER, "programs"),
+    "draw": _MODEL,
+    "observe": (*_COMPILER, "draw"),
+    "simulator": (*_COMPILER, "programs", "observe"),
     "worlds": _MODEL,
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
-    "draw": _SCREEN[: _SCREEN.index("draw")],
     "media": _SCREEN[: _SCREEN.index("media")],
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
     "pack_tests": _SCREEN,
-    "testing": (*_SCREEN, "pack_tests"),
+    "testing": (*_SCREEN, "ledgers", "pack_tests"),
     "envs": _SCREEN,
     "web": _SCREEN,
     "experiments": (*_SCREEN, "envs", "web"),
-    "cli": (*_SCREEN, "pack_tests", "testing", "envs", "web", "experiments"),
+    "cli": (*_SCREEN, "ledgers", "pack_tests", "testing", "envs", "web", "experiments"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }
@@ -69,7 +71,7 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("backends.torch_*", "programs", "simulator", "testing", "envs", "experiments")
+_TORCH = ("backends.torch_*", "programs", "observe", "simulator", "testing", "envs", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),

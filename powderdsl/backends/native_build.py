@@ -11,6 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +27,32 @@ FLAGS = (
 """No contraction: a·b + c is rounded twice on every machine, so that all backends agree bit for bit."""
 
 TIMEOUT = 600
+
+
+@dataclass(frozen=True)
+class Building:
+    """How much the compiler optimises (`-O0` to `-O3`), and the folder for libraries: None is the user's cache."""
+
+    level: str = "-O2"
+    folder: Path | None = None
+
+    def flags(self) -> tuple[str, ...]:
+        """FLAGS at this level."""
+        return tuple(self.level if flag == "-O2" else flag for flag in FLAGS)
+
+
+FOR_USERS = Building()
+_building: ContextVar[Building] = ContextVar("building", default=FOR_USERS)
+
+
+@contextmanager
+def building(how: Building) -> Iterator[None]:
+    """Build so inside the block: a test of thousands of rulesets wants neither -O2 nor the user's cache."""
+    token = _building.set(how)
+    try:
+        yield
+    finally:
+        _building.reset(token)
 
 
 class NoCompiler(Exception):
@@ -72,14 +101,14 @@ def processor() -> str:
         return f"{platform.machine()} {platform.processor()}"
 
 
-def cache_key(source: str, compiler: Compiler) -> str:
+def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...] = FLAGS) -> str:
     """A hash of everything that the library depends on."""
-    parts = (source, *compiler.command, compiler.version, *FLAGS, processor())
+    parts = (source, *compiler.command, compiler.version, *flags, processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
-def build(source: str) -> Path:
-    """The path of the library for a source, compiled unless it lies in the cache.
+def build(source: str, how: Building | None = None) -> Path:
+    """The path of the library for a source, compiled unless it lies in the cache; `how` is else what `building` says.
 
     Safe with other processes doing the same: the library appears under its name whole, or not at all.
 
@@ -87,18 +116,20 @@ def build(source: str) -> Path:
         NoCompiler: none was found, or it failed.
     """
     compiler = find_compiler()
+    how = how or _building.get()
+    flags = how.flags()
     try:
-        folder = cache_folder("native")
+        folder = how.folder or cache_folder("native")
     except OSError as error:
         raise NoCompiler(f"no cache folder: {error}") from None
-    target = folder / f"{cache_key(source, compiler)}.so"
+    target = folder / f"{cache_key(source, compiler, flags)}.so"
     if target.is_file():
         os.utime(target)
         return target
     with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
         unit, library = Path(scratch) / "program.cpp", Path(scratch) / "program.so"
         unit.write_text(source, encoding="utf-8")
-        command = [*compiler.command, *FLAGS, "-o", str(library), str(unit)]
+        command = [*compiler.command, *flags, "-o", str(library), str(unit)]
         if (
             "-march=native" in command
             and platform.machine() in ("x86_64", "AMD64")
@@ -126,14 +157,19 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_free": (None, [pointer]),
         "pd_copy": (pointer, [pointer]),
         "pd_load": (None, [pointer, integer, integer, integer, pointer]),
-        "pd_store": (None, [pointer, integer, integer, integer, integer, pointer]),
+        "pd_store": (None, [pointer, integer, integer, integer, integer, pointer, long]),
         "pd_load_real": (None, [pointer, integer, pointer, long]),
         "pd_store_real": (None, [pointer, integer, pointer, long]),
+        "pd_rgb": (None, [pointer, integer, integer, pointer, pointer, long]),
+        "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
+        "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
         "pd_run": (None, [pointer, long, integer, pointer, pointer, pointer, pointer, pointer]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
+    if hasattr(library, "pd_profile"):  # only where it was built with clocks
+        library.pd_profile.restype, library.pd_profile.argtypes = None, [pointer]
     return library
 
 

@@ -229,28 +229,6 @@ template <class T> static void load_values(Batch& b, int slot, int bits, const T
       p->zero = !some;
     }
 }
-template <class T> static void store_values(const Batch& b, int slot, int bits, bool negative, T* data) {
-  const Grid& g = b.g;
-  memset(data, 0, sizeof(T) * b.worlds * g.height * g.width);
-  for (size_t n = 0; n < b.groups.size(); n++)
-    for (int i = 0; i < bits; i++) {
-      const Plane* p = b.groups[n].slot[slot + i];
-      if (p->zero) continue;
-      T weight = (T)(negative && i == bits - 1 ? -((int64_t)1 << i) : (int64_t)1 << i);
-      for (int l = 0; l < std::min(LANES, b.worlds - (int)n * LANES); l++) {
-        T* cell = data + ((size_t)n * LANES + l) * g.height * g.width;
-        const u64* in = (const u64*)p->data;
-        for (int y = 0; y < g.height; y++)
-          for (int w = 0; w < g.words; w++) {
-            int count = std::min(64, g.width - 64 * w);
-            u64 word = in[(y * g.words + w) * LANES + l];
-            if (word)
-              for (int x = 0; x < count; x++) cell[x] |= (T)((word >> x & 1) * (u64)weight);
-            cell += count;
-          }
-      }
-    }
-}
 
 #define API extern "C" __attribute__((visibility("default")))
 API void* pd_new(int worlds, int height, int width) {
@@ -296,12 +274,6 @@ API void pd_load(void* batch, int slot, int bits, int item, const void* data) {
   else if (item == 2) load_values(b, slot, bits, (const int16_t*)data);
   else load_values(b, slot, bits, (const int32_t*)data);
 }
-API void pd_store(const void* batch, int slot, int bits, int negative, int item, void* data) {
-  const Batch& b = *(const Batch*)batch;
-  if (item == 1) store_values(b, slot, bits, negative, (uint8_t*)data);
-  else if (item == 2) store_values(b, slot, bits, negative, (uint16_t*)data);
-  else store_values(b, slot, bits, negative, (u32*)data);
-}
 API void pd_load_real(void* batch, int slot, const float* data, int64_t world_stride) {
   Batch& b = *(Batch*)batch;
   Context* c = borrow(b.g);
@@ -321,18 +293,6 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
     }
   }
   put_back(c);
-}
-API void pd_store_real(const void* batch, int slot, float* data, int64_t world_stride) {
-  const Batch& b = *(const Batch*)batch;
-  for (int world = 0; world < b.worlds; world++) {
-    const Field* f = b.groups[world / LANES].real[slot];
-    for (int y = 0; y < b.g.height; y++) {
-      int r = world % LANES * b.g.height + y;
-      float* out = data + world * world_stride + (int64_t)y * b.g.width;
-      if (f->live[r]) memcpy(out, f->data + (size_t)r * b.g.stride + HALO, sizeof(float) * b.g.width);
-      else memset(out, 0, sizeof(float) * b.g.width);
-    }
-  }
 }
 API void pd_run(void* batch, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, const uint8_t* planes, const float* reals) {
   Batch& b = *(Batch*)batch;

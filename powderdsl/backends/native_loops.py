@@ -163,17 +163,21 @@ class Loop:
         return cleaned
 
 
-def is_clean(node: Node, have: Callable[[Node], bool]) -> bool:
-    """Whether bits beyond the width are surely zero."""
-    if have(node) or node.op in ("const", "inside", "coordinate", "shift", *DRAWS, *ANCHORS):
-        return not (node.op == "coordinate" and node.attr[0] == "step")
-    if node.op == "and":
-        return any(is_clean(arg, have) for arg in node.args)
-    if node.op in ("or", "xor"):
-        return all(is_clean(arg, have) for arg in node.args)
-    if node.op == "select":
-        return all(is_clean(arg, have) for arg in node.args[1:])
-    return False
+def is_clean(node: Node, have: Callable[[Node], bool], known: dict[int, bool] | None = None) -> bool:
+    """Whether bits beyond the width are surely zero. Graphs share nodes, so answers are kept in `known`."""
+    known = {} if known is None else known
+    if id(node) not in known:
+        if have(node) or node.op in ("const", "inside", "coordinate", "shift", *DRAWS, *ANCHORS):
+            known[id(node)] = not (node.op == "coordinate" and node.attr[0] == "step")
+        elif node.op == "and":
+            known[id(node)] = any(is_clean(arg, have, known) for arg in node.args)
+        elif node.op in ("or", "xor"):
+            known[id(node)] = all(is_clean(arg, have, known) for arg in node.args)
+        elif node.op == "select":
+            known[id(node)] = all(is_clean(arg, have, known) for arg in node.args[1:])
+        else:
+            known[id(node)] = False
+    return known[id(node)]
 
 
 def prerequisites(node: Node, have: Callable[[Node], bool]) -> list[Node]:

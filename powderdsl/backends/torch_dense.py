@@ -17,6 +17,7 @@ from torch import Tensor
 from powderdsl.backends import torch_random
 from powderdsl.backends.dense_source import pass_source
 from powderdsl.backends.torch_job import Job
+from powderdsl.backends.torch_laps import Laps, unwatched
 from powderdsl.ir.ops import Program
 
 SNAP = 2.0**-20
@@ -182,6 +183,15 @@ class DenseProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes; no host sync."""
+        return self._run(job, unwatched)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds that each pass takes over `job.steps`."""
+        laps = Laps(self.device)
+        self._run(job, laps)
+        return laps.passes()
+
+    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
         seed, index, start = job.clock
         batch, height, width = job.state["element"].shape
         kernels = Kernels(
@@ -197,9 +207,11 @@ class DenseProgram:
                         planes[name] = torch.full(
                             kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
                         )
+                lap("")
                 for name, function in self._functions:
                     if job.passes is None or name in job.passes:
                         planes.update(function(kernels, planes))
+                        lap(name)
         return self._pack(planes, job.state, kernels)
 
     def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -29,8 +29,30 @@ class PackedState(Mapping[str, Tensor]):
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._tensors:
-            self._tensors[name] = self.program.unpack(self, name)
+            dtype, shape = self.like[name]
+            self._tensors[name] = self.write(name, torch.empty(shape, dtype=dtype))
         return self._tensors[name]
+
+    def has(self, name: str) -> bool:
+        """Whether a slot's tensor is there already."""
+        return name in self._tensors
+
+    def write(self, name: str, out: Tensor) -> Tensor:
+        """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
+        program = self.program
+        if out.dtype == torch.float32:
+            parts = (f"{name}.row", f"{name}.column") if out.ndim == 4 else (name,)
+            for i, part in enumerate(parts):
+                first = out[:, i] if out.ndim == 4 else out
+                program.library.pd_store_real(
+                    self.handle, program.layout.reals[part], address(first), out.stride(0)
+                )
+        else:
+            slot, bits, signed = program.planes_of(name)
+            program.library.pd_store(
+                self.handle, slot, bits, signed, out.element_size(), address(out), out.stride(0)
+            )
+        return out
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.like)
@@ -45,15 +67,18 @@ class NativeProgram:
     Args:
         program: the numeric program, whose slots are the state's.
         planes: the same program from `ir.bits.lower_bits`.
+        clocks: count the time of each pass, for `profile`; such a program runs on one thread.
 
     Raises:
         native_build.NoCompiler: there is no C++ compiler, or it failed.
     """
 
-    def __init__(self, program: Program, planes: Program, threads: int = 1):
+    def __init__(self, program: Program, planes: Program, threads: int = 1, *, clocks: bool = False):
         source, self.layout = native_source(planes)
-        self.library = load_library(build(source))
-        self.threads = threads
+        self.library = load_library(build(f"#define PROFILE\n{source}" if clocks else source))
+        self.threads = 1 if clocks else threads
+        self._programs = program, planes
+        self._with_clocks: NativeProgram | None = None
         self._slots: dict[str, SlotType] = {slot.name: slot for slot in program.slots}
         self._kinds = dict(program.params)
         self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
@@ -75,13 +100,28 @@ class NativeProgram:
             handle,
             job.steps,
             self.threads,
-            _address(seed),
-            _address(index),
-            _address(start),
-            _address(planes),
-            _address(reals),
+            address(seed),
+            address(index),
+            address(start),
+            address(planes),
+            address(reals),
         )
         return packed
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds of processor time by pass over `job.steps`, on one thread.
+
+        The first call compiles the program once more, with clocks in it. Raises NoCompiler if that fails.
+        """
+        if self._with_clocks is None:
+            self._with_clocks = NativeProgram(*self._programs, clocks=True)
+        passes = self._programs[1].passes
+        seconds = (ctypes.c_double * len(passes))()
+        library = self._with_clocks.library
+        library.pd_profile(seconds)  # what earlier runs have left
+        self._with_clocks.run(job)
+        library.pd_profile(seconds)
+        return {pass_.name: spent for pass_, spent in zip(passes, seconds, strict=True)}
 
     def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
         """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
@@ -119,39 +159,22 @@ class NativeProgram:
                 for i, part in enumerate(parts):
                     first = value[:, i] if value.ndim == 4 else value
                     self.library.pd_load_real(
-                        handle, self.layout.reals[part], _address(first), value.stride(0)
+                        handle, self.layout.reals[part], address(first), value.stride(0)
                     )
             else:
-                slot, bits, _ = self._where(name)
-                self.library.pd_load(handle, slot, bits, value.element_size(), _address(value))
+                slot, bits, _ = self.planes_of(name)
+                self.library.pd_load(handle, slot, bits, value.element_size(), address(value))
         return handle, like
 
-    def _where(self, name: str) -> tuple[int, int, bool]:
-        """First plane, number of planes, and whether the last is a sign."""
+    def planes_of(self, name: str) -> tuple[int, int, bool]:
+        """First plane of a slot, number of planes, and whether the last is a sign."""
         type = self._slots[name].type
         if type.name == "flag":
             return self.layout.planes[name], 1, False
         bits, signed = planes_of(type.lo, type.hi)
         return self.layout.planes[f"{name}:0"], bits, signed
 
-    def unpack(self, state: PackedState, name: str) -> Tensor:
-        """One slot as a tensor in its storage dtype."""
-        dtype, shape = state.like[name]
-        value = torch.empty(shape, dtype=dtype)
-        if dtype == torch.float32:
-            parts = (f"{name}.row", f"{name}.column") if len(shape) == 4 else (name,)
-            for i, part in enumerate(parts):
-                first = value[:, i] if len(shape) == 4 else value
-                self.library.pd_store_real(
-                    state.handle, self.layout.reals[part], _address(first), value.stride(0)
-                )
-        else:
-            slot, bits, signed = self._where(name)
-            self.library.pd_store(
-                state.handle, slot, bits, int(signed), value.element_size(), _address(value)
-            )
-        return value
 
-
-def _address(tensor: Tensor) -> ctypes.c_void_p:
+def address(tensor: Tensor) -> ctypes.c_void_p:
+    """Where a tensor's data begin, for C."""
     return ctypes.c_void_p(tensor.data_ptr())

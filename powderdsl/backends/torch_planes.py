@@ -5,7 +5,7 @@ Runs IR on planes (`ir.bits`). No host sync in a step; the same numbers as every
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -15,6 +15,7 @@ from powderdsl.backends import torch_random, torch_words
 from powderdsl.backends.planes_source import planes_pass_source
 from powderdsl.backends.torch_dense import Kernels, PassFunction, compiled
 from powderdsl.backends.torch_job import Job
+from powderdsl.backends.torch_laps import Laps, unwatched
 from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import Program, SlotType
 
@@ -205,6 +206,15 @@ class PlanesProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes; no host sync."""
+        return self._run(job, unwatched)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds that each pass takes over `job.steps`."""
+        laps = Laps(self.device)
+        self._run(job, laps)
+        return laps.passes()
+
+    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
         seed, index, start = job.clock
         batch, height, width = job.state["element"].shape
         dense = Kernels(
@@ -217,9 +227,11 @@ class PlanesProgram:
             for i in range(job.steps):
                 kernels.begin(start + i)
                 self._reset(planes, kernels)
+                lap("")
                 for name, function in self._functions:
                     if job.passes is None or name in job.passes:
                         planes.update(function(kernels, planes))
+                        lap(name)
         return self._pack(planes, job.state, kernels)
 
     def _reset(self, planes: dict[str, Tensor], kernels: PlaneKernels) -> None:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import click
 
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK, counted, write_diagnostics
-from powderdsl.compiler import load_with_diagnostics
+from powderdsl.cli.show_command import table
+from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
-from powderdsl.diagnostics.render import render_json, render_short
+from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short
 from powderdsl.model.types import Ruleset
+
+if TYPE_CHECKING:
+    from powderdsl.ir.cost import PassCost
 
 
 @click.command("check")
@@ -26,7 +34,8 @@ from powderdsl.model.types import Ruleset
 )
 @click.option("--notes", is_flag=True, help="Also list what is worth knowing, such as rules that are asleep.")
 @click.option("--warnings-as-errors", is_flag=True, help="Exit with 1 if there are warnings.")
-def command(rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool) -> int:
+@click.option("--cost", is_flag=True, help="Also say what each pass costs; in JSON as a second key.")
+def command(rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool, cost: bool) -> int:
     """Find the mistakes in rule files, all at once.
 
     Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml.
@@ -35,6 +44,7 @@ def command(rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors
     """
     found: dict[Diagnostic, None] = {}
     lines = []
+    expenses: dict[str, tuple[PassCost, ...]] = {}
     errors = warnings = 0
     for name in rules:
         ruleset, diagnostics = _check(name)
@@ -43,7 +53,13 @@ def command(rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors
         warnings += counts[Severity.WARNING]
         found |= dict.fromkeys(one for one in diagnostics if notes or one.severity is not Severity.NOTE)
         lines.append(_summary(name, ruleset, counts, notes))
-    if layout == "json":
+        if cost and ruleset is not None:
+            expenses[name] = _costs(ruleset)
+            lines += ["", *_cost_lines(expenses[name])]
+    if layout == "json" and cost:
+        listed = {name: [asdict(one) for one in passes] for name, passes in expenses.items()}
+        click.echo(json.dumps({"diagnostics": [*map(diagnostic_data, found)], "cost": listed}, indent=2))
+    elif layout == "json":
         click.echo(render_json(found))
     elif layout == "short":
         click.echo("".join(f"{render_short(one)}\n" for one in found) + "\n".join(lines))
@@ -62,6 +78,37 @@ def _check(name: str) -> tuple[Ruleset | None, tuple[Diagnostic, ...]]:
         return load_with_diagnostics(name)
     except CompileError as error:
         return None, error.diagnostics
+
+
+def _costs(ruleset: Ruleset) -> tuple[PassCost, ...]:
+    from powderdsl.ir.cost import costs
+
+    return costs(lower(ruleset))
+
+
+def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
+    """A table, a line for each pass that planes do not carry, and what the numbers are."""
+    heading = [
+        "pass",
+        "form",
+        "share (%)",
+        "moments",
+        "gates",
+        "shifts",
+        "moves",
+        "random bits",
+        "reals",
+        "neighbours",
+    ]
+    rows = [heading]
+    for one in passes:
+        numbers = (one.moments, one.gates, one.shifts, one.moves, one.random_bits, one.reals, one.neighbours)
+        rows.append([one.name, one.form, f"{100 * one.share:.0f}", *map(str, numbers)])
+    yield from table(rows)
+    for one in passes:
+        if one.form == "cells":
+            yield f"{one.name}: {one.dense:,} operations on cells, not on planes: {one.why} ({one.place})"
+    yield "For every cell and step, if nothing is skipped. Shares are estimates."
 
 
 def _summary(name: str, ruleset: Ruleset | None, counts: Counter[Severity], notes: bool) -> str:

@@ -69,25 +69,29 @@ def _checked(rules: str, stage: str, backend: str, pass_name: str | None, settin
 
 
 def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
-    """The generated source of a backend."""
-    from powderdsl.ir.bits import lower_bits
+    """The generated source of a backend: part by part, where planes cannot carry all passes."""
+    from powderdsl.backends.torch_dense import kernel_source
+    from powderdsl.backends.torch_planes import planes_kernel_source
+    from powderdsl.ir.segments import segments
 
     match backend:
         case "reference":
             raise BadInput("the reference backend runs the checked model: it has no kernels")
         case "dense":
-            from powderdsl.backends.torch_dense import kernel_source
-
             return kernel_source(program, pass_name)
-        case "native":
+        case "native" if pass_name is not None:
+            raise BadInput("native source is one text: --pass does not go with it")
+    texts = []
+    for part in segments(program):
+        if part.planes is None:
+            texts.append(kernel_source(part.program, pass_name))
+        elif backend == "native":
             from powderdsl.backends.native_source import native_source
 
-            if pass_name is not None:
-                raise BadInput("native source is one text: --pass does not go with it")
-            return native_source(lower_bits(program))[0]
-    from powderdsl.backends.torch_planes import planes_kernel_source
-
-    return planes_kernel_source(lower_bits(program), pass_name)
+            texts.append(native_source(part.planes)[0])
+        else:
+            texts.append(planes_kernel_source(part.planes, pass_name))
+    return "\n\n".join(text for text in texts if text)
 
 
 def _check_pass(name: str, known: Sequence[str]) -> None:

@@ -10,17 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.model.reactions import moved_ids, unchanging_ids
 from powderdsl.model.types import Ruleset
 from powderdsl.worlds.files import failure
-from powderdsl.worlds.raster import MAX_CELLS, Box, Disk, Frame, Line, Shape, Size, mask
+from powderdsl.worlds.raster import Size
+from powderdsl.worlds.strewn import check_cells, strew
 
 if TYPE_CHECKING:
     from powderdsl.simulator import Simulator, World
 
 DEFAULT_SIZE: Size = (64, 64)
-MAX_TOTAL = 16 * MAX_CELLS
-"""Cells of all worlds that are made at once."""
 
 KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
 
@@ -41,7 +39,7 @@ def start_ids(
         _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
         return None
     ids = drawn_ids(name, ruleset, size)
-    _check_cells(batch or 1, ids.shape)
+    check_cells(batch or 1, ids.shape)
     return np.repeat(ids[None], batch or 1, axis=0)
 
 
@@ -82,58 +80,3 @@ def _refuse_options(reason: str, **options: object) -> None:
     for option, value in options.items():
         if value is not None:
             raise BadInput(f"--{option} does not go with this world: {reason}")
-
-
-def _check_cells(batch: int, size: tuple[int, ...]) -> None:
-    if batch * size[0] * size[1] > MAX_TOTAL:
-        many = f"{batch} worlds of {size[0]}×{size[1]} cells"
-        raise failure("PD607", many, helps=(f"all worlds together have at most {MAX_TOTAL:,} cells",))
-
-
-def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uint8]:
-    """Worlds of shapes at random places, uint8 [batch, H, W]: world i depends on `seed` and i alone.
-
-    The ground is the element of the lowest id. On it lie 24 disks, boxes and lines of the other elements,
-    each of them solid, or only half of its cells. If anything in the ruleset moves and some element never
-    changes, the first such element frames the world, so that nothing falls out of it.
-    """
-    height, width = size
-    _check_cells(batch, size)
-    everything = [element.id for element in ruleset.elements]
-    ground, others = everything[0], everything[1:]
-    worlds = np.full((batch, height, width), ground, dtype=np.uint8)
-    if not others:
-        return worlds
-    frame = _frame_element(ruleset, ground) if min(size) >= 3 else None
-    edge = mask(Frame(), size)
-    for index, world in enumerate(worlds):
-        random = np.random.default_rng([seed, index])
-        for _ in range(24):
-            cells = mask(_shape(random, size), size)
-            element = others[random.integers(len(others))]
-            if random.random() < 0.5:
-                cells &= random.random(size) < 0.5
-            world[cells] = element
-        if frame is not None:
-            world[edge] = frame
-    return worlds
-
-
-def _shape(random: np.random.Generator, size: Size) -> Shape:
-    """A shape up to about a quarter of the world across, anywhere in it."""
-    row, column = (int(random.integers(side)) for side in size)
-    reach = max(min(size) // 8, 1)
-    match random.integers(3):
-        case 0:
-            return Disk((row, column), int(random.integers(1, reach + 2)))
-        case 1:
-            rows, columns = (int(number) for number in random.integers(1, 2 * reach + 1, 2))
-            return Box((row, row + rows), (column, column + columns))
-    down, right = (int(number) for number in random.integers(-2 * reach, 2 * reach + 1, 2))
-    return Line((row, column), (row + down, column + right), 1)
-
-
-def _frame_element(ruleset: Ruleset, ground: int) -> int | None:
-    if not moved_ids(ruleset):
-        return None
-    return min(unchanging_ids(ruleset) - {ground}, default=None)

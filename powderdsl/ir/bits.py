@@ -14,9 +14,16 @@ from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Program, SlotType, Ste
 
 MAX_TABLE_BITS = 12
 
+MAX_GATES = 1 << 14
+"""Nodes of a pass on planes. So many take a C++ compiler a quarter of a minute."""
+
 
 class NotBits(Exception):
-    """Something that planes cannot carry; the dense backend can."""
+    """Something that planes cannot carry; the dense backend can. `place` is the rule's file and line."""
+
+    def __init__(self, why: str, place: str = ""):
+        super().__init__(why)
+        self.place = place
 
 
 def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
@@ -32,9 +39,13 @@ def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
 def lower_bits(program: Program) -> Program:
     """The program on planes. Raises NotBits with the pass that cannot be."""
     slots = tuple(plane for slot in program.slots for plane in plane_slots(slot))
-    types = {slot.name: slot for slot in program.slots}
-    passes = tuple(_PassBits(types).lower(pass_) for pass_ in program.passes)
+    passes = tuple(lower_pass(program, pass_) for pass_ in program.passes)
     return replace(program, slots=slots, passes=passes)
+
+
+def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
+    """One pass of a program on planes. Raises NotBits."""
+    return _PassBits({slot.name: slot for slot in program.slots}).lower(pass_)
 
 
 @dataclass
@@ -63,7 +74,13 @@ class _PassBits:
     def _visit(self, node: Node) -> None:
         if id(node) not in self.values:
             self.build.place = node.places[0] if node.places else ""
-            self.values[id(node)] = self._lower(node)
+            try:
+                self.values[id(node)] = self._lower(node)
+                if self.build.graph.size > MAX_GATES:
+                    raise NotBits(f"more than {MAX_GATES:,} gates")
+            except NotBits as error:
+                error.place = error.place or self.build.place
+                raise
 
     def _write(self, name: str, node: Node) -> list[tuple[str, Node]]:
         """The planes that a write of a slot becomes. Scratch slots have no declared range: theirs is the node's."""

@@ -168,6 +168,11 @@ class Graph:
     def __init__(self) -> None:
         self._nodes: dict[Hashable, Node] = {}
 
+    @property
+    def size(self) -> int:
+        """How many nodes there are."""
+        return len(self._nodes)
+
     def node(
         self,
         op: str,

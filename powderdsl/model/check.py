@@ -51,7 +51,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     elements = tuple(_tagged(element, composition) for element in composition.elements.values())
     passes = tuple(elaborated.passes)
     facts = _facts(symbols)
-    stored = {name: overridden_ids(passes, name, facts) for name in elaborated.overridden}
+    stored = overridden_ids(passes, sorted(elaborated.overridden), facts)
     symbols.properties = {
         name: replace(p, stored=stored.get(name, frozenset())) for name, p in symbols.properties.items()
     }

@@ -45,8 +45,8 @@ MAX_ROUNDS = 4096
 MAX_RULE_WORK = 5_000
 """Parts of expressions that one rule may come to, quantifiers written out."""
 
-MAX_WORK = 250_000
-"""Parts of expressions that all rules may come to: some seconds."""
+MAX_WORK = 100_000
+"""Parts of expressions that all rules may come to: a second or two."""
 
 MAX_SET_DEPTH = 24
 """How many sets may be defined by each other in a row."""
@@ -371,7 +371,6 @@ class Typer(Coercer):
 
     def domain(self, syntax: Syntax, scope: Scope) -> list[Operand]:
         operand = self.evaluate(syntax, scope)
-        names = {element.id: name for name, element in self.symbols.composition.elements.items()}
         match operand:
             case Bounds():
                 if operand.hi - operand.lo >= 64:
@@ -384,6 +383,7 @@ class Typer(Coercer):
                     )
                 return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():
+                names = {element.id: name for name, element in self.symbols.composition.elements.items()}
                 return [SetOf((i,), names[i]) for i in operand.ids]
             case Items():
                 return list(operand.items)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -237,8 +237,23 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
     )
 
 
-def overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
-    """The ids whose cells may hold their own value of a property: those that some rule assigns it to."""
+def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
+    """For each of these properties the ids whose cells may hold their own value: those that some rule assigns it to.
+
+    A value of its own may fulfil the condition of another such rule: this goes on until nothing is added.
+    """
+    found: dict[str, frozenset[int]] = {name: frozenset() for name in names}
+    while True:
+        more = {name: found[name] | _overridden_ids(passes, name, facts) for name in found}
+        if more == found:
+            return found
+        found = more
+        stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
+        facts = replace(facts, properties={**facts.properties, **stored})
+
+
+def _overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
+    """The ids that some rule assigns a property to, if cells hold values of their own as `facts` say."""
     found: set[int] = set()
     for pass_ in passes:
         for moment in pass_.moments:

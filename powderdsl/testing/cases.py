@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 SIDES = (1, 2, 3, 4, 5, 7, 9, 16, 31, 32, 33, 63, 64, 65, 97)
 """Lengths of sides: tiny ones, where neighbours coincide, and the borders of words of 32 and 64 columns."""
+
+CLOCKS = (0, 0, 0, 1, 6, 1 << 20, (1 << 32) - 1, 1 << 40)
+"""Steps at which worlds start: the clock runs on beyond 32 bits."""
 
 FEW_CELLS = 12
 """Worlds of so few cells are chosen cell by cell, so that Hypothesis can shrink them; others are filled by a seed."""
@@ -41,26 +44,54 @@ class Start:
     """A batch of start worlds, free of any backend.
 
     `ids` is uint8 [B, H, W]; `fields` are arrays by slot name, [B, H, W] or [B, 2, H, W]; `params` are values for
-    all of a ruleset's parameters, one a world, or none.
+    all of a ruleset's parameters, one a world, or none; `step` is what the clock says.
     """
 
     ids: np.ndarray
     fields: dict[str, np.ndarray] = field(default_factory=dict)
     seed: int = 0
     params: dict[str, list[float]] = field(default_factory=dict)
+    step: int = 0
 
     def world(self, simulator: Simulator) -> World:
         """The same worlds for any simulator of the ruleset."""
         world = simulator.world(self.ids.astype(np.int64), seed=self.seed)
+        world = replace(world, step=world.step + self.step)
         return simulator.replace(world, **self.fields) if self.fields else world
 
     def __str__(self) -> str:
         shape = "×".join(map(str, self.ids.shape))
-        told = [f"worlds {shape}, seed {self.seed}, ids {self.ids.tolist() if self.ids.size <= 80 else '…'}"]
+        told = [
+            f"worlds {shape}, seed {self.seed}, step {self.step}, ids {self.ids.tolist() if self.ids.size <= 80 else '…'}"
+        ]
         told += [
             f"{name} {values.tolist() if values.size <= 160 else '…'}" for name, values in self.fields.items()
         ]
         return "\n".join([*told, *(f"{name} = {values}" for name, values in self.params.items())])
+
+
+@dataclass(frozen=True)
+class Case:
+    """Rules, worlds and a number of steps to run on a backend and compare with the reference."""
+
+    text: str
+    start: Start
+    steps: int
+    backend: str
+
+
+def fitted(start: Start, ruleset: Ruleset) -> Start:
+    """The same worlds for a ruleset from which something went: without what it does not have."""
+    known = sorted(element.id for element in ruleset.elements)
+    ids = np.where(np.isin(start.ids, known), start.ids, known[0]).astype(np.uint8)
+    names = {slot.name for slot in slots(ruleset)[1:]}
+    params = {param.name for param in ruleset.params}
+    return replace(
+        start,
+        ids=ids,
+        fields={name: values for name, values in start.fields.items() if name in names},
+        params={name: values for name, values in start.params.items() if name in params},
+    )
 
 
 def random_start(
@@ -86,7 +117,7 @@ def random_start(
         if choices.maybe(25)
         else {}
     )
-    return Start(ids, fields, choices.below(1 << 31), params)
+    return Start(ids, fields, choices.below(1 << 31), params, choices.pick(CLOCKS))
 
 
 def _sides(choices: Choices, max_side: int) -> tuple[int, int]:

@@ -319,7 +319,15 @@ class Phrases:
         ]
         return choices.weighted(
             [
-                (4, (SIDE, choices.pick(["(left, right)", "sides", "diagonals", "(below, above.left)"]))),
+                (
+                    4,
+                    (
+                        SIDE,
+                        choices.pick(
+                            ["(left, right)", "sides", "diagonals", "(below, above.left)", "octants"]
+                        ),
+                    ),
+                ),
                 (3, (NUMBER, choices.pick(["0..2", "0..1"]))),
                 (2, (ONE, choices.pick(groups))),
                 (1, (PLACE, "(at(0, 2), at(-3, 1))")),

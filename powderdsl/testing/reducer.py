@@ -12,7 +12,7 @@ from powderdsl.diagnostics import Reporter, Source
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_text
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
-from powderdsl.testing.cases import Start
+from powderdsl.testing.cases import Case, Start
 from powderdsl.testing.rulemaker import write_yaml
 from powderdsl.testing.vocabulary import Tree
 
@@ -45,6 +45,34 @@ def reduce_text(text: str, fails: Callable[[str], bool], tries: int = 5000) -> s
         else:
             position += 1
     return write_yaml(tree)
+
+
+def reduce_case(case: Case, fails: Callable[[Case], bool]) -> Case:
+    """The smallest case found that still fails: fewer steps, smaller worlds, fewer rules, until nothing goes.
+
+    Args:
+        fails: whether a case fails as the first one did. It must say False for rules that do not compile, and may
+            say so for everything when time is up.
+    """
+    while True:
+        before = case
+        for steps in range(1, case.steps):
+            if fails(replace(case, steps=steps)):
+                case = replace(case, steps=steps)
+                break
+        case = _with_start(case, fails)
+        case = _with_text(case, fails)
+        if (case.steps, case.text) == (before.steps, before.text):
+            return case
+
+
+def _with_start(case: Case, fails: Callable[[Case], bool]) -> Case:
+    return replace(case, start=reduce_start(case.start, lambda start: fails(replace(case, start=start))))
+
+
+def _with_text(case: Case, fails: Callable[[Case], bool]) -> Case:
+    text = reduce_text(case.text, lambda text: fails(replace(case, text=text)))
+    return replace(case, text=text) if len(text) < len(case.text) else case
 
 
 def reduce_start(start: Start, fails: Callable[[Start], bool]) -> Start:
@@ -152,6 +180,8 @@ def _smaller_starts(start: Start) -> Iterator[Start]:
         yield replace(start, params={})
     if start.seed:
         yield replace(start, seed=0)
+    if start.step:
+        yield replace(start, step=0)
     if start.ids.max() > start.ids.min():
         yield replace(start, ids=np.where(start.ids == start.ids.max(), start.ids.min(), start.ids))
 
@@ -164,4 +194,4 @@ def _cut(start: Start, where: tuple[slice, slice, slice], world: int | None) -> 
     params = (
         start.params if world is None else {name: [values[world]] for name, values in start.params.items()}
     )
-    return Start(start.ids[where], fields, start.seed, params)
+    return replace(start, ids=start.ids[where], fields=fields, params=params)

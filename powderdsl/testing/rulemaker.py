@@ -85,7 +85,8 @@ class PassMaker:
         """The pass as YAML."""
         tree: dict[str, Tree] = {}
         if earlier and self.choices.maybe(30):
-            tree["after"] = self.choices.pick([earlier[-1], [earlier[0], "nowhere?"]])
+            order = self.choices.pick(["after", "after", "before"])
+            tree[order] = self.choices.pick([earlier[-1], [earlier[0], "nowhere?"]])
         scratch = {
             self._name("x"): self._scratch_kind()
             for _ in range(self.choices.weighted([(4, 0), (2, 1), (1, 2)]))

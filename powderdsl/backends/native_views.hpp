@@ -1,0 +1,181 @@
+// What packed worlds show: values of cells, pictures, channels, and the planes themselves, written straight into the
+// caller's memory. `apart` is the distance from one world to the next there, in items. Comes after the driver.
+
+ALWAYS u64 word_of(const Plane* p, int lane, int i) { return p->zero ? 0 : ((const u64*)p->data)[i * LANES + lane]; }
+
+// Flags as bytes 0 and 1: eight of them by a table, sixty-four at once where the machine can.
+struct Spread {
+  u64 of[256];
+  constexpr Spread() : of() {
+    for (int b = 0; b < 256; b++)
+      for (int i = 0; i < 8; i++) of[b] |= (u64)(b >> i & 1) << 8 * i;
+  }
+};
+static constexpr Spread SPREAD;
+// The sum of up to eight planes by weight, as 64 bytes.
+ALWAYS void bytes_of(const u64* words, const uint8_t* weights, int count, uint8_t* out) {
+#if defined(__AVX512BW__)
+  __m512i sum = _mm512_setzero_si512();
+  for (int i = 0; i < count; i++) sum = _mm512_mask_add_epi8(sum, words[i], sum, _mm512_set1_epi8((char)weights[i]));
+  _mm512_storeu_si512(out, sum);
+#else
+  for (int part = 0; part < 8; part++) {
+    u64 sum = 0;
+    for (int i = 0; i < count; i++) sum |= SPREAD.of[words[i] >> 8 * part & 255] * weights[i];
+    memcpy(out + 8 * part, &sum, 8);
+  }
+#endif
+}
+
+// The planes of a slot of whole numbers; the last may be a sign, which counts in all higher bits too.
+struct Planes {
+  const Plane* const* plane;
+  int bits;
+  bool negative;
+};
+static Planes planes_of(const Group& group, int slot, int bits, int negative) {
+  return Planes{group.slot + slot, bits, negative != 0};
+}
+// 64 cells from word i of a world, eight planes a byte.
+template <class T> ALWAYS void cells_of(const Planes& p, int lane, int i, T* out) {
+  uint8_t bytes[sizeof(T)][64];
+  for (int part = 0; part < (int)sizeof(T); part++) {
+    u64 words[8];
+    uint8_t weights[8];
+    int first = 8 * part, count = std::min(8, p.bits - first);
+    for (int k = 0; k < count; k++) {
+      words[k] = word_of(p.plane[first + k], lane, i);
+      weights[k] = 1 << k;
+    }
+    if (p.negative && count <= 0) {
+      words[0] = word_of(p.plane[p.bits - 1], lane, i);
+      weights[0] = 255;
+      count = 1;
+    } else if (p.negative && first + count == p.bits) {
+      weights[count - 1] = -(1 << (count - 1));
+    }
+    bytes_of(words, weights, std::max(count, 0), bytes[part]);
+  }
+  if constexpr (sizeof(T) == 1) {
+    memcpy(out, bytes[0], 64);
+  } else {
+    for (int x = 0; x < 64; x++) {
+      T value = 0;
+      for (int part = 0; part < (int)sizeof(T); part++) value |= (T)bytes[part][x] << 8 * part;
+      out[x] = value;
+    }
+  }
+}
+
+// Calls `put(word, cell, count)` for every run of up to 64 columns of a world, from the top left.
+template <class Put> ALWAYS void each_run(const Grid& g, Put put) {
+  for (int y = 0; y < g.height; y++)
+    for (int w = 0; w < g.words; w++) put(y * g.words + w, y * g.width + 64 * w, std::min(64, g.width - 64 * w));
+}
+template <class T> static void store_values(const Batch& b, int slot, int bits, int negative, T* data, int64_t apart) {
+  for (int world = 0; world < b.worlds; world++) {
+    Planes p = planes_of(b.groups[world / LANES], slot, bits, negative);
+    T* out = data + world * apart;
+    each_run(b.g, [&](int i, int cell, int count) {
+      if (count == 64) return cells_of(p, world % LANES, i, out + cell);
+      T part[64];
+      cells_of(p, world % LANES, i, part);
+      memcpy(out + cell, part, sizeof(T) * count);
+    });
+  }
+}
+API void pd_store(const void* batch, int slot, int bits, int negative, int item, void* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  if (item == 1) store_values(b, slot, bits, negative, (uint8_t*)data, apart);
+  else if (item == 2) store_values(b, slot, bits, negative, (uint16_t*)data, apart);
+  else store_values(b, slot, bits, negative, (u32*)data, apart);
+}
+
+// Pictures: `palette` has red, green and blue of each number in its three low bytes.
+API void pd_rgb(const void* batch, int slot, int bits, const u32* palette, uint8_t* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  for (int world = 0; world < b.worlds; world++) {
+    Planes p = planes_of(b.groups[world / LANES], slot, bits, 0);
+    uint8_t* out = data + world * apart;
+    each_run(b.g, [&](int i, int cell, int count) {
+      uint8_t ids[64];
+      cells_of(p, world % LANES, i, ids);
+      uint8_t* pixel = out + 3 * (size_t)cell;
+      for (int x = 0; x < count - 1; x++, pixel += 3) memcpy(pixel, palette + ids[x], 4);  // the next mends the fourth
+      memcpy(pixel, palette + ids[count - 1], 3);
+    });
+  }
+}
+
+// Channels of float32.
+struct Channel {
+  int kind;  // 0 nothing, 1 cells of a number, 2 what a table says of a number, 3 a number, 4 a real
+  int slot, bits;
+  int value;  // the number, the table, or whether the last plane is a sign
+};
+ALWAYS void put_floats(float* out, u64 word, int count) {  // flags as 0 and 1
+  float part[64], *to = count == 64 ? out : part;
+  for (int x = 0; x < 64; x += CHUNK) *(Fu*)(to + x) = (Fu)blend(word >> x & 0xffff, splatf(1), splatf(0));
+  if (count < 64) memcpy(out, part, sizeof(float) * count);
+}
+static void store_real(const Grid& g, const Field* f, int lane, float* out) {
+  for (int y = 0; y < g.height; y++, out += g.width) {
+    size_t row = (size_t)lane * g.height + y;
+    if (f->live[row]) memcpy(out, f->data + row * g.stride + HALO, sizeof(float) * g.width);
+    else memset(out, 0, sizeof(float) * g.width);
+  }
+}
+static void store_channel(const Batch& b, const Channel& c, const float* tables, int world, float* out) {
+  const Group& group = b.groups[world / LANES];
+  int lane = world % LANES;
+  if (c.kind == 0) {
+    memset(out, 0, sizeof(float) * b.g.height * b.g.width);
+  } else if (c.kind == 4) {
+    store_real(b.g, group.real[c.slot], lane, out);
+  } else if (c.kind == 1) {
+    each_run(b.g, [&](int i, int cell, int count) {
+      u64 word = ~0ull;
+      for (int k = 0; k < c.bits; k++) {
+        u64 plane = word_of(group.slot[c.slot + k], lane, i);
+        word &= c.value >> k & 1 ? plane : ~plane;
+      }
+      put_floats(out + cell, word, count);
+    });
+  } else if (c.kind == 2) {
+    Planes p = planes_of(group, c.slot, c.bits, 0);
+    each_run(b.g, [&](int i, int cell, int count) {
+      uint8_t ids[64];
+      cells_of(p, lane, i, ids);
+      for (int x = 0; x < count; x++) out[cell + x] = tables[256 * c.value + ids[x]];
+    });
+  } else {
+    Planes p = planes_of(group, c.slot, c.bits, c.value);
+    each_run(b.g, [&](int i, int cell, int count) {
+      int32_t part[64];
+      cells_of(p, lane, i, (u32*)part);
+      for (int x = 0; x < count; x++) out[cell + x] = (float)part[x];
+    });
+  }
+}
+API void pd_channels(const void* batch, int count, const Channel* channels, const float* tables, float* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  for (int world = 0; world < b.worlds; world++)
+    for (int i = 0; i < count; i++)
+      store_channel(b, channels[i], tables, world, data + world * apart + (int64_t)i * b.g.height * b.g.width);
+}
+API void pd_store_real(const void* batch, int slot, float* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  for (int world = 0; world < b.worlds; world++)
+    store_real(b.g, b.groups[world / LANES].real[slot], world % LANES, data + world * apart);
+}
+
+// Planes as they are: [plane][row][word] of each world.
+API void pd_planes(const void* batch, int count, const int* slots, u64* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  for (int world = 0; world < b.worlds; world++)
+    for (int k = 0; k < count; k++) {
+      const Plane* p = b.groups[world / LANES].slot[slots[k]];
+      u64* out = data + world * apart + (int64_t)k * b.g.cells();
+      for (int i = 0; i < b.g.cells(); i++) out[i] = word_of(p, world % LANES, i);
+    }
+}

@@ -1,0 +1,118 @@
+"""What worlds show, written into a tensor that is there: pictures, channels, packed planes. No host sync.
+
+Worlds that lie packed in native memory are read where they lie; all others are tensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from powderdsl.backends import torch_words
+from powderdsl.backends.torch_native import PackedState, address
+
+State = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel of cells in float32: where it comes from.
+
+    `kind` is ``zero``; ``one_hot``, 1 where the slot has the number `value`; ``table``, entry `value` of the tables at
+    the slot's number; or ``slot``, what the slot holds. Parts of vectors are slots of their own: ``name.row``.
+    """
+
+    kind: str
+    slot: str = ""
+    value: int = 0
+
+
+@dataclass(frozen=True)
+class PlaneName:
+    """One packed plane: bit `bit` of a slot in two's complement."""
+
+    slot: str
+    bit: int
+
+
+def shape_of(state: State) -> tuple[int, int, int]:
+    """(worlds, rows, columns), without unpacking anything."""
+    shape = state.like["element"][1] if isinstance(state, PackedState) else state["element"].shape
+    batch, height, width = shape
+    return batch, height, width
+
+
+def write_slot(state: State, name: str, out: Tensor) -> None:
+    """A slot in its storage dtype."""
+    if isinstance(state, PackedState) and not state.has(name):
+        state.write(name, out)
+    else:
+        out.copy_(state[name])
+
+
+def write_rgb(state: State, palette: Tensor, out: Tensor) -> None:
+    """Colours uint8 [B, H, W, 3] of the elements. `palette` is uint8 [256, 4]: red, green, blue, nothing."""
+    if isinstance(state, PackedState):
+        slot, bits, _ = state.program.planes_of("element")
+        state.program.library.pd_rgb(state.handle, slot, bits, address(palette), address(out), out.stride(0))
+    else:
+        ids = state["element"].flatten().int()
+        out.copy_(palette[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
+
+
+def write_channels(state: State, channels: Sequence[Channel], tables: Tensor, out: Tensor) -> None:
+    """Channels float32 [B, C, H, W]. `tables` is float32 [n, 256]."""
+    if isinstance(state, PackedState):
+        wanted = torch.tensor([_native_channel(c, state) for c in channels], dtype=torch.int32)
+        state.program.library.pd_channels(
+            state.handle, len(channels), address(wanted), address(tables), address(out), out.stride(0)
+        )
+        return
+    at = 0
+    while at < len(channels):
+        channel, end = channels[at], at + 1
+        if channel.kind == "one_hot":  # neighbouring numbers together
+            while end < len(channels) and channels[end].kind == "one_hot":
+                end += 1
+            first, last = channel.value, channels[end - 1].value
+            numbers = torch.arange(first, last + 1, device=out.device, dtype=torch.uint8)
+            out[:, at:end] = state[channel.slot][:, None] == numbers[:, None, None]
+        elif channel.kind == "table":
+            out[:, at] = tables[channel.value][state[channel.slot].int()]
+        elif channel.kind == "slot":
+            out[:, at] = _part(state, channel.slot)
+        else:
+            out[:, at] = 0
+        at = end
+
+
+def _part(state: State, name: str) -> Tensor:
+    base, _, part = name.rpartition(".")
+    return state[base][:, ("row", "column").index(part)] if base in state else state[name]
+
+
+def _native_channel(channel: Channel, state: PackedState) -> tuple[int, int, int, int]:
+    """A channel as native code has it: kind, first plane or real, planes, value."""
+    program = state.program
+    if channel.kind == "zero":
+        return 0, 0, 0, 0
+    if channel.slot in program.layout.reals:
+        return 4, program.layout.reals[channel.slot], 0, 0
+    slot, bits, signed = program.planes_of(channel.slot)
+    if channel.kind == "slot":
+        return 3, slot, bits, int(signed)
+    return (1 if channel.kind == "one_hot" else 2), slot, bits, channel.value
+
+
+def write_planes(state: State, names: Sequence[PlaneName], out: Tensor) -> None:
+    """Packed planes int64 [B, P, H, ⌈W/64⌉]; bits beyond the width are zero."""
+    if isinstance(state, PackedState):
+        program = state.program
+        slots = torch.tensor([program.planes_of(n.slot)[0] + n.bit for n in names], dtype=torch.int32)
+        program.library.pd_planes(state.handle, len(names), address(slots), address(out), out.stride(0))
+        return
+    for i, name in enumerate(names):
+        out[:, i] = torch_words.pack((state[name.slot] >> name.bit) & 1 != 0)

@@ -1,0 +1,115 @@
+"""What each pass of a program costs, counted in its IR: nothing is run, nothing is taken to be skipped."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from powderdsl.ir.ops import REAL, Node, Offset, PassGraph, Program, nodes_of
+from powderdsl.ir.segments import Carried, carry
+
+GATES = {"not": 1, "and": 1, "or": 1, "xor": 1, "select": 3}
+"""Gates that an operation on planes takes: a choice is (a and c) or (b and not c)."""
+
+WEIGHTS = {"gate": 1.0, "shift": 4.0, "move": 8.0, "random": 8.0, "real": 32.0, "dense": 200.0}
+"""About what one of each takes, in vector operations on 512 cells: sixteen reals fill the vector that holds 512 flags,
+a random bit is a hash, what runs on cells goes through memory. Chosen so that the shares of the shipped rulesets come
+out as native code needs them on worlds full of everything: most do to a factor of two."""
+
+
+@dataclass(frozen=True)
+class PassCost:
+    """One pass. Counts are for every cell and step.
+
+    `gates` are those of flags and whole numbers on planes, `shifts` the planes read at a neighbour, `moves` those
+    exchanged with one, `random_bits` what its draws take at most, `reals` operations on float32. A pass on cells has
+    `dense` operations instead, with the reason and the rule (``file:line``) that is why. `share` is an estimate.
+    """
+
+    name: str
+    pack: str
+    moments: int
+    gates: int
+    shifts: int
+    moves: int
+    random_bits: int
+    reals: int
+    dense: int
+    neighbours: int
+    form: str
+    why: str
+    place: str
+    share: float
+
+
+def costs(program: Program) -> tuple[PassCost, ...]:
+    """What the passes of an optimised program cost, in their order. Shares add up to 1."""
+    counts = [_counted(carry(program, pass_)) for pass_ in program.passes]
+    weights = [sum(WEIGHTS[kind] * number for kind, number in count.items()) for _, count in counts]
+    whole = sum(weights) or 1.0
+    found = []
+    for (carried, count), weight in zip(counts, weights, strict=True):
+        pass_ = carried.cells
+        found.append(
+            PassCost(
+                name=pass_.name,
+                pack=pass_.pack,
+                moments=len(pass_.moments),
+                gates=count["gate"],
+                shifts=count["shift"],
+                moves=count["move"],
+                random_bits=count["random"],
+                reals=count["real"],
+                dense=count["dense"],
+                neighbours=len(_neighbours(pass_)),
+                form="planes" if carried.planes else "cells",
+                why=carried.why,
+                place=carried.place,
+                share=weight / whole,
+            )
+        )
+    return tuple(found)
+
+
+def _counted(carried: Carried) -> tuple[Carried, Counter[str]]:
+    """How much there is of each kind of work."""
+    nodes = nodes_of(carried.planes or carried.cells, moments=False)
+    count = Counter({"random": _random_bits(nodes)})
+    if carried.planes is None:
+        count["dense"] = sum(1 for node in nodes if node.args)
+        return carried, count
+    for node in nodes:
+        if node.type == REAL or any(arg.type == REAL for arg in node.args):
+            count["real"] += bool(node.args)
+        elif node.op in GATES:
+            count["gate"] += GATES[node.op]
+        elif node.op == "shift":
+            count["shift"] += 1
+        elif node.op in ("swap", "arrive"):
+            count["move"] += 1
+    return carried, count
+
+
+def _random_bits(nodes: Iterable[Node]) -> int:
+    """Bits drawn a cell: of each stream as many as its finest question needs. They are shared within a pass."""
+    needed: Counter[str] = Counter()
+    for node in nodes:
+        if node.op in ("chance", "below", "below_planes", "draw"):
+            stream, bits = node.attr[:2]
+            limit = node.attr[2] if node.op == "chance" else 1
+            needed[stream] = max(needed[stream], bits - ((limit & -limit).bit_length() - 1))
+    return needed.total()
+
+
+def _neighbours(pass_: PassGraph) -> set[Offset]:
+    """Offsets at which other cells are read or written."""
+    found: set[Offset] = set()
+    for node in nodes_of(pass_, moments=False):
+        if node.op == "shift":
+            found.add(node.attr[:2])
+        elif node.op == "count":
+            found |= {(dy, dx) for dy, dx, _ in node.attr[0]}
+        elif node.op in ("swap", "arrive"):
+            found.add(node.attr)
+    return found - {(0, 0)}

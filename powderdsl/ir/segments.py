@@ -1,0 +1,59 @@
+"""A program in consecutive parts, each in one form: bit planes, or one value a cell where planes cannot carry a pass.
+
+Random numbers hang on streams, cells and steps, never on the pass that reads them: parts draw what the whole drew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+from powderdsl.ir.bits import NotBits, lower_bits, lower_pass, plane_slots
+from powderdsl.ir.ops import PassGraph, Program
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Passes in a row. `planes` is `program` on planes, None if they run on cells."""
+
+    program: Program
+    planes: Program | None
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A pass, the same on planes, or why there is none, and the rule that this is due to."""
+
+    cells: PassGraph
+    planes: PassGraph | None
+    why: str = ""
+    place: str = ""
+
+
+def carry(program: Program, pass_: PassGraph) -> Carried:
+    """In which form a pass of a program runs."""
+    try:
+        return Carried(pass_, lower_pass(program, pass_))
+    except NotBits as error:
+        return Carried(pass_, None, str(error), error.place)
+
+
+def segments(program: Program, carry: Callable[[Program, PassGraph], Carried] = carry) -> tuple[Segment, ...]:
+    """A program as parts of as many passes as possible. Slots that reset do so in the first part only."""
+    found = []
+    slots = program.slots
+    carried = [carry(program, pass_) for pass_ in program.passes]
+    if not carried:
+        return (Segment(program, lower_bits(program)),)
+    for packed, group in groupby(carried, lambda one: one.planes is not None):
+        passes = tuple(group)
+        part = replace(program, slots=slots, passes=tuple(one.cells for one in passes))
+        planes = replace(
+            part,
+            slots=tuple(plane for slot in slots for plane in plane_slots(slot)),
+            passes=tuple(one.planes for one in passes if one.planes is not None),
+        )
+        found.append(Segment(part, planes if packed else None))
+        slots = tuple(replace(slot, resets=False) for slot in program.slots)
+    return tuple(found)

@@ -1,0 +1,107 @@
+"""Cases as files that people can read: rules, worlds as ids, fields, steps, and what was wrong when it was found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.model.state import slots
+from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.testing.cases import Case, Start, load_text
+from powderdsl.testing.reducer import to_tree
+from powderdsl.testing.rulemaker import write_yaml
+from powderdsl.testing.vocabulary import Tree
+from powderdsl.worlds.files import failure, read_source, replacing
+
+
+def write_case(path: Path, case: Case, problem: str = "") -> None:
+    """Write a case. `problem` stands above it as a comment.
+
+    Raises:
+        CompileError: PD613, the file cannot be written.
+    """
+    start = case.start
+    head = [*problem.splitlines(), f"Again: powderdsl fuzz --replay {path.name}"]
+    tree: dict[str, Tree] = {
+        "backend": case.backend,
+        "steps": str(case.steps),
+        "seed": str(start.seed),
+        "step": str(start.step),
+        "worlds": _rows(start.ids),
+    }
+    if start.fields:
+        tree["fields"] = {name: _rows(values) for name, values in start.fields.items()}
+    if start.params:
+        tree["params"] = {
+            name: " ".join(repr(value) for value in values) for name, values in start.params.items()
+        }
+    rules = "".join(f"  {line}\n" for line in case.text.splitlines())
+    text = "".join(f"# {line}\n" for line in head) + write_yaml(tree) + f"rules: |\n{rules}"
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_case(path: Path) -> Case:
+    """The case in a file.
+
+    Raises:
+        CompileError: it cannot be read (PD1xx), it is no case (PD602), or its rules are refused.
+    """
+    reporter = Reporter()
+    source = read_source(path, reporter)
+    root = parse_yaml(source, reporter) if source is not None else None
+    reporter.raise_if_errors()
+    tree = to_tree(root) if root is not None else None
+    try:
+        assert isinstance(tree, dict)
+        text = _line(tree["rules"])
+        types = {slot.name: slot.dtype for slot in slots(load_text(text, path.name))}
+        fields = {name: _array(rows, types[name]) for name, rows in _entries(tree.get("fields"))}
+        params = {
+            name: [float(word) for word in _line(row).split()] for name, row in _entries(tree.get("params"))
+        }
+        start = Start(
+            _array(tree["worlds"], "uint8"),
+            fields,
+            int(_line(tree["seed"])),
+            params,
+            int(_line(tree["step"])),
+        )
+        return Case(text, start, int(_line(tree["steps"])), _line(tree["backend"]))
+    except CompileError:
+        raise
+    except (AssertionError, KeyError, ValueError, TypeError, OverflowError) as error:
+        note = (
+            f"{type(error).__name__}: {' '.join(str(error).split())}" if str(error) else "a part is missing"
+        )
+        helps = ("a case is written by `powderdsl fuzz`",)
+        raise failure("PD602", f"{path} is no case of `powderdsl fuzz`", notes=(note,), helps=helps) from None
+
+
+def _rows(values: np.ndarray) -> Tree:
+    """Nested lists, the last axis a line of numbers; floats as the shortest text that means the same float32."""
+    if values.ndim == 1:
+        return " ".join(str(value) for value in values)
+    return [_rows(part) for part in values]
+
+
+def _array(tree: Tree, dtype: str) -> np.ndarray:
+    def nested(part: Tree) -> list:
+        if isinstance(part, str):
+            return [np.dtype(dtype).type(word) for word in part.split()]
+        assert isinstance(part, list)
+        return [nested(item) for item in part]
+
+    return np.asarray(nested(tree), dtype)
+
+
+def _line(tree: Tree) -> str:
+    assert isinstance(tree, str)
+    return tree
+
+
+def _entries(tree: Tree | None) -> list[tuple[str, Tree]]:
+    assert tree is None or isinstance(tree, dict)
+    return list((tree or {}).items())

@@ -1,0 +1,89 @@
+"""Generated kernels on the CPU: fibers stand for threads, so their meaning and their barriers are tested without a GPU."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+
+from torch import Tensor
+
+from powderdsl.backends.cuda_source import KernelSource
+from powderdsl.backends.native_build import find_compiler
+from powderdsl.backends.torch_cuda import Arguments, Compile, CudaProgram, Launch
+from powderdsl.backends.torch_job import Job
+from powderdsl.compiler import lower
+from powderdsl.ir.bits import lower_bits
+from powderdsl.model.types import Ruleset
+from powderdsl.simulator import Simulator
+from powderdsl.simulator import compile as compile_ruleset
+
+FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-fno-strict-aliasing", "-shared", "-fPIC", "-w")
+
+
+class EmulatedWorlds(ctypes.Structure):
+    """`Worlds` of the kernel."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("planes", "reals", "scratch", "seed", "index", "step", "flags", "numbers")),
+        ("worlds", ctypes.c_int),
+        ("steps", ctypes.c_int),
+    )  # fmt: skip
+
+
+def emulated_text(text: str) -> str:
+    """A kernel's source between what stands in for a GPU."""
+    folder = files("powderdsl.testing")
+    before = (folder / "cuda_emulation.hpp").read_text(encoding="utf-8")
+    after = (folder / "cuda_fibers.hpp").read_text(encoding="utf-8")
+    return "\n".join([before, text, after])
+
+
+def compiler_for(folder: Path, order: int) -> Compile:
+    """Makes kernels that run on the CPU; `order` 0 or 1: which fiber runs first. Raises NoCompiler."""
+
+    def compile(source: KernelSource) -> Launch:
+        text = emulated_text(source.text)
+        target = folder / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.so"
+        if not target.is_file():
+            with tempfile.TemporaryDirectory(dir=folder) as scratch:
+                unit, library = Path(scratch) / "kernel.cpp", Path(scratch) / "kernel.so"
+                unit.write_text(text, encoding="utf-8")
+                command = [*find_compiler().command, *FLAGS, "-o", str(library), str(unit)]
+                subprocess.run(command, check=True, timeout=600)
+                os.replace(library, target)
+        emulate = ctypes.CDLL(str(target)).emulate
+
+        def launch(arguments: Arguments) -> None:
+            worlds = EmulatedWorlds(
+                *(tensor.data_ptr() for tensor in arguments.tensors), len(arguments.clock[0]), arguments.steps
+            )
+            if emulate(ctypes.byref(worlds), arguments.blocks, order):
+                raise AssertionError("some threads wait at a barrier that others never reach")
+
+        return launch
+
+    return compile
+
+
+class _Emulated:
+    def __init__(self, program: CudaProgram):
+        self.program = program
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        return self.program.run(job)
+
+
+def emulated_simulator(
+    ruleset: Ruleset, folder: Path, order: int = 0, shared_limit: int = 232448
+) -> Simulator:
+    """A simulator whose steps run the generated kernels on the CPU."""
+    simulator = compile_ruleset(ruleset, backend="dense")
+    program = lower(ruleset)
+    simulator._program = CudaProgram(program, lower_bits(program), compiler_for(folder, order), shared_limit)
+    return simulator

@@ -1,0 +1,151 @@
+"""Passes that planes cannot carry run on cells between the others: the same worlds, whichever passes those are."""
+
+from __future__ import annotations
+
+import pytest
+
+import powderdsl
+from powderdsl.backends.torch_mixed import MixedProgram, mixed_program
+from powderdsl.backends.torch_planes import PlanesProgram
+from powderdsl.compiler import lower
+from powderdsl.diagnostics import CompileError
+from powderdsl.ir import bits
+from powderdsl.ir.build import Builder
+from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, whole
+from powderdsl.ir.segments import Carried, carry, segments
+from powderdsl.model.types import Ruleset
+from powderdsl.simulator import Simulator, World
+from powderdsl.testing.cases import load_text, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.testing.compare import assert_same, find_difference
+
+ROWS = "\n".join("      - " + " ".join(str(1 + (5 * i + 3 * j) % 7) for j in range(21)) for i in range(21))
+
+HEAVY = f"""\
+pack: heavy
+elements:
+  air: {{id: 0, color: "#102030"}}
+  dust: {{id: 1, color: "#FEDCBA"}}
+kernels:
+  wide:
+    rows:
+{ROWS}
+fields:
+  level: {{type: -500..500, at: element, default: 3}}
+  light: {{type: -20..500, at: place, default: 1}}
+  waves: {{type: real(-9..9), at: place}}
+  marks: {{type: 0..9, at: place, resets: step}}
+streams: [coin]
+passes:
+  mark:
+    do: marks += 2 where dust and coin < 0.5
+  fall:
+    after: mark
+    do: dust swaps below if below is air and coin < 0.3
+  weigh:
+    after: fall
+    do:
+      - light := sum(level in wide) mod 61 - marks where coin < 0.7
+      - waves := waves / 2 + marks
+  settle:
+    after: weigh
+    do:
+      - dust -> air if light > 40 with chance 5%
+      - level += 1 where marks > 1
+"""
+
+
+def spread(name: str) -> Ruleset:
+    return load_text(HEAVY, "heavy.yaml") if name == "heavy" else powderdsl.load(name)
+
+
+def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
+    """A kernel of 441 weights over numbers of eleven bits. Its rule is named, the other passes stay on planes."""
+    program = lower(spread("heavy"))
+    carried = {pass_.name: carry(program, pass_) for pass_ in program.passes}
+    assert [name for name, one in carried.items() if one.planes is None] == ["weigh"]
+    assert carried["weigh"].why == f"more than {bits.MAX_GATES:,} gates"
+    assert carried["weigh"].place.startswith("heavy.yaml:")
+    parts = segments(program)
+    assert [[p.name for p in part.program.passes] for part in parts] == [
+        ["mark", "fall"],
+        ["weigh"],
+        ["settle"],
+    ]
+    assert [part.planes is None for part in parts] == [False, True, False]
+    assert [any(slot.resets for slot in part.program.slots) for part in parts] == [True, False, False]
+
+
+@pytest.mark.parametrize("backend", ["planes", "native"])
+def test_the_oracles_worlds(backend: str) -> None:
+    """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one by one."""
+    rules = spread("heavy")
+    try:
+        sims = [powderdsl.compile(rules, backend=name) for name in ("reference", "dense", backend)]
+    except CompileError as error:
+        notes = [note for diagnostic in error.diagnostics for note in diagnostic.notes]
+        if any("no C++ compiler found" in note for note in notes):
+            pytest.skip("no C++ compiler on this machine")
+        raise
+    for number, shape in enumerate([(2, 3, 5), (9, 4, 33), (1, 2, 65)]):
+        assert_same(rules, random_start(rules, Choices.seeded(number), shape), steps=3, simulators=sims)
+
+
+@pytest.mark.parametrize("name", ["powderworld", "heavy"])
+def test_any_passes_on_cells(name: str, torch) -> None:  # type: ignore[no-untyped-def]
+    """Whichever passes are kept from planes: several steps at once, with given draws, with chosen passes."""
+    rules = spread(name)
+    program = lower(rules)
+    choices = Choices.seeded(11)
+    oracle = powderdsl.compile(rules, backend="dense")
+    names = [pass_.name for pass_ in program.passes]
+    for number, refused in enumerate((names[0::2], names[1::2], names[-1:])):
+        sim = with_refused(rules, program, refused)
+        start = random_start(rules, choices, (2, 5, (7, 64, 65)[number]))
+        draws = {stream.name: torch.rand(start.ids.shape) for stream in rules.streams[:1]}
+        for options in ({}, {"passes": names[::3]}, {"random": draws}):
+            expected = oracle.step(start.world(oracle), 3, **options)
+            found = sim.step(start.world(sim), 3, **options)
+            difference = find_difference(expected.state, found.state)
+            assert difference is None, (difference, refused, options.keys())
+
+
+def test_what_planes_refuse_and_rules_cannot_say() -> None:
+    """Sets of large numbers, and numbers that float32 rounds: rule files have neither, the IR could."""
+    build = Builder()
+    build.place = "made.yaml:7"
+    number = build.input("number", whole(0, 1 << 25))
+    slots = (SlotType("number", number.type, 0, False), SlotType("found", FLAG, 0, False))
+    rare = build.in_set(number, frozenset({3, 1 << 20}))
+    rounded = build.compare("lt", build.to_real(number), build.real(2.5))
+    for node, why in ((rare, "a table over 26 planes"), (rounded, "a whole number too large for float32")):
+        pass_ = PassGraph("made", "made", (), (("found", node),))
+        found = carry(Program("made", slots, (), (), (pass_,)), pass_)
+        assert (found.planes, found.why, found.place) == (None, why, "made.yaml:7")
+
+
+def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simulator:
+    """A simulator on planes that runs some passes on cells."""
+
+    def choose(program: Program, pass_: PassGraph) -> Carried:
+        found = carry(program, pass_)
+        return Carried(pass_, None, "refused here") if pass_.name in refused else found
+
+    sim = powderdsl.compile(rules, backend="dense")
+    sim._program = mixed_program(
+        segments(program, choose), sim.device, lambda cells, planes: PlanesProgram(cells, planes, sim.device)
+    )
+    assert isinstance(sim._program, MixedProgram)
+    return sim
+
+
+def test_rules_without_passes(torch) -> None:  # type: ignore[no-untyped-def]
+    """Nothing happens, except that fields which reset do so."""
+    rules = load_text(HEAVY.split("streams:")[0])
+    worlds: list[World] = []
+    for backend in ("reference", "planes"):
+        sim = powderdsl.compile(rules, backend=backend)
+        world = sim.replace(sim.world(torch.ones(1, 2, 3, dtype=torch.uint8)), marks=7)
+        worlds.append(sim.step(world, 2))
+    assert find_difference(worlds[0].state, worlds[1].state) is None
+    assert not worlds[1]["marks"].any()
