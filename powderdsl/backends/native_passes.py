@@ -159,24 +159,25 @@ class PassWriter:
         self.planes.update(names)
 
     def change(self, nodes: list[Node], olds: dict[int, str], condition: str) -> None:
-        """New planes, if any mask of the moment holds anywhere; the old ones otherwise."""
+        """New planes or fields, if any mask of the moment holds anywhere; the old ones otherwise."""
         if not nodes:
             return
-        names = {id(node): self.fresh("p") for node in nodes}
+        kind, prefix = ("Field", "f") if nodes[0].type == REAL else ("Plane", "p")
+        names = {id(node): self.fresh(prefix) for node in nodes}
         outer = (self.planes, self.fields, self.block)
         self.planes, self.fields, self.block = dict(self.planes), dict(self.fields), Block()
         self.ensure(nodes)
-        inner_names = {id(node): self.planes[id(node)] for node in nodes}
+        made = self.fields if kind == "Field" else self.planes
         for key, name in names.items():
-            self.block.statements.append(f"{name} = keep({inner_names[key]});")
+            self.block.statements.append(f"{name} = keep({made[key]});")
         text = self.block.text()
         self.planes, self.fields, self.block = outer
-        declared = ", ".join(f"*{name}" for name in dict.fromkeys(names.values()))
+        declared = ", ".join(f"*{name}" for name in names.values())
         otherwise = " ".join(f"{name} = keep({olds[key]});" for key, name in names.items())
         self.block.statements.append(
-            f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}"
+            f"{kind} {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}"
         )
-        self.planes.update(names)
+        (self.fields if kind == "Field" else self.planes).update(names)
 
     def comparisons(self, guards: list[Node]) -> None:
         """Comparisons of reals that masks ask for, outside any branch, with all others that can be had in one sweep."""
@@ -231,14 +232,17 @@ class PassWriter:
         candidates = {id(g): self.fresh("p") for g, _, rest in staged if rest}
         loop = Loop(self.planes, self.layout)
         outputs = []
+        empty = []
         for guard, cheap, rest in staged:
             parts = [loop.value(part) for part in cheap]
+            known = [names for part in cheap if (names := zero_with(part, self.planes)) is not None]
+            empty.append(min(known, key=len, default=None))
             name = candidates[id(guard)] if rest else self.fresh("p")
             if not rest:
                 self.planes[id(guard)] = name
             clean = any(is_clean(part, self.have) for part in cheap)
             outputs.append((name, " & ".join(parts) if clean else " & ".join([*parts, "valid"])))
-        self.emit_loop(loop, outputs)
+        self.emit_loop(loop, outputs, empty)
         condition = " || ".join(
             f"!{name}->zero"
             for name in (*candidates.values(), *(self.planes[id(g)] for g in guards if self.have(g)))
@@ -290,7 +294,7 @@ class PassWriter:
         cheap: list[Node] = []
         rest: list[Node] = []
         for part in _conjuncts(guard, self.have):
-            free = not prerequisites(part, self.have) and part.op not in ANCHORS
+            free = self.have(part) or (not prerequisites(part, self.have) and part.op not in ANCHORS)
             draws = any(n.op in DRAWS for n in walk(part)) and not self.have(part)
             (cheap if free and not draws else rest).append(part)
         return cheap, rest
@@ -479,24 +483,33 @@ class PassWriter:
             self.block.statements.append(lanes)
             self.fields.update({id(chain[0]): name for chain, name in zip(chains, names, strict=True)})
 
+    def settled(self, nodes: list[Node]) -> None:
+        """Settled slots under choices: nothing is computed where no choice holds anywhere."""
+        kept = [(node, *found) for node in nodes if (found := unchanged(node)) and self.have(found[0])]
+        masks = list({id(mask): mask for _, _, chosen in kept for mask in chosen}.values())
+        if not masks:
+            return
+        self.ensure(masks)
+        condition = " || ".join(f"!{self.planes[id(mask)]}->zero" for mask in masks)
+        self.change([node for node, _, _ in kept], {id(node): self.fields[id(base)] for node, base, _ in kept}, condition)
+
     def changed_rows(
         self, outputs: list[tuple[Node, str, str]], kept: list[tuple[Node, list[Node]]], sweep: Lanes
     ) -> None:
-        """Settled slots under choices stay as they are where no choice holds: whole fields, or row by row."""
+        """Settled slots under choices stay as they are in rows where no choice holds."""
         masks = {id(mask): self.planes[id(mask)] for _, chosen in kept for mask in chosen}.values()
         scan = " | ".join(f"((const u64*){plane}->data)[(y * words + w) * LANES + l]" for plane in masks)
         pairs = [(name, self.fields[id(base)]) for (_, name, _), (base, _) in zip(outputs, kept, strict=True)]
         copies = " ".join(f"some{name} |= copy_row(c, {name}, {base}, l, y);" for name, base in pairs)
         still = f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; if (!some) {{ {copies} continue; }} }}\n"
-        loop = lane_loop([replace(sweep, rows=still + sweep.rows, asked=None)], sweep.fields)
-        declared, _, rest = loop.partition("\n")
-        same = " ".join(f"{name} = keep({base});" for name, base in pairs)
-        empty = " && ".join(f"{plane}->zero" for plane in masks) or "true"
-        self.block.statements.append(f"{declared}\nif ({empty}) {{ {same} }} else {{\n{rest}\n}}")
+        self.block.statements.append(
+            lane_loop([replace(sweep, rows=still + sweep.rows, asked=None)], sweep.fields)
+        )
 
     def finish(self) -> None:
         """Leave the outputs in the context's slots."""
         self.inputs([node for _, node in self.pass_.outputs])
+        self.settled([node for _, node in self.pass_.outputs if node.type == REAL and not self.have(node)])
         self.ensure([node for _, node in self.pass_.outputs])
         lines = []
         for slot, node in self.pass_.outputs:

@@ -411,13 +411,20 @@ class _PassBits:
             return build.select(value, build.real(1.0), build.real(0.0))
         if max(abs(argument.type.lo), abs(argument.type.hi)) >= 1 << 24:
             raise NotBits("a whole number too large for float32")
-        total: Node = build.real(0.0)
+        weights: dict[int, tuple[Node, float]] = {}  # equal planes count together
+        always = 0.0
         for i, plane in enumerate(value.planes):
             weight = -float(1 << i) if value.signed and i == len(value.planes) - 1 else float(1 << i)
-            if plane is not self.gates.no:
-                total = build.arithmetic(
-                    "add", total, build.select(plane, build.real(weight), build.real(0.0))
-                )
+            if plane.op == "const":
+                always += weight if plane.attr else 0.0
+            else:
+                weights[id(plane)] = (plane, weights.get(id(plane), (plane, 0.0))[1] + weight)
+        if not weights:
+            return build.real(always)
+        (first, weight), *rest = weights.values()
+        total = build.select(first, build.real(always + weight), build.real(always))
+        for plane, weight in rest:
+            total = build.arithmetic("add", total, build.select(plane, build.real(weight), build.real(0.0)))
         return total
 
 
