@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 
 from powderdsl.backends.native_blocks import Block, Lanes, lane_loop
@@ -51,6 +53,14 @@ class PassWriter:
             id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))
         }
         self.input_nodes = {id(n): n for n in nodes if n.op == "input"}
+        asked = Counter(
+            key
+            for step in pass_.moments
+            for guard in dict.fromkeys(step.guards)
+            for key in {id(part) for part in _conjunctions(guard)}
+        )
+        self.shared = {key for key, count in asked.items() if count > 1}
+        """Parts of several masks: where such a plane is empty, all of them are."""
         self.slot_of = {key: str(n.attr) for key, n in self.input_nodes.items()}
 
     def source(self) -> str:
@@ -224,6 +234,7 @@ class PassWriter:
         guards = list({id(g): g for g in guards}.values())
         open_guards = [g for g in guards if not self.have(g)]
         self.ensure([g for g in open_guards if g.op in ANCHORS])
+        self.ensure([part for guard in open_guards for part in self.shared_parts(guard)])
         open_guards = [g for g in open_guards if not self.have(g)]
         staged = [(g, *self.split(g)) for g in open_guards]
         if not any(rest for _, _, rest in staged) or not all(cheap for _, cheap, _ in staged):
@@ -288,6 +299,15 @@ class PassWriter:
         )
         self.planes.update(names)
         return " || ".join(f"!{self.planes[id(g)]}->zero" for g in guards)
+
+    def shared_parts(self, guard: Node) -> list[Node]:
+        """The largest parts of a mask that other masks have too, if one loop can compute them."""
+        if self.have(guard) or guard.op in ("input", "not"):
+            return []
+        if id(guard) in self.shared and not is_uniform(guard) and not prerequisites(guard, self.have):
+            if not any(inner.op in (*DRAWS, *ANCHORS) for inner in walk(guard)):
+                return [guard]
+        return [part for arg in guard.args for part in self.shared_parts(arg)] if guard.op == "and" else []
 
     def split(self, guard: Node) -> tuple[list[Node], list[Node]]:
         """Conjuncts that one loop can compute from what is there, and those that take more."""
@@ -526,6 +546,14 @@ class PassWriter:
             place = f"c.{kind}[{table[slot]}]"
             lines.append(f"if ({place}) give(c, {place}); {place} = {prefix}{table[slot]};")
         self.block.statements.append("\n".join(lines))
+
+
+def _conjunctions(node: Node) -> Iterator[Node]:
+    """A mask and all parts of it that must hold."""
+    yield node
+    if node.op == "and":
+        for arg in node.args:
+            yield from _conjunctions(arg)
 
 
 def _conjuncts(node: Node, have) -> list[Node]:  # type: ignore[no-untyped-def]
