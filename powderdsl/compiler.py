@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
 
 BACKENDS = {
-    "auto": "what starts at once: `torch`",
+    "auto": "`torch` at once, and `native` once that is compiled; work of seconds starts no compiler",
     "torch": "any device: one tensor element a cell for little work, packed bit planes for more",
     "dense": "torch, always one tensor element a cell: the readable one",
     "planes": "torch, always packed bit planes",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Protocol
 
 import torch
@@ -116,12 +117,12 @@ class TorchProgram:
 class CompiledProgram:
     """Native code for whole steps; torch where draws are given or passes chosen."""
 
-    def __init__(self, native: Runnable, rest: Runnable):
+    def __init__(self, native: Runnable, rest: Callable[[], Runnable]):
         self._native, self._rest = native, rest
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
-        runnable = self._rest if job.draws or job.passes is not None else self._native
+        runnable = self._rest() if job.draws or job.passes is not None else self._native
         return runnable.run(job)
 
     def profile(self, job: Job) -> Mapping[str, float]:
@@ -140,32 +141,39 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
     from powderdsl.backends.torch_dense import DenseProgram
     from powderdsl.compiler import lower
 
-    program = lower(ruleset)
+    # Both are made when first needed: code that was compiled before needs neither.
+    lowered = cache(lambda: lower(ruleset))
+    torch_program = cache(lambda: TorchProgram(lowered(), device))
     if backend == "dense":
-        return DenseProgram(program, device)
-    torch_program = TorchProgram(program, device)
+        return DenseProgram(lowered(), device)
     if backend == "planes":
-        return torch_program.planes()
+        return torch_program().planes()
     if backend == "native":
-        return CompiledProgram(_native(program, device, threads), torch_program)
-    return torch_program
+        return CompiledProgram(_native(ruleset, lowered, device, threads), torch_program)
+    if backend == "auto" and device.type == "cpu":
+        from powderdsl.auto_program import AutoProgram
+        from powderdsl.native_start import native_program, ready_program
+
+        return AutoProgram(
+            torch_program,
+            lambda: ready_program(ruleset, lowered, threads),
+            lambda: native_program(ruleset, lowered, threads),
+        )
+    return torch_program()
 
 
-def _native(program: Program, device: torch.device, threads: int) -> Runnable:
-    from powderdsl.backends.native_build import NoCompiler
-    from powderdsl.backends.torch_mixed import packed_program
-    from powderdsl.backends.torch_native import NativeProgram
+def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
+    from powderdsl.backends.native_compilers import CURE, NoCompiler
+    from powderdsl.native_start import native_program
 
     problem = "native code runs on the CPU" if device.type != "cpu" else ""
     try:
         if not problem:
-            return packed_program(
-                program, device, lambda cells, planes: NativeProgram(cells, planes, threads)
-            )
+            return native_program(ruleset, lowered, threads)
     except NoCompiler as error:
         problem = str(error)
     reporter = Reporter()
-    helps = ["run on the backend `torch`, or install g++, clang++ or `pip install ziglang`"]
+    helps = [f"run on the backend `torch`, or {CURE}"]
     reporter.error(
         "PD701", "the native backend is not available", None, notes=problem.splitlines(), helps=helps
     )

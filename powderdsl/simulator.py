@@ -99,6 +99,18 @@ class Simulator:
         self._known[[element.id for element in ruleset.elements]] = True
 
     @property
+    def running(self) -> str:
+        """The backend that the next step runs on: for ``auto``, ``torch`` or ``native``."""
+        return str(
+            getattr(self._program, "running", "torch" if self.backend == "auto" else self.backend)
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For ``auto``: what ran and why, in sentences."""
+        return tuple(getattr(self._program, "notes", ()))
+
+    @property
     def elements(self) -> tuple[str, ...]:
         """Names in id order."""
         return tuple(element.name for element in self.ruleset.elements)
@@ -488,4 +500,4 @@ def compile(
         reporter = Reporter()
         reporter.error("PD701", f"no backend `{backend}`", None, helps=["backends: " + ", ".join(BACKENDS)])
         raise CompileError(reporter.diagnostics)
-    return Simulator(model, "torch" if backend == "auto" else backend, device, threads)
+    return Simulator(model, backend, device, threads)

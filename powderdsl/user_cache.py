@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import stat
 from pathlib import Path
 
 
@@ -11,21 +12,34 @@ def cache_folder(name: str) -> Path:
     """A folder of the cache, made with mode 0700.
 
     Raises:
-        OSError: it cannot be made, or belongs to somebody else.
+        OSError: it cannot be made, belongs to somebody else, or others may write to it.
     """
-    folder = _root() / "powderdsl" / name
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    if hasattr(os, "getuid"):
-        if folder.stat().st_uid != os.getuid():
+    top = _root() / "powderdsl"
+    for folder in (top, top / name):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        check_private(folder)
+    return top / name
+
+
+def check_private(folder: Path) -> None:
+    """Refuse a folder in which somebody else can have put something. Raises PermissionError."""
+    if not hasattr(os, "getuid"):
+        return
+    # A link is looked at too: whoever owns it decides where it leads.
+    for found in (folder.lstat(), folder.stat()):
+        if found.st_uid != os.getuid():
             raise PermissionError(f"{folder} belongs to another user")
-        folder.chmod(0o700)
-    return folder
+    if folder.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(f"others may write to {folder}: empty it, then `chmod 700` it")
 
 
 def _root() -> Path:
-    """Where caches of this user live."""
+    """Where caches of this user live. Raises OSError if there is no home folder."""
     if platform.system() == "Linux":  # what platformdirs says too, without the time its import takes
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        try:
+            return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        except RuntimeError as error:
+            raise OSError(str(error)) from None
     import platformdirs
 
     return Path(platformdirs.user_cache_dir())

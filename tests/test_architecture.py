@@ -27,7 +27,8 @@ MAX_LINES = 500
 
 _MODEL = ("diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
-_SCREEN = (*_COMPILER, "programs", "draw", "observe", "simulator", "worlds", "media", "terminal")
+_PROGRAMS = ("programs", "native_start", "auto_program")
+_SCREEN = (*_COMPILER, *_PROGRAMS, "draw", "observe", "simulator", "worlds", "media", "terminal")
 _EVERYTHING = (*_SCREEN, "ledgers", "pack_tests", "testing", "envs", "web", "experiments", "cli")
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -43,7 +44,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
     "backends": ("diagnostics", "ir", "user_cache"),
     "compiler": _COMPILER[:-1],
-    "programs": _COMPILER,
+    "native_start": _COMPILER,
+    "auto_program": _COMPILER,
+    "programs": (*_COMPILER, "native_start", "auto_program"),
     "draw": _MODEL,
     "observe": (*_COMPILER, "draw"),
     "simulator": (*_COMPILER, "programs", "observe"),
@@ -71,7 +74,7 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("backends.torch_*", "programs", "observe", "simulator", "testing", "envs", "experiments")
+_TORCH = ("backends.torch_*", *_PROGRAMS, "observe", "simulator", "testing", "envs", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),

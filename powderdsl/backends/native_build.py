@@ -1,30 +1,28 @@
-"""Compile generated C++ and keep the results: one shared library for each source, compiler and set of flags."""
+"""Compile generated C++ and load what came of it: one shared library for each source, compiler and set of flags."""
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import hashlib
 import os
-import platform
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from powderdsl.backends import compiler_guard, native_cache
+from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for, processor
 from powderdsl.user_cache import cache_folder
-
-FLAGS = (
-    "-std=c++17", "-O2", "-march=native", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math",
-    "-fno-strict-aliasing", "-fno-gcse", "-fno-tree-pre", "-shared", "-fPIC", "-pthread", "-fvisibility=hidden", "-w",
-)  # fmt: skip
-"""No contraction: a·b + c is rounded twice on every machine, so that all backends agree bit for bit."""
 
 TIMEOUT = 600
 
@@ -36,9 +34,12 @@ class Building:
     level: str = "-O2"
     folder: Path | None = None
 
-    def flags(self) -> tuple[str, ...]:
-        """FLAGS at this level."""
-        return tuple(self.level if flag == "-O2" else flag for flag in FLAGS)
+    def place(self) -> Path:
+        """The folder. Raises NoCompiler if there is none that is private to the user."""
+        try:
+            return self.folder or cache_folder("native")
+        except OSError as error:
+            raise NoCompiler(f"no folder for compiled code: {error}") from None
 
 
 FOR_USERS = Building()
@@ -55,96 +56,151 @@ def building(how: Building) -> Iterator[None]:
         _building.reset(token)
 
 
-class NoCompiler(Exception):
-    """No C++ compiler that works was found; the message says what was tried."""
+def current() -> Building:
+    """What `building` says."""
+    return _building.get()
 
 
-@dataclass(frozen=True)
-class Compiler:
-    """A command that compiles C++, and what identifies it."""
-
-    command: tuple[str, ...]
-    version: str
-
-
-@lru_cache(maxsize=1)
-def find_compiler() -> Compiler:
-    """`$CXX`, c++, g++, clang++, or the one in the `ziglang` wheel. Raises NoCompiler."""
-    candidates: list[tuple[str, ...]] = []
-    if os.environ.get("CXX"):
-        candidates.append(tuple(os.environ["CXX"].split()))
-    candidates += [(name,) for name in ("g++", "c++", "clang++")]
-    candidates.append((sys.executable, "-m", "ziglang", "c++"))
-    tried = []
-    for command in candidates:
-        if shutil.which(command[0]) is None:
-            tried.append(command[0])
-            continue
-        try:
-            result = subprocess.run(
-                [*command, "--version"], capture_output=True, text=True, timeout=30, check=True
-            )
-        except (OSError, subprocess.SubprocessError):
-            tried.append(" ".join(command))
-            continue
-        return Compiler(command, result.stdout.splitlines()[0] if result.stdout else "")
-    raise NoCompiler("no C++ compiler found; tried " + ", ".join(tried))
-
-
-@lru_cache(maxsize=1)
-def processor() -> str:
-    """What `-march=native` hangs on: the machine and its instruction sets."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
-    except OSError:
-        return f"{platform.machine()} {platform.processor()}"
-
-
-def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...] = FLAGS) -> str:
-    """A hash of everything that the library depends on."""
-    parts = (source, *compiler.command, compiler.version, *flags, processor())
+def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
+    """A hash of everything that a library depends on."""
+    program = shutil.which(compiler.command[0]) or ""
+    parts = (source, os.path.realpath(program), *compiler.command, compiler.version, *flags, processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
-def build(source: str, how: Building | None = None) -> Path:
-    """The path of the library for a source, compiled unless it lies in the cache; `how` is else what `building` says.
+def build(source: str, ruleset: str = "") -> Path:
+    """The path of the library for a source, compiled unless it lies in the cache.
 
-    Safe with other processes doing the same: the library appears under its name whole, or not at all.
+    Safe with other processes and threads doing the same: one of them compiles, and the library appears whole or not at
+    all. A library that is damaged is compiled anew.
+
+    Args:
+        ruleset: a name for `powderdsl cache list`.
 
     Raises:
         NoCompiler: none was found, or it failed.
     """
-    compiler = find_compiler()
-    how = how or _building.get()
-    flags = how.flags()
-    try:
-        folder = how.folder or cache_folder("native")
-    except OSError as error:
-        raise NoCompiler(f"no cache folder: {error}") from None
-    target = folder / f"{cache_key(source, compiler, flags)}.so"
-    if target.is_file():
-        os.utime(target)
-        return target
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
-        unit, library = Path(scratch) / "program.cpp", Path(scratch) / "program.so"
-        unit.write_text(source, encoding="utf-8")
-        command = [*compiler.command, *flags, "-o", str(library), str(unit)]
-        if (
-            "-march=native" in command
-            and platform.machine() in ("x86_64", "AMD64")
-            and "avx512f" in processor()
-        ):
-            command.insert(-3, "-mprefer-vector-width=512")
+    compiler, how = find_compiler(), current()
+    flags, folder = flags_for(compiler, how.level), how.place()
+    key = cache_key(source, compiler, flags)
+    found = native_cache.find(folder, key)
+    if found is not None:
+        return found
+    with native_cache.turn(folder, key):
         try:
-            result = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT)
-        except (OSError, subprocess.SubprocessError) as error:
-            raise NoCompiler(f"{compiler.command[0]} could not be run: {error}") from None
-        if result.returncode:
-            detail = "\n".join(result.stderr.splitlines()[:8])
-            raise NoCompiler(f"{compiler.command[0]} failed:\n{detail}")
-        os.replace(library, target)
-    return target
+            return native_cache.find(folder, key) or _compile(source, ruleset, compiler, flags, folder, key)
+        except OSError as error:
+            raise NoCompiler(f"no room for compiled code: {error}") from None
+
+
+def _compile(
+    source: str, ruleset: str, compiler: Compiler, flags: tuple[str, ...], folder: Path, key: str
+) -> Path:
+    native_cache.tidy(folder)
+    began, created = time.perf_counter(), time.time()
+    scratch = Path(tempfile.mkdtemp(dir=folder, prefix=native_cache.BUILDING))
+    try:
+        unit, built = scratch / "program.cpp", scratch / "built"
+        unit.write_text(source, encoding="utf-8")
+        built.mkdir()
+        command = [*compiler.command, *flags, "-o", str(built / native_cache.LIBRARY), str(unit)]
+        status, said = run_guarded(command, scratch)
+        if status:
+            raise NoCompiler("\n".join([f"{compiler.command[0]} failed:", *said.splitlines()[:8]]))
+        about = {
+            "ruleset": ruleset,
+            "backend": "native",
+            "compiler": compiler.version,
+            "created": created,
+            "seconds": round(time.perf_counter() - began, 2),
+        }
+        return native_cache.add(folder, key, built, about)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+_running: dict[subprocess.Popen[bytes], Path] = {}
+_lock = threading.Lock()
+
+
+def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
+    """Exit code and messages of a command that never outlives this process.
+
+    Args:
+        scratch: a folder for its temporary files, which goes when this process ends in between.
+
+    Raises:
+        NoCompiler: it cannot be started, or takes longer than TIMEOUT.
+    """
+    # Nothing is ever written: the guard waits until the last process that has our end is gone.
+    theirs, ours = os.pipe()
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-I", "-S", compiler_guard.__file__, *command],
+            stdin=theirs,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
+            start_new_session=True,
+        )
+    except OSError as error:
+        os.close(ours)
+        raise NoCompiler(f"{command[0]} could not be run: {error}") from None
+    finally:
+        os.close(theirs)
+    with _lock:
+        _running[process] = scratch
+    try:
+        said = process.communicate(timeout=TIMEOUT)[1].decode(errors="replace")
+    except subprocess.TimeoutExpired:
+        raise NoCompiler(f"{command[0]} took longer than {TIMEOUT} s") from None
+    finally:
+        _end(process)
+        os.close(ours)
+        with _lock:
+            _running.pop(process, None)
+    return process.returncode, said
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a guard that still runs, and all that it has started; reap it."""
+    if process.poll() is None:
+        with suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@atexit.register
+def _end_all() -> None:
+    with _lock:
+        running = dict(_running)
+    for process, scratch in running.items():
+        _end(process)
+        shutil.rmtree(scratch, ignore_errors=True)  # the thread that waits for it is no longer run
+
+
+def _forget() -> None:
+    """In a fork: what the parent runs is none of our business."""
+    global _lock
+    _lock = threading.Lock()
+    _running.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+def open_library(source: str, ruleset: str = "") -> tuple[Path, ctypes.CDLL]:
+    """The library of a source, built if need be. Raises NoCompiler."""
+    path = build(source, ruleset)
+    try:
+        return path, load_library(path)
+    except OSError:  # another process has just thrown it away; or it cannot be loaded at all
+        path = build(source, ruleset)
+    try:
+        return path, load_library(path)
+    except OSError as error:
+        raise NoCompiler(f"compiled code cannot be loaded: {error}") from None
 
 
 @lru_cache(maxsize=64)
@@ -171,36 +227,3 @@ def load_library(path: Path) -> ctypes.CDLL:
     if hasattr(library, "pd_profile"):  # only where it was built with clocks
         library.pd_profile.restype, library.pd_profile.argtypes = None, [pointer]
     return library
-
-
-@dataclass(frozen=True)
-class CachedLibrary:
-    """One compiled library in the cache: bytes, and when it was used last (seconds since the epoch)."""
-
-    name: str
-    size: int
-    used: float
-
-    @property
-    def age(self) -> float:
-        return time.time() - self.used
-
-
-def cached_libraries() -> list[CachedLibrary]:
-    """What lies in the cache, the last used first."""
-    found = [
-        CachedLibrary(p.stem, p.stat().st_size, p.stat().st_mtime)
-        for p in cache_folder("native").glob("*.so")
-    ]
-    return sorted(found, key=lambda entry: -entry.used)
-
-
-def clear_cache() -> int:
-    """Remove all compiled libraries and what killed builds left behind; returns how many libraries went."""
-    folder = cache_folder("native")
-    libraries = list(folder.glob("*.so"))
-    for path in libraries:
-        path.unlink(missing_ok=True)
-    for scratch in folder.glob(".build-*"):
-        shutil.rmtree(scratch, ignore_errors=True)
-    return len(libraries)

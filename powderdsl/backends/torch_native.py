@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import ctypes
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from torch import Tensor
 
-from powderdsl.backends.native_build import build, load_library
-from powderdsl.backends.native_source import native_source
+from powderdsl.backends.native_build import load_library
+from powderdsl.backends.native_code import NativeCode
 from powderdsl.backends.torch_dense import Kernels
 from powderdsl.backends.torch_job import Job
 from powderdsl.ir.gates import width as planes_of
-from powderdsl.ir.ops import Program, SlotType
 
 
 class PackedState(Mapping[str, Tensor]):
@@ -65,22 +64,15 @@ class NativeProgram:
     """A program as compiled C++.
 
     Args:
-        program: the numeric program, whose slots are the state's.
-        planes: the same program from `ir.bits.lower_bits`.
-        clocks: count the time of each pass, for `profile`; such a program runs on one thread.
-
-    Raises:
-        native_build.NoCompiler: there is no C++ compiler, or it failed.
+        with_clocks: the same code that counts the time of each pass, made when `profile` asks for it.
     """
 
-    def __init__(self, program: Program, planes: Program, threads: int = 1, *, clocks: bool = False):
-        source, self.layout = native_source(planes)
-        self.library = load_library(build(f"#define PROFILE\n{source}" if clocks else source))
-        self.threads = 1 if clocks else threads
-        self._programs = program, planes
+    def __init__(self, code: NativeCode, threads: int, with_clocks: Callable[[], NativeCode]):
+        self.library = load_library(code.library)
+        self.layout, self.threads = code.layout, threads
+        self._types, self._kinds, self._passes = code.types, code.kinds, code.passes
+        self._clocks = with_clocks
         self._with_clocks: NativeProgram | None = None
-        self._slots: dict[str, SlotType] = {slot.name: slot for slot in program.slots}
-        self._kinds = dict(program.params)
         self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
@@ -114,24 +106,24 @@ class NativeProgram:
         The first call compiles the program once more, with clocks in it. Raises NoCompiler if that fails.
         """
         if self._with_clocks is None:
-            self._with_clocks = NativeProgram(*self._programs, clocks=True)
-        passes = self._programs[1].passes
-        seconds = (ctypes.c_double * len(passes))()
+            self._with_clocks = NativeProgram(self._clocks(), 1, self._clocks)
+        seconds = (ctypes.c_double * len(self._passes))()
         library = self._with_clocks.library
         library.pd_profile(seconds)  # what earlier runs have left
         self._with_clocks.run(job)
         library.pd_profile(seconds)
-        return {pass_.name: spent for pass_, spent in zip(passes, seconds, strict=True)}
+        return dict(zip(self._passes, seconds, strict=True))
 
     def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
         """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
         key = tuple(params.values())
+        last = self._last  # another thread may write it
         if (
-            self._last is not None
-            and len(key) == len(self._last[0])
-            and all(a is b for a, b in zip(key, self._last[0], strict=True))
+            last is not None
+            and len(key) == len(last[0])
+            and all(a is b for a, b in zip(key, last[0], strict=True))
         ):
-            return self._last[1]
+            return last[1]
         planes = torch.zeros(max(1, len(self.layout.param_planes)), batch, dtype=torch.uint8)
         views: dict[tuple[str, str], Tensor] = {}
         for (name, how, bit), number in self.layout.param_planes.items():
@@ -168,7 +160,7 @@ class NativeProgram:
 
     def planes_of(self, name: str) -> tuple[int, int, bool]:
         """First plane of a slot, number of planes, and whether the last is a sign."""
-        type = self._slots[name].type
+        type = self._types[name]
         if type.name == "flag":
             return self.layout.planes[name], 1, False
         bits, signed = planes_of(type.lo, type.hi)

@@ -130,7 +130,7 @@ def command(
 
 
 def _check_compiler() -> None:
-    from powderdsl.backends.native_build import NoCompiler, find_compiler
+    from powderdsl.backends.native_compilers import NoCompiler, find_compiler
     from powderdsl.worlds.files import failure
 
     try:

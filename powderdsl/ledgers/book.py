@@ -11,15 +11,20 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+from powderdsl.ledgers.absent import Wants, find_wants, named_by_fields
 from powderdsl.ledgers.changes import Found, RuleLine, find_changes, ledger_facts
+from powderdsl.ledgers.field_writes import FieldEntry, find_fields
+from powderdsl.ledgers.overlaps import Overlap, find_overlaps
+from powderdsl.ledgers.sums import constant_sums, falling_sums, in_order, rising_sums
 from powderdsl.model.types import Ruleset
 
 
 @dataclass(frozen=True)
 class Proven:
-    """It holds in every world, at every step."""
+    """It holds in every world, at every step. `given` says what a world must fulfil once, at the start, if anything."""
 
     reason: str
+    given: str = ""
 
     def __bool__(self) -> bool:
         return True
@@ -45,12 +50,17 @@ class RuleEntry:
 
     `changes` are pairs (before, after) of elements: in a cell where the first was, the second is. `moves` are the
     elements that it carries away or pushes aside. `fires` is False if it is proven never to happen.
+
+    Of each of `needs` one element must exist, or the line cannot happen. `copies` are elements that it makes only where
+    they exist already. To exist is to be held by a cell, or named by a field, at the start of the step.
     """
 
     rule: RuleLine
     fires: bool
     changes: tuple[tuple[str, str], ...]
     moves: tuple[str, ...]
+    needs: tuple[tuple[str, ...], ...]
+    copies: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -58,11 +68,15 @@ class Ledger:
     """What the rules of a ruleset do, line by line, and what can be concluded. Elements go by their names.
 
     `complete` is False if the rules were too many to be asked about everything: then more is taken for possible.
+    `named` are the elements that fields may name although no cell ever held them.
     """
 
     name: str
     elements: tuple[str, ...]
     rules: tuple[RuleEntry, ...]
+    fields: tuple[FieldEntry, ...]
+    overlaps: tuple[Overlap, ...]
+    named: tuple[str, ...]
     complete: bool
 
     @cached_property
@@ -73,6 +87,21 @@ class Ledger:
             for pair in entry.changes:
                 found[pair] = (*found.get(pair, ()), entry.rule)
         return found
+
+    @cached_property
+    def constant_sums(self) -> tuple[tuple[str, ...], ...]:
+        """The smallest sums of elements that are constant: see `sums.constant_sums`."""
+        return constant_sums(self.elements, self.changes)
+
+    @cached_property
+    def rising_sums(self) -> tuple[tuple[str, ...], ...]:
+        """The smallest sums of elements that never fall and are not constant: see `sums.rising_sums`."""
+        return rising_sums(self.elements, self.changes)
+
+    @cached_property
+    def falling_sums(self) -> tuple[tuple[str, ...], ...]:
+        """The smallest sums of elements that never rise and are not constant."""
+        return falling_sums(self.elements, self.changes)
 
     def conserved(self, weights: Mapping[str, int]) -> Verdict:
         """Whether the weighted number of cells is constant: ``{"a": 1, "b": 1}`` is the sum of two elements.
@@ -103,6 +132,72 @@ class Ledger:
         if not lines:
             return Proven(f"no rule moves `{element}` or turns it into anything")
         return NotProven(f"`{element}` may be moved or become something else", tuple(lines))
+
+    def never_appears(self, element: str) -> Verdict:
+        """Whether a world that starts without this element, in cells and in fields, stays without it.
+
+        Raises KeyError for a name that is no element.
+        """
+        self._known([element])
+        makers = [
+            entry.rule
+            for entry in self.rules
+            if any(after == element for _, after in entry.changes)
+            and element not in entry.copies
+            and (element,) not in entry.needs
+        ]
+        if makers:
+            return NotProven(f"`{element}` may come of other elements", tuple(makers))
+        made = any(after == element for _, after in self.changes)
+        return Proven(
+            f"rules make `{element}` only where it is already" if made else f"no rule makes `{element}`"
+        )
+
+    def reach(self, start: Iterable[str]) -> tuple[str, ...]:
+        """All elements that a world can ever hold, if it starts with these and its fields were not set by hand.
+
+        Raises KeyError for a name that is no element.
+        """
+        start = set(start)
+        self._known(start)
+        cells, known = set(start), start | set(self.named)
+        while True:
+            more = {
+                after
+                for entry in self.rules
+                if all(known.intersection(one) for one in entry.needs)
+                for before, after in entry.changes
+                if before in cells and (after in known or after not in entry.copies)
+            }
+            if more <= cells:
+                return in_order(self.elements, cells)
+            cells |= more
+            known |= more
+
+    def within(self, field: str, low: float, high: float) -> Verdict:
+        """Whether a field's numbers stay within two bounds, in every cell. Both parts of a vector are numbers.
+
+        Raises KeyError for a name that is no field.
+        """
+        entry = next((one for one in self.fields if one.name == field), None)
+        if entry is None:
+            raise KeyError(f"no field `{field}` in {self.name}")
+        if entry.bounds is None:
+            return NotProven(f"`{field}` is no number: it holds {entry.kind}")
+        if low <= entry.bounds[0] and entry.bounds[1] <= high:
+            return Proven(f"`{field}` is declared as {entry.kind}, and every write is cut off there")
+        if entry.fresh_bounds is None:
+            return NotProven(f"`{field}` holds {entry.kind}", entry.writers)
+        if low <= entry.fresh_bounds[0] and entry.fresh_bounds[1] <= high:
+            return Proven(f"no rule writes `{field}` beyond", f"`{field}` within {low:g}..{high:g}")
+        lines = [
+            line
+            for line, lowest, highest in entry.reaches
+            if (lowest is not None and lowest < low) or (highest is not None and highest > high)
+        ]
+        if not lines:
+            return NotProven(f"`{field}` starts outside {low:g}..{high:g}")
+        return NotProven(f"`{field}` may be written beyond {low:g}..{high:g}", tuple(lines))
 
     def _weighed(self, weights: Mapping[str, int], verb: str, breaks) -> Verdict:  # type: ignore[no-untyped-def]
         self._known(weights)
@@ -140,13 +235,29 @@ def ledger(ruleset: Ruleset) -> Ledger:
     """The ledger of a checked ruleset: decided from its rules, no world is run."""
     facts = ledger_facts(ruleset)
     names = {element.id: element.name for element in ruleset.elements}
-    entries = tuple(_entry(found, names) for found in find_changes(ruleset, facts))
-    return Ledger(ruleset.name, tuple(names.values()), entries, not facts.budget.is_exhausted)
+    found = find_changes(ruleset, facts)
+    wants = find_wants(ruleset, facts)
+    return Ledger(
+        ruleset.name,
+        tuple(names.values()),
+        tuple(_entry(one, wants.get(one.line), names) for one in found),
+        find_fields(ruleset, found),
+        find_overlaps(ruleset, facts),
+        tuple(_named(named_by_fields(ruleset), names)),
+        not facts.budget.is_exhausted,
+    )
 
 
-def _entry(found: Found, names: Mapping[int, str]) -> RuleEntry:
-    changes = tuple((names[a], names[b]) for a, b in sorted(found.pairs))
-    return RuleEntry(found.line, found.fires, changes, tuple(_named(found.moves, names)))
+def _entry(found: Found, wants: Wants | None, names: Mapping[int, str]) -> RuleEntry:
+    wants = wants or Wants((), frozenset())
+    return RuleEntry(
+        found.line,
+        found.fires,
+        tuple((names[a], names[b]) for a, b in sorted(found.pairs)),
+        tuple(_named(found.moves, names)),
+        tuple(tuple(_named(ids, names)) for ids in wants.needs),
+        tuple(_named(wants.copies & {after for _, after in found.pairs}, names)),
+    )
 
 
 def _named(ids: Iterable[int], names: Mapping[int, str]) -> Iterator[str]:

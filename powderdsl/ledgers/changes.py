@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
-from powderdsl.diagnostics import Span
 from powderdsl.model.operands import ELEMENT_HERE, member, negation
 from powderdsl.model.reactions import facts_of
 from powderdsl.model.satisfy import Budget, Facts, satisfiable
@@ -122,15 +121,15 @@ def ledger_facts(ruleset: Ruleset) -> Facts:
 
 def find_changes(ruleset: Ruleset, facts: Facts) -> list[Found]:
     """What each line may do, in the order in which the lines run first."""
-    found: dict[tuple[Span, str], Found] = {}
+    found: dict[RuleLine, Found] = {}
     for pass_ in ruleset.passes:
         for moment in pass_.moments:
             asked = Asked.of(moment, facts)
             for rule in moment.rules:
-                one = found.setdefault((rule.span, pass_.name), Found(rule_line(rule, pass_)))
-                _look_at(rule, asked, one)
+                line = rule_line(rule, pass_)
+                _look_at(rule, asked, found.setdefault(line, Found(line)))
             for rule, pairs in _chains(asked):
-                found[(rule.span, pass_.name)].pairs |= pairs
+                found[rule_line(rule, pass_)].pairs |= pairs
     return list(found.values())
 
 

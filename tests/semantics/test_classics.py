@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl.backends.native_build import NoCompiler, find_compiler
+from powderdsl.backends.native_compilers import NoCompiler, find_compiler
 from powderdsl.simulator import Simulator, World
 from powderdsl.worlds.ascii import read_ascii, write_ascii
 

@@ -1,0 +1,211 @@
+"""Compiled libraries on disk: a folder for each, which appears whole or not at all, and is checked before it is loaded.
+
+<key>/program.so, about.json    a library, and what is known of it
+<key>.json                      what a program needs besides its library (`native_code`)
+<key>.lock                      held by who is compiling
+.build-…, .gone-…               on the way in, on the way out
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+LIBRARY, ABOUT = "program.so", "about.json"
+BUILDING, GONE = ".build-", ".gone-"
+
+LIMIT = 512 << 20
+"""Bytes of libraries that are kept; of more, those used longest ago go."""
+
+LEFT_BEHIND = 24 * 3600.0
+"""Seconds after which what a killed process has left is nobody's any more."""
+
+PATIENCE = 120.0
+"""Seconds to wait for another process that compiles the same; after that both do."""
+
+
+@dataclass(frozen=True)
+class About:
+    """What is written down about a library when it is made: `created` in seconds since the epoch."""
+
+    ruleset: str
+    backend: str
+    compiler: str
+    created: float
+    seconds: float
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A library in the cache; `used` is when last, in seconds since the epoch."""
+
+    key: str
+    about: About
+    used: float
+
+    @property
+    def age(self) -> float:
+        """Seconds since it was used."""
+        return max(0.0, time.time() - self.used)
+
+
+def find(folder: Path, key: str) -> Path | None:
+    """The library of a key if it is there and whole; one that is damaged counts as absent. Marks it as used."""
+    about = _about(folder / key)
+    if about is None:
+        return None
+    library = folder / key / LIBRARY
+    try:
+        data = library.read_bytes()
+    except OSError:
+        return None
+    if len(data) != about.size or hashlib.sha256(data).hexdigest() != about.sha256:
+        return None
+    with suppress(OSError):  # a cache that cannot be written is still a cache
+        os.utime(folder / key / ABOUT)
+    return library
+
+
+def add(folder: Path, key: str, built: Path, about: dict[str, Any]) -> Path:
+    """Take a folder with a LIBRARY into the cache; the library's path. Whoever is first wins.
+
+    Args:
+        about: the fields of `About` except size and hash.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    data = (built / LIBRARY).read_bytes()
+    written = About(**about, size=len(data), sha256=hashlib.sha256(data).hexdigest())
+    (built / ABOUT).write_text(json.dumps(asdict(written)), encoding="utf-8")
+    for _ in range(3):
+        try:
+            os.rename(built, folder / key)
+            break
+        except OSError:
+            found = find(folder, key)
+            if found is not None:
+                return found
+            _discard(folder / key)
+    else:
+        raise OSError(f"cannot write {folder / key}")
+    tidy(folder, keep=key)
+    return folder / key / LIBRARY
+
+
+def entries(folder: Path) -> list[Entry]:
+    """What lies in the cache, the last used first."""
+    found = []
+    for place in folder.iterdir():
+        about = None if place.name.startswith(".") else _about(place)
+        if about is not None:
+            with suppress(OSError):
+                found.append(Entry(place.name, about, (place / ABOUT).stat().st_mtime))
+    return sorted(found, key=lambda entry: (-entry.used, entry.key))
+
+
+def clear(folder: Path, older_than: float = 0.0) -> list[Entry]:
+    """Remove libraries not used for `older_than` seconds; returns which. With 0, whatever else lies there goes too."""
+    gone = [entry for entry in entries(folder) if entry.age >= older_than]
+    for entry in gone:
+        _discard(folder / entry.key)
+    if older_than <= 0:
+        for place in folder.iterdir():
+            # A lock may be held, and what is being built is somebody's.
+            if place.suffix != ".lock" and not place.name.startswith(BUILDING):
+                _discard(place)
+    tidy(folder)
+    return gone
+
+
+def tidy(folder: Path, limit: int = LIMIT, keep: str = "") -> None:
+    """Remove what killed processes have left, and the libraries used longest ago beyond `limit` bytes, except `keep`."""
+    total = 0
+    for entry in sorted(entries(folder), key=lambda entry: entry.key != keep):
+        total += entry.about.size
+        if total > limit and entry.key != keep:
+            _discard(folder / entry.key)
+    for place in folder.iterdir():
+        left = place.name.startswith((BUILDING, GONE)) or place.suffix in (".lock", ".json")
+        with suppress(OSError):
+            if left and time.time() - place.stat().st_mtime > LEFT_BEHIND and not _needed(folder, place):
+                _discard(place)
+
+
+def _needed(folder: Path, place: Path) -> bool:
+    """Whether a `<key>.json` names a library that is there."""
+    if place.suffix != ".json":
+        return False
+    kept = read_json(place)
+    return kept is not None and (folder / str(kept.get("library", "")) / ABOUT).is_file()
+
+
+@contextmanager
+def turn(folder: Path, key: str) -> Iterator[None]:
+    """One process at a time inside the block, for a while: they would all compile the same.
+
+    The kernel lets go of the lock of a process that dies. Where there are no locks, nobody waits.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(folder / f"{key}.lock")
+    try:
+        lock.acquire(timeout=PATIENCE)
+    except (OSError, NotImplementedError, Timeout):
+        yield
+        return
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """A JSON object, None if there is none or it is damaged."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return value if isinstance(value, dict) else None
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write a file whole or not at all. Raises OSError."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=BUILDING)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump(value, file)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _about(place: Path) -> About | None:
+    kept = read_json(place / ABOUT)
+    try:
+        return None if kept is None else About(**kept)
+    except TypeError:
+        return None
+
+
+def _discard(place: Path) -> None:
+    """Remove a file or a folder; a folder gets another name first, so that nobody finds half of it."""
+    with suppress(OSError):
+        if not place.is_dir():
+            place.unlink(missing_ok=True)
+            return
+        gone = Path(tempfile.mkdtemp(dir=place.parent, prefix=GONE))
+        os.rename(place, gone / "it")
+        shutil.rmtree(gone, ignore_errors=True)

@@ -1,0 +1,86 @@
+"""A program as compiled C++ and what its callers must know: enough to run it again without lowering anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from powderdsl.backends import native_cache
+from powderdsl.backends.native_build import current, open_library
+from powderdsl.backends.native_layout import Layout
+from powderdsl.backends.native_source import native_source
+from powderdsl.ir.ops import Program, Type
+
+
+@dataclass(frozen=True)
+class NativeCode:
+    """A library, where its slots and parameters lie, the type of each slot, the kind of each parameter, the passes."""
+
+    library: Path
+    layout: Layout
+    types: Mapping[str, Type]
+    kinds: Mapping[str, str]
+    passes: tuple[str, ...]
+
+
+def compile_program(program: Program, planes: Program, *, clocks: bool = False) -> NativeCode:
+    """Write a program as C++ and compile it.
+
+    Args:
+        program: the numeric program, whose slots are the state's.
+        planes: the same program from `ir.bits.lower_bits`.
+        clocks: count the time of each pass.
+
+    Raises:
+        NoCompiler: there is no C++ compiler, or it failed.
+    """
+    source, layout = native_source(planes)
+    library, _ = open_library(f"#define PROFILE\n{source}" if clocks else source, program.name)
+    types = {slot.name: slot.type for slot in program.slots}
+    return NativeCode(library, layout, types, dict(program.params), tuple(p.name for p in planes.passes))
+
+
+def recall(key: str) -> NativeCode | None:
+    """The code that was remembered under a key, if its library is still there. Raises NoCompiler without a cache."""
+    folder = current().place()
+    kept = native_cache.read_json(folder / f"{key}.json")
+    try:
+        library = kept and native_cache.find(folder, kept["library"])
+        return _decode(kept, library) if kept and library else None
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None  # damaged: it will be written anew
+
+
+def remember(key: str, code: NativeCode) -> None:
+    """Keep what a program needs besides its library. A cache that cannot be written only costs time."""
+    try:
+        native_cache.write_json(current().place() / f"{key}.json", _encode(code))
+    except OSError:
+        return
+
+
+def _encode(code: NativeCode) -> dict[str, Any]:
+    """As JSON. Tables are lists of pairs: their keys are tuples."""
+    layout = {f.name: getattr(code.layout, f.name) for f in fields(Layout)}
+    return {
+        "library": code.library.parent.name,
+        "layout": {k: list(v.items()) if isinstance(v, dict) else v for k, v in layout.items()},
+        "types": {name: asdict(type) for name, type in code.types.items()},
+        "kinds": dict(code.kinds),
+        "passes": list(code.passes),
+    }
+
+
+def _decode(kept: dict[str, Any], library: Path) -> NativeCode:
+    tables: dict[str, Any] = {
+        name: {_key(key): number for key, number in value} if isinstance(value, list) else value
+        for name, value in kept["layout"].items()
+    }
+    types = {name: Type(**value) for name, value in kept["types"].items()}
+    return NativeCode(library, Layout(**tables), types, kept["kinds"], tuple(kept["passes"]))
+
+
+def _key(key: Any) -> Any:
+    return tuple(key) if isinstance(key, list) else key

@@ -1,0 +1,126 @@
+"""C++ compilers: which one there is, and the flags that it takes."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+
+CURE = "install g++ or clang++, or `pip install ziglang`"
+"""What to do where there is no compiler."""
+
+
+class NoCompiler(Exception):
+    """No C++ compiler that works was found, or it failed; the message says what was tried."""
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A command that compiles C++, and what identifies it. `family` is ``gcc``, ``clang`` or ``zig``."""
+
+    command: tuple[str, ...]
+    family: str
+    version: str
+    """The first line of what `--version` says."""
+
+
+def find_compiler() -> Compiler:
+    """The compiler of `$CXX`; without that the first of g++, c++, clang++ and the `ziglang` package that works.
+
+    Raises:
+        NoCompiler: there is none. `$CXX` is not passed over: whoever sets it wants that one.
+    """
+    return _find(os.environ.get("CXX", ""), os.environ.get("PATH", ""))
+
+
+@lru_cache(maxsize=8)
+def _find(cxx: str, path: str) -> Compiler:
+    """As above, for these values of the environment: what was found is remembered, what was not is sought again."""
+    try:
+        candidates = [tuple(shlex.split(cxx))] if cxx.strip() else _usual()
+    except ValueError as error:
+        raise NoCompiler(f"no C++ compiler: $CXX is `{cxx}`: {error}") from None
+    tried = []
+    for command in candidates:
+        version = _version(command)
+        if version:
+            return Compiler(command, _family(command, version), version)
+        tried.append(" ".join(command))
+    if cxx.strip():
+        raise NoCompiler(f"no C++ compiler: $CXX is `{cxx}`, which cannot be run")
+    missing = [] if len(candidates) > 3 else ["the package ziglang"]
+    raise NoCompiler("no C++ compiler: tried " + ", ".join(tried + missing))
+
+
+def _usual() -> list[tuple[str, ...]]:
+    found: list[tuple[str, ...]] = [("g++",), ("c++",), ("clang++",)]
+    package = find_spec("ziglang")
+    if package is not None and package.origin:
+        # The program itself: `python -m ziglang` would start Python once more.
+        found.append((str(Path(package.origin).with_name("zig")), "c++"))
+    return found
+
+
+def _version(command: tuple[str, ...]) -> str:
+    """The first line of `--version`; empty if the command does not run."""
+    if shutil.which(command[0]) is None:
+        return ""
+    try:
+        result = subprocess.run(
+            [*command, "--version"],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=30,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return result.stdout.strip().splitlines()[0] if result.stdout.strip() else "unknown"
+
+
+def _family(command: tuple[str, ...], version: str) -> str:
+    if "c++" in command[1:] and any("zig" in Path(word).name for word in command):
+        return "zig"
+    return "clang" if "clang" in version else "gcc"
+
+
+def flags_for(compiler: Compiler, level: str, machine: str = "", features: str = "") -> tuple[str, ...]:
+    """The flags for a library of generated code.
+
+    Args:
+        level: ``-O0`` to ``-O3``.
+        machine, features: of the processor, as `platform.machine` and `processor` say; this one's if empty.
+
+    Floats keep their meaning at every level: no contraction (a·b + c is rounded twice on every machine) and no fast
+    mathematics, so that all backends agree bit for bit.
+    """
+    machine, features = machine or platform.machine(), features or processor()
+    on_x86 = machine in ("x86_64", "AMD64", "i686")
+    flags = ["-std=c++17", level, "-march=native" if on_x86 else "-mcpu=native"]
+    flags += ["-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-strict-aliasing"]
+    if on_x86 and "avx512f" in features:
+        flags.append("-mprefer-vector-width=512")
+    if compiler.family == "gcc":
+        # Functions are long: these two took most of the time and gained nothing.
+        flags += ["-fno-gcse", "-fno-tree-pre"]
+    if compiler.family == "zig":
+        flags.append("-fno-sanitize=undefined")  # which zig adds at -O0
+    return (*flags, "-shared", "-fPIC", "-pthread", "-fvisibility=hidden", "-w")
+
+
+@lru_cache(maxsize=1)
+def processor() -> str:
+    """What code for this very processor hangs on: the machine and its instruction sets."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
