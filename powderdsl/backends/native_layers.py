@@ -54,7 +54,8 @@ def layer_lanes(
     bases = [fields[id(chain[-1].args[2])] for chain in chains]
     takes = " ".join(f"{name} = take_field(c); bool some{name} = false;" for name in names)
     pads = " ".join(
-        f"for (int l = c.lanes; l < LANES; l++) memset({name}->live + l * height, 0, height);" for name in names
+        f"for (int l = c.lanes; l < LANES; l++) memset({name}->live + l * height, 0, height);"
+        for name in names
     )
     lists = " ".join(f"active_rows(c, {mask}, {first + i});" for i, mask in enumerate(masks))
     lists += f" active_together(c, {first}, {count});"
