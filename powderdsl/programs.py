@@ -82,6 +82,8 @@ PLANES_FROM = 1 << 16
 class TorchProgram:
     """Torch in its two forms, which give the same worlds: cells for little work, packed planes for more."""
 
+    running = "torch"
+
     def __init__(self, program: Program, device: torch.device):
         from powderdsl.backends.torch_dense import DenseProgram
 

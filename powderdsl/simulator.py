@@ -101,9 +101,7 @@ class Simulator:
     @property
     def running(self) -> str:
         """The backend that the next step runs on: for ``auto``, ``torch`` or ``native``."""
-        return str(
-            getattr(self._program, "running", "torch" if self.backend == "auto" else self.backend)
-        )
+        return str(getattr(self._program, "running", self.backend))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -153,14 +151,13 @@ class Simulator:
         ) == 0
         if index is None:
             index = range(batch) if one_seed else [0] * batch
-        world = World(
+        return World(
             self,
             {name: self._fresh(slot, element) for name, slot in self._slots.items()},
             self._numbers(seed, "seed", batch),
             self._numbers(index, "index", batch),
             torch.zeros(batch, dtype=torch.int64, device=self.device),
         )
-        return world
 
     def _fresh(self, slot: Slot, ids: Tensor) -> Tensor:
         """A slot's tensor as new cells of these elements have it."""

@@ -29,7 +29,7 @@ _MODEL = ("diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
 _PROGRAMS = ("programs", "native_start", "auto_program")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", "observe", "simulator", "worlds", "media", "terminal")
-_EVERYTHING = (*_SCREEN, "ledgers", "pack_tests", "testing", "envs", "web", "experiments", "cli")
+_EVERYTHING = (*_SCREEN, "ledgers", "pack_tests", "testing", "bench", "envs", "web", "experiments", "cli")
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
@@ -56,10 +56,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
     "pack_tests": _SCREEN,
     "testing": (*_SCREEN, "ledgers", "pack_tests"),
+    "bench": _SCREEN,
     "envs": _SCREEN,
     "web": _SCREEN,
     "experiments": (*_SCREEN, "envs", "web"),
-    "cli": (*_SCREEN, "ledgers", "pack_tests", "testing", "envs", "web", "experiments"),
+    "cli": (*_SCREEN, "ledgers", "pack_tests", "testing", "bench", "envs", "web", "experiments"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }
@@ -78,10 +79,13 @@ _TORCH = ("backends.torch_*", *_PROGRAMS, "observe", "simulator", "testing", "en
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),
-    "torch": Home((*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "web", "cli"), _TORCH),
+    "torch": Home(
+        (*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "bench", "web", "cli"), _TORCH
+    ),
     "gymnasium": Home(("envs", "experiments"), ("envs", "experiments")),
     "stable_baselines3": Home(("envs", "experiments"), ("envs", "experiments")),
     "click": Home(("cli",), ("cli",)),
+    "matplotlib": Home(("bench",), ()),
 }
 
 SLOW_IMPORTS = ("torch", "gymnasium", "stable_baselines3", "matplotlib", "tensorboard")

@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show": ("show_command", "List elements, reactions, passes and parameters."),
     "test": ("test_command", "Run the tests that stand in packs."),
     "fuzz": ("fuzz_command", "Compare all backends on random rules and worlds."),
+    "bench": ("bench_command", "Measure how fast rules run, on each backend, batch and size."),
     "new": ("new_command", "Write a first pack: an element, a rule and a test."),
     "render": ("render_command", "Draw a world as a picture, without running it."),
     "explain": ("explain_command", "Say what a diagnostic code means, and how to mend it."),

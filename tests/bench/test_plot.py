@@ -1,0 +1,47 @@
+"""The plot of a report, and what is said where matplotlib is missing."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from PIL import Image
+
+import powderdsl
+from powderdsl.bench import make_plan
+from powderdsl.bench.figures import Ready, Sample, make_report
+from powderdsl.bench.machine import Machine
+from powderdsl.bench.memory import Memory
+from powderdsl.bench.plot import require_matplotlib, write_plot
+
+MACHINE = Machine("Linux", "some processor", 4, "cpu", "3", "2", "none", "0", load=0.1)
+
+
+def a_report(sizes):
+    plan = make_plan(powderdsl.load("life"), backends=["torch", "native"], batches=[1, 32], sizes=sizes)
+    events = [Ready(cell, 1.0, 1.0, Memory(0, "not at all"), 100, 2, 5) for cell in plan.cells]
+    samples = [Sample(cell, number, 1.0 + number, 1.0) for number in range(2) for cell in plan.cells]
+    return make_report(plan, MACHINE, [*events, *samples])
+
+
+def test_several_sizes_have_a_figure_of_their_own(tmp_path):
+    pytest.importorskip("matplotlib")
+    widths = []
+    for name, sizes in (("one.png", [(8, 8)]), ("two.png", [(8, 8), (16, 32)])):
+        write_plot(tmp_path / name, a_report(sizes))
+        with Image.open(tmp_path / name) as image:
+            widths.append(image.width)
+            assert len(image.convert("RGB").getcolors(1 << 24)) > 10
+    assert widths[1] > widths[0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.png", "two.png"]
+
+
+def test_without_matplotlib_the_cure_is_named(monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(powderdsl.CompileError) as caught:
+        require_matplotlib()
+    found = caught.value.diagnostics[0]
+    assert found.code == "PD612"
+    assert "pip install 'powderdsl[plot]'" in found.helps

@@ -1,0 +1,126 @@
+"""`powderdsl bench`: what it prints and writes, what it refuses, and Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+from powderdsl.bench.measure import measure_events
+from powderdsl.cli import bench_command, exits
+from tests.cli.commands import powderdsl
+
+QUICK = ("bench", "life", "--size", "6x8", "--rounds", "2", "--seconds", "0.001", "--steps", "2")
+DENSE = (*QUICK, "--backend", "dense", "--batch", "2")
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_all_combinations_are_measured(tmp_path):
+    result = powderdsl(*DENSE, "--backend", "reference", "--batch", "3", "--json", "x.json", "--profile")
+    assert result.exit_code == 0
+    data = json.loads((tmp_path / "x.json").read_text())
+    measured = [(cell["backend"], cell["batch"]) for cell in data["cells"]]
+    assert measured == [("dense", 2), ("dense", 3), ("reference", 2), ("reference", 3)]
+    lines = result.stdout.splitlines()
+    assert [tuple(line.split()[:3]) for line in lines if line.startswith(("dense", "reference"))] == [
+        (backend, str(batch), "6×8") for backend, batch in measured
+    ]
+    passes = [one["name"] for one in data["cells"][0]["passes"]]
+    table = result.stdout.split("\n\n")[-1].splitlines()
+    assert [line.split("  ")[0] for line in table[1:-2]] == passes
+    assert [line.split("  ")[0] for line in table[-2:]] == ["all passes", "whole step, measured"]
+
+
+def test_parameters_can_be_set():
+    assert powderdsl(*DENSE, "--set", "life.nonsense=3").exit_code == exits.BAD_INPUT
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["no-such-rules"], "PD304"),
+        (["life", "--backend", "fast"], "fast"),
+        (["life", "--batch", "0"], "0"),
+        (["life", "--size", "0x4"], "at least one row"),
+        (["life", "--size", "4096x4096", "--batch", "1000"], "PD607"),
+        (["life", "--elements", "200"], "elements"),
+        (["life", "--only", "snow"], "no element `snow`"),
+        (["life", "--only", "a,,b"], "NAME,NAME"),
+        (["life", "--only", "alive", "--elements", "1"], "not by both"),
+        (["life", "--workload", "storm"], "storm"),
+        (["life", "--seconds", "nan"], "seconds"),
+        (["life", "--seconds", "-1"], "seconds"),
+        (["life", "--device", "abacus"], "PD701"),
+        (["life", "--json", "no/such/folder.json"], "PD613"),
+        (["life", "--plot", "no/such/folder.png"], "PD613"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(arguments, words):
+    result = powderdsl("bench", *arguments)
+    assert result.exit_code == exits.BAD_INPUT
+    assert words in result.stderr
+
+
+def test_without_matplotlib_nothing_is_measured(monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result = powderdsl(*DENSE, "--plot", "x.png")
+    assert result.exit_code == exits.BAD_INPUT
+    assert "PD612" in result.stderr
+    assert "powderdsl[plot]" in result.stderr
+    assert result.stdout == ""
+
+
+def test_a_plot_is_written(tmp_path):
+    pytest.importorskip("matplotlib")
+    assert powderdsl(*DENSE, "--plot", "x.png").exit_code == 0
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_ctrl_c_reports_what_was_measured(monkeypatch, tmp_path):
+    def interrupted(plan):
+        events = measure_events(plan)
+        for _ in range(3):  # a cell begun, the cell ready, one round
+            yield next(events)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench_command, "measure_events", interrupted)
+    result = powderdsl(*DENSE, "--json", "x.json")
+    assert result.exit_code == exits.INTERRUPTED
+    assert "interrupted: 1 of 2 rounds" in result.stdout
+    data = json.loads((tmp_path / "x.json").read_text())
+    assert data["interrupted"]
+    assert [len(cell["round_seconds"]) for cell in data["cells"]] == [1]
+
+
+def test_ctrl_c_before_anything_was_measured(monkeypatch):
+    def interrupted(plan):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench_command, "measure_events", interrupted)
+    result = powderdsl(*DENSE, "--plot", "x.png")
+    assert result.exit_code == exits.INTERRUPTED
+    assert "interrupted: 0 of 2 rounds" in result.stdout
+
+
+def test_without_a_compiler_torch_is_measured(monkeypatch):
+    def none():
+        raise bench_command.NoCompiler("no C++ compiler found")
+
+    monkeypatch.setattr(bench_command, "find_compiler", none)
+    result = powderdsl(*QUICK, "--batch", "1")
+    assert result.exit_code == 0
+    assert "no C++ compiler found" in result.stderr
+    assert "\ntorch " in result.stdout
+    assert "\nnative " not in result.stdout
+
+
+def test_help_says_what_the_workloads_are():
+    text = powderdsl("bench", "--help").stdout
+    assert all(f"\n    {name} " in text for name in ("gusts", "shapes", "noise", "few"))
