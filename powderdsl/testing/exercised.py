@@ -44,6 +44,15 @@ ON_CELLS = ("passes", "on cells")
 ON_NUMBERS = frozenset({"below", "in_set", "table", "count", "mod", "to_real"})
 """IR operations that take or make whole numbers only: none is left on bit planes."""
 
+KINDS = ("flag", "int", "element", "direction", "real", "vec2")
+KINDS_OF = {
+    **dict.fromkeys(("look", "choose", "field", "let"), KINDS),
+    "const": ("flag", "int", "element", "real"),
+    "sum": ("int", "real", "vec2"),
+    "add": ("int", "real", "vec2", "draw"),
+}
+"""Operations of the model that every backend does in another way for another kind."""
+
 FOR_PLANES = frozenset({"chance", "below_planes"})
 """IR operations that only the lowering to bit planes makes."""
 
@@ -72,7 +81,7 @@ def expected() -> dict[str, frozenset[str]]:
             + [f"property {kind}" for kind in ("int", "flag", "chance")]
             + [f"param {kind}" for kind in ("int", "flag", "chance", "real")]
         ),
-        "model": frozenset(OPS),
+        "model": frozenset(OPS) | {f"{op} {kind}" for op, kinds in KINDS_OF.items() for kind in kinds},
         "IR": frozenset(IR_OPS) - FOR_PLANES,
         "bit planes": frozenset(IR_OPS) - ON_NUMBERS,
     }  # fmt: skip
@@ -197,6 +206,7 @@ def _of_model(ruleset: Ruleset) -> Iterator[tuple[str, str]]:
             yield "fields and properties", f"{name} {item.kind.name}"
     for expr in expressions(ruleset):
         yield "model", expr.op
+        yield "model", f"{expr.op} {expr.kind.name}"
     for moment in (moment for pass_ in ruleset.passes for moment in pass_.moments):
         yield "rules", moment.policy
         for rule in moment.rules:

@@ -18,7 +18,7 @@ def real(phrases: Phrases, depth: int) -> Phrase:
         (1, partial(_real_param, phrases)),
     ]
     trees = [
-        (4, partial(_real_arithmetic, phrases)), (2, partial(_divide, phrases)), (1, partial(_real_unary, phrases)), (1, partial(_real_extreme, phrases)), (2, partial(_part, phrases)),
+        (4, partial(_real_arithmetic, phrases)), (2, partial(_divide, phrases)), (2, partial(_real_unary, phrases)), (2, partial(_real_extreme, phrases)), (2, partial(_part, phrases)),
         (1, partial(_length, phrases)), (1, partial(_real_sum, phrases)), (1, partial(_choose_real, phrases)), (1, partial(_scaled_draw, phrases)),
     ]  # fmt: skip
     return phrases._one(leaves + (trees if depth > 0 else []), depth)

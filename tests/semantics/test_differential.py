@@ -1,36 +1,33 @@
 """Every backend against the oracle, bit by bit: shipped rulesets, random rulesets, odd worlds.
 
 A pair is one ruleset with one world. The random pairs are the same in every run: they come from seeds. To look at
-others, or at more of them:
+others, or at more of them, and have what fails made small: `powderdsl fuzz`. Or:
 
     POWDERDSL_SEEDS=1000..3000 pytest tests/semantics/test_differential.py -k random
-
-A failing case says where the backends differ first, and shows the ruleset and the world;
-`powderdsl.testing.reducer` makes it small.
 """
 
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from powderdsl.compiler import load, lower, shipped, shipped_rules
+from powderdsl.backends.native_build import Building, NoCompiler, find_compiler
+from powderdsl.compiler import load, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError
-from powderdsl.ir.bits import lower_bits
-from powderdsl.ir.ops import OPS as IR_OPS
-from powderdsl.ir.ops import Node, Program
-from powderdsl.model.types import OPS, Assign, Expr, Ruleset
+from powderdsl.model.types import Ruleset
 from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.testing.cases import Start, load_text, random_start
 from powderdsl.testing.choices import Choices
 from powderdsl.testing.compare import assert_same, find_difference
+from powderdsl.testing.differential import Outcome, Plan, run_seed
+from powderdsl.testing.exercised import constructs, missing, operations
 from powderdsl.testing.rulemaker import random_ruleset_text
 from powderdsl.testing.strategies import rulesets, worlds
 
@@ -41,8 +38,8 @@ CHUNKS = range(FIRST, LAST, CHUNK)
 MAX_REJECTED = 0.08
 """Share of random texts that the static checks may refuse: it is 0.014."""
 
-PLANE_OPS = {"chance", "below_planes"}
-"""What only the lowering to bit planes makes."""
+COVERED_BY = 200
+"""So many random rulesets exercise everything."""
 
 
 @cache
@@ -52,20 +49,6 @@ def seeded_ruleset(seed: int) -> Ruleset | None:
         return load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
     except CompileError:
         return None
-
-
-def starts(ruleset: Ruleset, seed: int) -> Iterator[Start]:
-    """The start worlds of a seed: five small ones, three and two a batch, the second batch wider."""
-    for part, (batch, side) in enumerate(((3, 5), (2, 65))):
-        choices = Choices.seeded(seed * 2 + part)
-        yield random_start(ruleset, choices, (batch, *_sides(choices, side)))
-
-
-def _sides(choices: Choices, limit: int) -> tuple[int, int]:
-    """Rows and columns: few rows where there are many columns, so that the oracle has little to do."""
-    if limit <= 5:
-        return choices.whole(1, limit), choices.whole(1, limit)
-    return choices.whole(1, 3), choices.pick([31, 32, 33, 63, 64, 65])
 
 
 # Shipped rulesets
@@ -96,18 +79,43 @@ def test_shipped_rulesets(name: str) -> None:
 # Random rulesets
 
 
+def agreed(outcomes: Iterable[Outcome]) -> int:
+    """How many worlds agreed. Fails with the first that did not, and how to run it again."""
+    worlds = 0
+    for outcome in outcomes:
+        for found in outcome.findings:
+            again = (
+                f"powderdsl fuzz --seeds {outcome.seed}..{outcome.seed + 1} --backends {found.case.backend}"
+            )
+            pytest.fail(
+                f"{found.case.backend} {found.problem}\n{again}\n{found.case.start}\n{found.case.text}"
+            )
+        worlds += outcome.worlds
+    return worlds
+
+
 @pytest.mark.parametrize("first", CHUNKS)
 def test_random_rulesets(first: int) -> None:
-    pairs = 0
-    for seed in range(first, min(first + CHUNK, LAST)):
-        ruleset = seeded_ruleset(seed)
-        if ruleset is None:
-            continue
-        simulators = [compile_ruleset(ruleset, backend=backend) for backend in BACKENDS]
-        for start in starts(ruleset, seed):
-            pairs += len(start.ids)
-            assert_same(ruleset, start, steps=2, simulators=simulators)
-    assert pairs >= 4 * CHUNK
+    seeds = range(first, min(first + CHUNK, LAST))
+    assert agreed(run_seed(seed, Plan(worlds=4, steps=2)) for seed in seeds) >= 3 * len(seeds)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seeds", "level"), [(range(40, 46), "-O0"), (range(46, 48), "-O1"), (range(48, 49), "-O2")]
+)
+def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path) -> None:
+    """Few, since each takes seconds to compile; the level of optimisation changes nothing."""
+    needs_compiler()
+    plan = Plan(("native",), worlds=4, steps=3, building=Building(level, tmp_path))
+    assert agreed(run_seed(seed, plan) for seed in seeds) >= 4
+
+
+def needs_compiler() -> None:
+    try:
+        find_compiler()
+    except NoCompiler:
+        pytest.skip("no C++ compiler on this machine")
 
 
 @settings(
@@ -149,77 +157,31 @@ def test_draws_from_outside() -> None:
 # What the random rulesets are made of
 
 
-def expressions(ruleset: Ruleset) -> Iterator[Expr]:
-    """Every expression of a ruleset and every part of it."""
-    for pass_ in ruleset.passes:
-        for moment in pass_.moments:
-            tops = [let.value for let in moment.lets]
-            for rule in moment.rules:
-                effects = () if isinstance(rule, Assign) else rule.effects
-                tops += [
-                    top
-                    for top in (rule.mask, getattr(rule, "value", None), getattr(rule, "target", None))
-                    if top is not None
-                ]
-                tops += [effect.value for effect in effects]
-            for top in tops:
-                yield from top.walk()
-
-
-def ir_nodes(program: Program) -> Iterator[Node]:
-    """Every node of a program."""
-    for pass_ in program.passes:
-        seen: set[Node] = set()
-        stack = [node for _, node in pass_.outputs] + [
-            node for step in pass_.moments for _, node in step.writes
-        ]
-        while stack:
-            node = stack.pop()
-            if node not in seen:
-                seen.add(node)
-                yield node
-                stack.extend(node.args)
-
-
-def test_random_rulesets_use_all_of_the_model() -> None:
-    ops: Counter[tuple[str, str]] = Counter()
-    forms: Counter[str] = Counter()
-    policies: Counter[str] = Counter()
-    updates: Counter[str] = Counter()
-    for seed in range(FIRST, LAST):
-        ruleset = seeded_ruleset(seed)
-        if ruleset is None:
-            continue
-        ops.update((expr.op, expr.kind.name) for expr in expressions(ruleset))
-        for moment in (moment for pass_ in ruleset.passes for moment in pass_.moments):
-            forms.update(type(rule).__name__ for rule in moment.rules)
-            policies[moment.policy] += 1
-            for rule in moment.rules:
-                updates.update(a.op for a in ([rule] if isinstance(rule, Assign) else rule.effects))
-    assert {op for op, _ in ops} == OPS.keys()
-    assert {"Transform", "Swap", "Move", "Assign"} == forms.keys()
-    assert {"prove", "drop_both", "first_wins"} == policies.keys()
-    assert {":=", "+=", "-="} == updates.keys()
-    for op in ("look", "choose", "field", "const", "let"):
-        kinds = {"flag", "int", "element", "direction", "real", "vec2"} - (
-            {"direction"} if op == "const" else set()
-        )
-        assert kinds - {"vec2" if op == "const" else ""} <= {kind for name, kind in ops if name == op}, op
-    assert {"int", "real", "vec2"} <= {kind for name, kind in ops if name == "sum"}
-    assert {"int", "real", "vec2", "draw"} <= {kind for name, kind in ops if name == "add"}
-
-
-def test_random_rulesets_use_all_of_the_ir() -> None:
-    ops: set[str] = set()
-    plane_ops: set[str] = set()
-    for seed in range(FIRST, min(LAST, FIRST + 150)):
+@pytest.mark.slow
+def test_random_rulesets_use_all_of_the_language_and_the_ir() -> None:
+    """Every construct and every operation, on numbers and on bit planes; the lists come from the compiler's tables."""
+    used: set[tuple[str, str]] = set()
+    for seed in range(COVERED_BY):
         ruleset = seeded_ruleset(seed)
         if ruleset is not None:
-            program = lower(ruleset)
-            ops |= {node.op for node in ir_nodes(program)}
-            plane_ops |= {node.op for node in ir_nodes(lower_bits(program))}
-    assert ops >= IR_OPS.keys() - PLANE_OPS
-    assert plane_ops >= PLANE_OPS & IR_OPS.keys()
+            used |= constructs(random_ruleset_text(seed), ruleset) | operations(ruleset)
+        if not missing(used):
+            return
+    pytest.fail(f"never exercised: {missing(used)}")
+
+
+def test_what_is_not_exercised_is_named() -> None:
+    text = (
+        "pack: p\nelements: {a: {id: 0, color: '#000000'}}\npasses: {one: {do: 'a -> a if row mod 2 == 1'}}\n"
+    )
+    used = constructs(text, load_text(text)) | operations(load_text(text))
+    lacking = missing(used)
+    assert {("syntax", "mod"), ("words", "row"), ("rules", "Transform"), ("model", "eq")} <= used
+    assert "swap" in lacking["syntax"]
+    assert "column" in lacking["words"]
+    assert "pass.before" in lacking["keys"]
+    assert "sqrt" in lacking["IR"]
+    assert "settle" in lacking["bit planes"]
 
 
 # The comparison itself

@@ -1,0 +1,122 @@
+"""`powderdsl fuzz`: what it says, saves and returns; a backend that is made wrong is found, reduced and replayed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from powderdsl.backends.native_build import Building
+from powderdsl.simulator import Simulator
+from powderdsl.testing import differential
+from powderdsl.testing.case_files import read_case, write_case
+from powderdsl.testing.reducer import reduce_case
+from tests.cli.commands import command_line, environment_with, powderdsl, process
+
+
+@pytest.mark.slow
+def test_a_run_reports_saves_its_state_and_goes_on(tmp_path: Path) -> None:
+    options = ("fuzz", "--jobs", 1, "--worlds", 2, "--steps", 1, "--save", tmp_path / "found")
+    first = process(*options, "--seeds", "0..2")
+    assert first.returncode == 0, first.stderr
+    assert "2 rulesets" in first.stdout
+    assert "dense and planes against the reference" in first.stdout
+    assert "no differences found" in first.stdout
+    assert "bit planes" in first.stdout
+    second = process(*options, "--seeds", "0..3", "--resume")
+    assert second.returncode == 0, second.stderr
+    assert json.loads((tmp_path / "found" / "state.json").read_text())["next"] == 3
+    assert "3 rulesets" in second.stdout
+    other = powderdsl(*options, "--resume", "--backends", "dense")
+    assert other.exit_code == 2
+    assert "PD602" in other.stderr
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
+    line = command_line("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path)
+    running = subprocess.Popen(
+        [*line, "--seeds", "0..100000"], env=environment_with(), stdout=subprocess.PIPE, text=True
+    )
+    state = tmp_path / "state.json"
+    while not state.exists() and running.poll() is None:  # it is written every ten seconds
+        time.sleep(0.2)
+    running.send_signal(signal.SIGINT)
+    told, _ = running.communicate(timeout=60)
+    assert running.returncode == 0
+    next_seed = json.loads(state.read_text())["next"]
+    assert next_seed > 0
+    assert f"`--resume` goes on from seed {next_seed}" in told
+    assert "no differences found" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--seeds", "5..2"), "no range of seeds"),
+        (("--backends", "dense,sparse"), "no backend `sparse`"),
+        (("--seeds", "0..2", "--seconds", "3"), "not both"),
+        (("--replay", "nowhere.yaml"), "cannot read nowhere.yaml"),
+        (("--resume", "--save", "nowhere"), "cannot read nowhere/state.json"),
+    ],
+)
+def test_bad_options(options: tuple[str, ...], words: str) -> None:
+    result = powderdsl("fuzz", *options)
+    assert result.exit_code == 2
+    assert words in result.stderr
+
+
+@pytest.mark.slow
+def test_damaged_files(tmp_path: Path) -> None:
+    result = process("fuzz", "--front-end", "--seeds", "0..30", "--jobs", 1, "--save", tmp_path)
+    assert result.returncode == 0, result.stdout
+    assert "30 inputs" in result.stdout
+    assert "no problems found" in result.stdout
+
+
+@pytest.mark.slow
+def test_a_wrong_backend_is_found_reduced_and_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Planes that turn each second row's new cells: only rules that change elements fail, which is what is left."""
+    compiled = differential._compiled
+
+    def wrong(ruleset: Any, backend: str, how: Building, threads: int) -> Simulator:
+        simulator = compiled(ruleset, backend, how, threads)
+        if backend == "planes":
+            step = simulator.step
+
+            def broken(world: Any, *args: Any, **options: Any) -> Any:
+                after = step(world, *args, **options)
+                ids = after.ids.clone()
+                changed = (ids != world.ids).any(0)
+                ids[:, changed] = world.ids[:, changed]
+                return simulator.replace(after, ids=ids)
+
+            monkeypatch.setattr(simulator, "step", broken)
+        return simulator
+
+    monkeypatch.setattr(differential, "_compiled", wrong)
+    plan = differential.Plan(("planes",), worlds=2, steps=2)
+    outcomes = (differential.run_seed(seed, plan) for seed in range(20))
+    finding = next(found for outcome in outcomes for found in outcome.findings)
+    small = reduce_case(finding.case, differential.still_fails(finding, plan.building))
+    assert small.steps == 1
+    assert small.start.ids.size <= 2
+    assert len(small.text) < len(finding.case.text) / 2
+    write_case(tmp_path / "case.yaml", small, finding.problem)
+    assert "fields" not in (tmp_path / "case.yaml").read_text() or small.start.fields
+    replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
+    assert replayed.exit_code == 1
+    assert "planes differs after step 1: `element`" in replayed.stdout
+    monkeypatch.setattr(differential, "_compiled", compiled)
+    differential._simulator.cache_clear()
+    replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
+    assert replayed.exit_code == 0
+    assert "planes and the reference agree" in replayed.stdout
+    assert read_case(tmp_path / "case.yaml").text == small.text
