@@ -166,7 +166,7 @@ class PassMaker:
         return "for " + ", ".join(bindings), phrases, max(rounds, 1)
 
     def _let_kind(self) -> Kind:
-        kinds = [(6, FLAG), (3, some_range(self.choices)), (2, ELEMENT), (1, DIRECTION)]
+        kinds = [(6, FLAG), (3, some_range(self.choices)), (2, ELEMENT), (2, DIRECTION)]
         if self.manner.reals:
             kinds += [(2, Kind("real")), (2, VEC2)]
         return self.choices.weighted(kinds)
