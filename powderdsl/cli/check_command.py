@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,6 +16,9 @@ from powderdsl.cli.show_command import table
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short
+from powderdsl.ledgers.book import Ledger
+from powderdsl.ledgers.book import ledger as make_ledger
+from powderdsl.ledgers.report import ledger_data, ledger_text
 from powderdsl.model.types import Ruleset
 
 if TYPE_CHECKING:
@@ -35,7 +38,12 @@ if TYPE_CHECKING:
 @click.option("--notes", is_flag=True, help="Also list what is worth knowing, such as rules that are asleep.")
 @click.option("--warnings-as-errors", is_flag=True, help="Exit with 1 if there are warnings.")
 @click.option("--cost", is_flag=True, help="Also say what each pass costs; in JSON as a second key.")
-def command(rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool, cost: bool) -> int:
+@click.option(
+    "--ledger", is_flag=True, help="Also say what rules create, destroy and move; in JSON as a key."
+)
+def command(
+    rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool, cost: bool, ledger: bool
+) -> int:
     """Find the mistakes in rule files, all at once.
 
     Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml.
@@ -45,6 +53,7 @@ def command(rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors
     found: dict[Diagnostic, None] = {}
     lines = []
     expenses: dict[str, tuple[PassCost, ...]] = {}
+    ledgers: dict[str, Ledger] = {}
     errors = warnings = 0
     for name in rules:
         ruleset, diagnostics = _check(name)
@@ -56,9 +65,16 @@ def command(rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors
         if cost and ruleset is not None:
             expenses[name] = _costs(ruleset)
             lines += ["", *_cost_lines(expenses[name])]
-    if layout == "json" and cost:
-        listed = {name: [asdict(one) for one in passes] for name, passes in expenses.items()}
-        click.echo(json.dumps({"diagnostics": [*map(diagnostic_data, found)], "cost": listed}, indent=2))
+        if ledger and ruleset is not None:
+            ledgers[name] = make_ledger(ruleset)
+            lines += ["", ledger_text(ledgers[name])]
+    if layout == "json" and (cost or ledger):
+        data: dict[str, Any] = {"diagnostics": [*map(diagnostic_data, found)]}
+        if cost:
+            data["cost"] = {name: [asdict(one) for one in passes] for name, passes in expenses.items()}
+        if ledger:
+            data["ledger"] = {name: ledger_data(one) for name, one in ledgers.items()}
+        click.echo(json.dumps(data, indent=2, ensure_ascii=False))
     elif layout == "json":
         click.echo(render_json(found))
     elif layout == "short":

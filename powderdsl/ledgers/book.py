@@ -52,7 +52,8 @@ class RuleEntry:
     elements that it carries away or pushes aside. `fires` is False if it is proven never to happen.
 
     Of each of `needs` one element must exist, or the line cannot happen. `copies` are elements that it makes only where
-    they exist already. To exist is to be held by a cell, or named by a field, at the start of the step.
+    they exist already. To exist is to be held by a cell, or named by a field, at the start of
+    the step or earlier in it.
     """
 
     rule: RuleLine
@@ -233,18 +234,18 @@ def _sum_text(weights: Mapping[str, int]) -> str:
 
 def ledger(ruleset: Ruleset) -> Ledger:
     """The ledger of a checked ruleset: decided from its rules, no world is run."""
-    facts = ledger_facts(ruleset)
+    parts = [ledger_facts(ruleset) for _ in range(3)]  # each with work of its own
     names = {element.id: element.name for element in ruleset.elements}
-    found = find_changes(ruleset, facts)
-    wants = find_wants(ruleset, facts)
+    found = find_changes(ruleset, parts[0])
+    wants = find_wants(ruleset, parts[1])
     return Ledger(
         ruleset.name,
         tuple(names.values()),
         tuple(_entry(one, wants.get(one.line), names) for one in found),
         find_fields(ruleset, found),
-        find_overlaps(ruleset, facts),
+        find_overlaps(ruleset, parts[2]),
         tuple(_named(named_by_fields(ruleset), names)),
-        not facts.budget.is_exhausted,
+        all(facts.budget.left > 0 for facts in parts),
     )
 
 

@@ -6,7 +6,7 @@ Everything found here is an upper bound. What a rule is not said to do, it canno
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from powderdsl.model.operands import ELEMENT_HERE, member, negation
@@ -17,8 +17,11 @@ from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule
 
 HERE: Offset = (0, 0)
 
-BUDGET = 8_000_000
-"""Nodes evaluated for one ledger: a minute. The largest shipped ruleset needs a twentieth of it."""
+BUDGET = 400_000
+"""Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs half of it."""
+
+MAX_QUESTION = 20_000
+"""Nodes evaluated for one question, after which the answer is that it may be."""
 
 MAX_PAIRS = 1024
 """Pairs of elements that are asked about one by one where a rule computes what a cell becomes."""
@@ -68,10 +71,10 @@ class Asked:
         """Whether the rule may happen while these conditions hold too. False is a proof."""
         assert rule.mask is not None
         first = ((rule.mask, HERE), *more)
-        if not satisfiable(self.facts, first, self.lets):
+        if not possible(self.facts, first, self.lets):
             return False
         rivals = self.rivals(rule)
-        return not rivals or satisfiable(self.facts, (*first, *rivals), self.lets)
+        return not rivals or possible(self.facts, (*first, *rivals), self.lets)
 
     def rivals(self, rule: Rule) -> list[Condition]:
         """What must not hold for the rule to happen, by the moment's conflict policy.
@@ -101,6 +104,15 @@ class Asked:
         return found
 
 
+def possible(facts: Facts, conditions: Sequence[Condition], lets: dict[str, Expr]) -> bool:
+    """Whether the conditions may hold together. False is a proof; hard questions are given up, easy ones go on."""
+    budget = facts.budget
+    question = Budget(min(MAX_QUESTION, budget.left))
+    answer = satisfiable(replace(facts, budget=question), conditions, lets)
+    budget.left -= min(MAX_QUESTION, budget.left) - max(question.left, 0)
+    return answer
+
+
 def footprint(rule: Rule) -> tuple[Offset, ...]:
     """The cells that a rule claims, seen from the cell where its condition holds."""
     return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)
@@ -115,7 +127,7 @@ def is_not(number: int, at: Offset = HERE) -> Condition:
 
 
 def ledger_facts(ruleset: Ruleset) -> Facts:
-    """What is known of cells, with work for all questions of one ledger."""
+    """What is known of cells, with work for all questions of one part of a ledger."""
     return replace(facts_of(ruleset), budget=Budget(BUDGET))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from powderdsl.ledgers.changes import HERE, Asked, RuleLine, footprint, rule_line
+from powderdsl.ledgers.changes import HERE, Asked, RuleLine, footprint, possible, rule_line
 from powderdsl.model.operands import negation
-from powderdsl.model.satisfy import Facts, satisfiable
+from powderdsl.model.satisfy import Facts
 from powderdsl.model.types import Assign, Expr, Offset, Pass, Rule, Ruleset, Transform
 
 OUTCOMES = {
@@ -43,21 +43,22 @@ def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
         for moment in pass_.moments:
             asked = Asked.of(moment, facts)
             live = [rule for rule in moment.rules if rule.mask is None or asked.may(rule)]
-            found |= dict.fromkeys(_claims(live, asked, pass_, found))
+            found |= dict.fromkeys(_claims(asked, pass_, found))
             found |= dict.fromkeys(_writes(live, asked, pass_, found))
     found |= dict.fromkeys(_in_turn(ruleset, facts, found))
     return tuple(found)
 
 
 def _meet(first: Expr, second: Expr, at: Offset, asked: Asked) -> bool:
-    return satisfiable(asked.facts, [(first, HERE), (second, at)], asked.lets)
+    return possible(asked.facts, [(first, HERE), (second, at)], asked.lets)
 
 
-def _claims(rules: list[Rule], asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
+def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
     """Rules of one moment that may claim one cell, where a policy decides."""
     if asked.moment.policy == "prove":
         return
-    movers = [rule for rule in rules if not isinstance(rule, Assign)]
+    # What is always dropped meets others too: here only the conditions count.
+    movers = [rule for rule in asked.moment.rules if not isinstance(rule, Assign)]
     outcome = "first wins" if asked.moment.policy == "first_wins" else "both dropped"
     for i, second in enumerate(movers):
         for first in movers[: i + 1]:
@@ -151,7 +152,7 @@ def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iter
                 if t.op == "const"
             ]
             conditions = [(other_mask, HERE), (mask, HERE), *changing]
-            if overlap not in seen and satisfiable(facts, conditions, {**other_lets, **lets}):
+            if overlap not in seen and possible(facts, conditions, {**other_lets, **lets}):
                 seen.add(overlap)
                 yield overlap
 

@@ -1,0 +1,285 @@
+"""The ledger: what it says of known rules, and samples that try to contradict it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from powderdsl.compiler import load
+from powderdsl.diagnostics import CompileError
+from powderdsl.ledgers.book import Ledger, NotProven, Proven, ledger
+from powderdsl.ledgers.report import ledger_text
+from powderdsl.model.state import slots
+from powderdsl.model.types import ELEMENT, Ruleset
+from powderdsl.simulator import World
+from powderdsl.simulator import compile as compile_ruleset
+from powderdsl.testing.cases import load_text, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.testing.rulemaker import random_ruleset_text
+from tests.semantics.ledger_watch import Watch
+from tests.semantics.test_differential import compositions
+
+GOLDEN = Path(__file__).parent / "golden"
+
+SMALL = """\
+pack: small
+properties:
+  weight: {type: 0..7}
+  loose: {type: flag, default: no}
+fields:
+  age: {type: 0..9, at: element}
+elements:
+  air: {id: 0, weight: 1, color: "#ECF0F1", glyph: "."}
+  brick: {id: 1, weight: 5, color: "#6C7A89", glyph: "#"}
+  mud: {id: 2, weight: 2, color: "#6C7A89", glyph: m}
+  grass: {id: 3, weight: 2, color: "#6C7A89", glyph: g}
+"""
+
+
+def small(rules: str) -> Ruleset:
+    return load_text(SMALL + "passes:\n" + rules, "small.yaml")
+
+
+# What it says
+
+
+@pytest.mark.golden
+def test_the_ledger_of_powderworld(golden: Callable[[Path, str], None]) -> None:
+    golden(GOLDEN / "powderworld.ledger", ledger_text(ledger(load("powderworld"))))
+
+
+def test_verdicts_name_the_lines_that_stand_in_the_way() -> None:
+    book = ledger(load("core+water"))
+    assert book.conserved({"water": 1, "ice": 1})
+    assert book.conserved({"water": 2, "ice": 2, "wall": -1})
+    assert book.unchanged("wall")
+    assert not book.unchanged("empty")
+    verdict = book.conserved({"water": 1, "ice": 2})
+    assert isinstance(verdict, NotProven)
+    assert {line.pass_name for line in verdict.rules} == {"melt", "freeze"}
+    falls = book.never_falls(["ice"])
+    assert isinstance(falls, NotProven)
+    assert [line.text for line in falls.rules] == ["ice -> water if count(thaws) > 1 and interact < melt"]
+    assert isinstance(book.never_appears("ice"), Proven)
+    assert book.reach(["empty", "water"]) == ("empty", "water")
+    with pytest.raises(KeyError, match="no element `lava`"):
+        book.conserved({"lava": 1})
+
+
+def test_what_only_falls_and_only_rises() -> None:
+    book = ledger(small("  rot: {do: grass -> mud with chance 5%}\n"))
+    assert book.never_rises(["grass"])
+    assert book.never_falls(["mud"])
+    assert not book.never_rises({"mud": 1})
+    assert book.never_rises({"mud": 1, "grass": 2})
+    assert book.constant_sums == (("air",), ("brick",), ("mud", "grass"))
+    assert book.rising_sums == (("mud",),)
+    assert book.falling_sums == (("grass",),)
+    assert not book.never_appears("mud")
+
+
+def test_moves_that_leave_and_overwrite() -> None:
+    book = ledger(small("  go: {do: mud moves right leaving grass if right is not mud}\n"))
+    assert book.conserved({"mud": 1})
+    verdict = book.never_falls(["brick"])
+    assert isinstance(verdict, NotProven)
+    assert verdict.reason == "`brick` may become `grass`"
+    assert not book.unchanged("brick")
+
+
+def test_moves_that_follow_each_other() -> None:
+    """The first of a row leaves its element, the last one overwrites: of two rules here."""
+    rules = """\
+  go:
+    do:
+      - mud moves right leaving air if right is grass
+      - grass moves right leaving brick if right is air
+"""
+    book = ledger(small(rules))
+    assert ("air", "air") not in book.changes
+    assert not book.conserved({"air": 1})
+    ruleset = small(rules)
+    watch = Watch(ruleset, book)
+    simulator = compile_ruleset(ruleset, backend="reference")
+    with watch.running():
+        world = simulator.step(simulator.world([[2, 3, 0]]))
+    assert world.ids.tolist() == [[[0, 2, 3]]]
+    assert watch.denied == []
+
+
+def test_properties_that_cells_override_in_turn() -> None:
+    """Only what was made light becomes loose, and only what is loose changes."""
+    rules = """\
+  lighten: {do: weight := 3 where brick}
+  loosen: {do: loose := yes where weight == 3}
+  fall: {do: any but mud -> mud if loose}
+"""
+    book = ledger(small(rules))
+    assert book.changes.keys() == {("brick", "mud")}
+
+
+def test_a_draw_may_meet_a_bound_exactly() -> None:
+    text = SMALL.replace("fields:", "streams: [luck]\nfields:")
+    bound = "0.000762939453125%"  # 1/2¹⁷: half a step of a draw of 16 bits
+    text += f"passes:\n  rare: {{do: air -> mud if not (luck < {bound}) and not (luck > {bound})}}\n"
+    assert ledger(load_text(text, "rare.yaml")).rules[0].fires
+
+
+def test_policies_narrow_what_happens() -> None:
+    """Under `first_wins` the second rule never gets a cell that the first one does not want."""
+    rules = """\
+  go:
+    conflicts: POLICY
+    do:
+      - mud -> air
+      - mud -> grass
+      - mud -> brick if count(mud) > 3
+"""
+    wins = ledger(small(rules.replace("POLICY", "first_wins")))
+    assert [entry.fires for entry in wins.rules] == [True, False, False]
+    assert ledger(small(rules.replace("POLICY", "drop_both"))).changes == {}
+    assert {one.outcome for one in wins.overlaps} == {"first wins"}
+
+
+def test_bounds_of_fields() -> None:
+    book = ledger(
+        small("  tick: {do: [age := 3 where mud, age += 1 where grass]}\n  tock: {do: age := 0 where air}\n")
+    )
+    assert book.within("age", 0, 9) == Proven("`age` is declared as 0..9, and every write is cut off there")
+    verdict = book.within("age", 0, 5)
+    assert isinstance(verdict, NotProven)
+    assert [line.text for line in verdict.rules] == ["age += 1"]
+    lazy = ledger(small("  tick: {do: age := 3 where mud}\n")).within("age", 0, 5)
+    assert isinstance(lazy, Proven)
+    assert lazy.given == "`age` within 0..5"
+    with pytest.raises(KeyError, match="no field `weight`"):
+        book.within("weight", 0, 9)
+
+
+def test_writes_whose_order_decides() -> None:
+    book = ledger(small("  tick: {do: [age += 3 where mud, age -= 1 where any, age := 5 where grass]}\n"))
+    assert {(one.outcome, one.first.text, one.second.text) for one in book.overlaps} == {
+        ("cut off", "age += 3", "age -= 1"),
+        ("last writes", "age -= 1", "age := 5"),
+    }
+
+
+def test_too_many_rules_are_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("powderdsl.ledgers.changes.BUDGET", 100)
+    book = ledger(load("core+water"))
+    assert not book.complete
+    assert "Not decided in full" in ledger_text(book)
+    assert not book.conserved({"wall": 1})
+
+
+# Samples that try to contradict it
+
+
+def contradictions(book: Ledger, ruleset: Ruleset, before: World, after: World) -> list[str]:
+    """What a step, or several, did that the ledger says cannot happen."""
+    old, new = before.ids.numpy(), after.ids.numpy()
+    numbers = {element.name: element.id for element in ruleset.elements}
+    found = []
+    for sums, wrong in (
+        (book.constant_sums, lambda a, b: a != b),
+        (book.rising_sums, lambda a, b: b < a),
+        (book.falling_sums, lambda a, b: b > a),
+    ):
+        for names in sums:
+            ids = [numbers[name] for name in names]
+            counts = [np.isin(part, ids).sum((1, 2)) for part in (old, new)]
+            if wrong(*counts).any():
+                found.append(f"the sum of {names}")
+    fields = [slot.name for slot in slots(ruleset)[1:] if slot.kind == ELEMENT and not slot.resets]
+    named = [before.state[name].numpy() for name in fields]
+    for name in book.elements:
+        if book.unchanged(name) and (new[old == numbers[name]] != numbers[name]).any():
+            found.append(f"{name} does not stay")
+        if book.never_appears(name):
+            lacking = ~np.any([(part == numbers[name]).any((1, 2)) for part in (old, *named)], 0)
+            if (new[lacking] == numbers[name]).any():
+                found.append(f"{name} appears")
+    for world in range(0, len(old), 10):
+        parts = [part[world].ravel() for part in (old, *named)]
+        start = {name for name in book.elements if any((part == numbers[name]).any() for part in parts)}
+        reach = [numbers[name] for name in book.reach(start)]
+        if not np.isin(new[world], reach).all():
+            found.append(f"{start} reach more")
+    for entry in book.fields:
+        if entry.name in after.state and entry.bounds is not None:
+            values = after.state[entry.name].numpy()
+            if values.min() < entry.bounds[0] or values.max() > entry.bounds[1]:
+                found.append(f"{entry.name} leaves its bounds")
+    return found
+
+
+def sampled(ruleset: Ruleset, batches: int, worlds: int, side: int, steps: int, backend: str) -> list[str]:
+    """Contradictions that random worlds find, after every step and over all of them."""
+    book = ledger(ruleset)
+    simulator = compile_ruleset(ruleset, backend=backend)
+    found: list[str] = []
+    for batch in range(batches):
+        start = random_start(ruleset, Choices.seeded(batch), (worlds, side, side))
+        first = world = start.world(simulator)
+        for _ in range(steps):
+            last, world = world, simulator.step(world, params=start.params or None)
+            found += contradictions(book, ruleset, last, world)
+        found += contradictions(book, ruleset, first, world)
+    return found
+
+
+@pytest.mark.slow
+def test_ten_thousand_worlds_do_not_contradict_the_ledger_of_powderworld() -> None:
+    assert sampled(load("powderworld"), batches=100, worlds=100, side=16, steps=3, backend="planes") == []
+
+
+@pytest.mark.parametrize("name", compositions())
+def test_shipped_rules_keep_to_their_ledger(name: str) -> None:
+    ruleset = load(name)
+    assert sampled(ruleset, batches=4, worlds=20, side=9, steps=3, backend="dense") == []
+    assert watched(ruleset, range(6)).denied == []
+
+
+def watched(ruleset: Ruleset, seeds: range, shape: tuple[int, int, int] | None = None) -> Watch:
+    """What the reference does with random worlds, held against the ledger rule by rule."""
+    watch = Watch(ruleset, ledger(ruleset))
+    simulator = compile_ruleset(ruleset, backend="reference")
+    for seed in seeds:
+        start = random_start(ruleset, Choices.seeded(seed), shape, max_side=9)
+        with watch.running():
+            simulator.step(start.world(simulator), 2, params=start.params or None)
+    return watch
+
+
+@pytest.mark.parametrize("first", range(0, 60, 20))
+def test_random_rules_keep_to_their_ledger(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "powderdsl.ledgers.changes.BUDGET", 50_000
+    )  # some are found too large: that is sound too
+    tried = 0
+    for seed in range(first, first + 20):
+        try:
+            ruleset = load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
+        except CompileError:
+            continue
+        tried += 1
+        watch = watched(ruleset, range(4))
+        assert watch.denied == [], f"seed {seed}"
+    assert tried > 15
+
+
+def test_the_watch_sees_what_a_ledger_lacks() -> None:
+    """A ledger of other rules is contradicted, so silence means something."""
+    ruleset = load("core+water")
+    book = ledger(ruleset)
+    less = [replace(entry, changes=(), moves=()) for entry in book.rules]
+    watch = Watch(ruleset, replace(book, rules=tuple(less)))
+    simulator = compile_ruleset(ruleset, backend="reference")
+    with watch.running():
+        simulator.step(random_start(ruleset, Choices.seeded(1), (4, 16, 16)).world(simulator), 4)
+    assert any("turns ice into water" in one for one in watch.denied)
+    assert any("moves water" in one for one in watch.denied)
