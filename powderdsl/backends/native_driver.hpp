@@ -11,7 +11,7 @@ struct Batch {
 };
 
 static Grid make_grid(int height, int width) {
-  return Grid{height, width, (width + 63) / 64, (width + CHUNK - 1) / CHUNK * CHUNK + 2 * HALO};
+  return Grid{height, width, (width + 63) / 64, (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO)};
 }
 static bool fixed_flag(const FixedPlane& f, const Grid& g, int y, int x) {
   switch (f.kind) {
@@ -37,7 +37,7 @@ static Context* new_context(const Grid& g) {
   c->nothing_row = aligned<V>(g.words);
   c->change = aligned<V>(2 * g.words);
   c->late = aligned<V>((MOVING + 1) * g.words);
-  c->zeros = aligned<float>(g.stride + CHUNK);
+  c->zeros = aligned<float>(g.stride + HALO + CHUNK);
   c->active = aligned<u64>((size_t)(ACTIVE + 1) * LANES * c->active_words());
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
@@ -89,7 +89,7 @@ static void put_back(Context* c) {
 static void own(Context& c, Field*& f) {
   if (f != c.calm && f->refs == 1) return;
   Field* copy = take_field(c);
-  if (!f->still) memcpy(copy->data, f->data, sizeof(float) * LANES * c.g.height * c.g.stride);
+  if (!f->still) memcpy(copy->data, f->data, field_size(c.g));
   memcpy(copy->live, f->live, LANES * c.g.height);
   copy->still = f->still;
   give(c, f);
@@ -109,7 +109,7 @@ static void reset_slots(Context& c) {
     Field* f = c.real[r.slot] = take_field(c);
     memset(f->live, 1, LANES * c.g.height);
     f->still = false;
-    std::fill(f->data, f->data + (size_t)LANES * c.g.height * c.g.stride, r.value);
+    std::fill(f->data, f->data + field_floats(c.g), r.value);
   }
 }
 struct Clocks {
@@ -263,7 +263,7 @@ API void* pd_copy(const void* batch) {
       memcpy(to->live, from->live, LANES * a->g.height);
       to->still = from->still;
       for (int r = 0; r < LANES * a->g.height; r++)
-        if (from->live[r]) memcpy(to->data + (size_t)r * a->g.stride, from->data + (size_t)r * a->g.stride, sizeof(float) * a->g.stride);
+        if (from->live[r]) copy_floats(a->g, to->data + (size_t)r * a->g.stride + HALO, from->data + (size_t)r * a->g.stride + HALO);
     }
   }
   return b;

@@ -133,7 +133,7 @@ struct Plane {
   bool zero;  // known to hold nothing
 };
 struct Field {
-  float* data;    // [LANES][height][stride], column 0 at HALO
+  float* data;    // HALO, then [LANES][height][stride]; between rows lie the halos of both
   uint8_t* live;  // [LANES][height]: rows that are not all zero; others are not to be read
   int refs;
   bool still;  // known to have no such row
@@ -211,14 +211,15 @@ template <class T> static void drop(Spare<T>& spare, T* t, size_t size, size_t m
 }
 constexpr size_t SPARE_BYTES = 1 << 28;  // at most this much waits, of each kind
 static size_t plane_size(const Grid& g) { return sizeof(V) * g.cells(); }
-static size_t field_size(const Grid& g) { return sizeof(float) * LANES * g.height * g.stride; }
+static size_t field_floats(const Grid& g) { return (size_t)LANES * g.height * g.stride + HALO; }
+static size_t field_size(const Grid& g) { return sizeof(float) * field_floats(g); }
 static Plane* new_plane(const Grid& g) {  // what it holds is not defined
   Plane* p = reuse(spare_planes, plane_size(g));
   return p ? p : new Plane{aligned<V>(g.cells()), 0, true};
 }
 static Field* new_field(const Grid& g) {
   Field* f = reuse(spare_fields, field_size(g) + g.height);
-  return f ? f : new Field{aligned<float>((size_t)LANES * g.height * g.stride + CHUNK), aligned<uint8_t>(LANES * g.height), 0, true};
+  return f ? f : new Field{aligned<float>(field_floats(g) + CHUNK), aligned<uint8_t>(LANES * g.height), 0, true};
 }
 static void drop(const Grid& g, Plane* p) { drop(spare_planes, p, plane_size(g), SPARE_BYTES / plane_size(g)); }
 static void drop(const Grid& g, Field* f) { drop(spare_fields, f, field_size(g) + g.height, SPARE_BYTES / field_size(g)); }
@@ -599,6 +600,9 @@ ALWAYS void finish_row(const Context& c, float* row) {
 ALWAYS float* row_of(const Context& c, const Field* f, int lane, int y) {
   return f->data + ((size_t)lane * c.g.height + y) * c.g.stride + HALO;
 }
+static void copy_floats(const Grid& g, float* to, const float* from) {  // a row and its halo
+  memcpy(to - REACH, from - REACH, sizeof(float) * (g.width + 2 * REACH));
+}
 // A row that choices will be laid over, or that stays as it is; whether it is live.
 ALWAYS bool lay_row(const Context& c, Field* to, int to_lane, const Field* from, int from_lane, int y, bool chosen) {
   const bool live = chosen || from->live[from_lane * c.g.height + y];
@@ -613,7 +617,7 @@ ALWAYS bool lay_row(const Context& c, Field* to, int to_lane, const Field* from,
 ALWAYS bool copy_row(const Context& c, Field* to, const Field* from, int lane, int y) {
   size_t at = lane * (size_t)c.g.height + y;
   to->live[at] = from->live[at];
-  if (from->live[at]) memcpy(to->data + at * c.g.stride, from->data + at * c.g.stride, sizeof(float) * c.g.stride);
+  if (from->live[at]) copy_floats(c.g, row_of(c, to, lane, y), row_of(c, from, lane, y));
   return from->live[at];
 }
 
