@@ -107,6 +107,11 @@ class CellFigures:
         """Seconds a world and step."""
         return _spread(seconds / self.world_steps for seconds in self.seconds)
 
+    @property
+    def processor_step_seconds(self) -> Spread:
+        """The processor's seconds a world and step, all threads together: what others do hardly changes them."""
+        return _spread(seconds / self.world_steps for seconds in self.processor_seconds)
+
 
 @dataclass(frozen=True)
 class Report:
@@ -171,6 +176,9 @@ def _cell_data(figures: CellFigures) -> dict[str, Any]:
         "first_step_seconds": ready.first_step_seconds,
         "peak_memory_bytes": ready.memory.growth,
         "peak_memory_how": ready.memory.how,
+        "peak_memory_bytes_per_cell": None
+        if ready.memory.growth is None
+        else ready.memory.growth / (cell.batch * cell.world_cells),
         "state_bytes_per_cell": ready.state_bytes / (cell.batch * cell.world_cells),
         "steps_per_call": ready.steps,
         "calls_per_round": ready.calls,
@@ -179,6 +187,7 @@ def _cell_data(figures: CellFigures) -> dict[str, Any]:
         "world_steps_per_second": asdict(figures.rate),
         "cell_updates_per_second": asdict(_scaled(figures.rate, cell.world_cells)),
         "microseconds_per_world_step": asdict(_scaled(seconds, 1e6)),
+        "processor_microseconds_per_world_step": asdict(_scaled(figures.processor_step_seconds, 1e6)),
         "nanoseconds_per_cell_step": asdict(_scaled(seconds, 1e9 / cell.world_cells)),
         "passes": [
             {"name": name, "microseconds_per_world_step": spent * 1e6, "share": share}

@@ -76,7 +76,7 @@ def _processor() -> str:
 
 
 def _compiler() -> str:
-    from powderdsl.backends.native_build import NoCompiler, find_compiler
+    from powderdsl.backends.native_compilers import NoCompiler, find_compiler
 
     try:
         return find_compiler().version

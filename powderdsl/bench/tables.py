@@ -66,7 +66,10 @@ def cell_table(cells: Sequence[CellFigures]) -> str:
         ("CPUs", lambda one: f"{one.processors:.2f}"),
         ("to first step", lambda one: f"{one.to_first_step:.2f} s"),
         ("memory", _memory),
-        ("state", lambda one: f"{one.ready.state_bytes / (one.cell.batch * one.cell.world_cells):.3g} B"),
+        (
+            "state",
+            lambda one: f"{one.ready.state_bytes / (one.cell.batch * one.cell.world_cells):.3g} B/cell",
+        ),
     ]
     return aligned([[name for name, _ in columns], *([show(one) for _, show in columns] for one in cells)])
 
@@ -81,7 +84,9 @@ def pass_table(cells: Sequence[CellFigures]) -> str:
     totals = [sum(spent for _, spent, _ in one) for one in shares]
     rows.append(["all passes", *(f"{number(total * 1e6)}     " for total in totals)])
     whole = [figures.world_step_seconds.median for figures in profiled]
-    rows.append(["whole step, measured", *(f"{number(seconds * 1e6)}     " for seconds in whole)])
+    rows.append(["whole step", *(f"{number(seconds * 1e6)}     " for seconds in whole)])
+    busy = [figures.processor_step_seconds.median for figures in profiled]
+    rows.append(["of that, processor time", *(f"{number(seconds * 1e6)}     " for seconds in busy)])
     return aligned(rows)
 
 
@@ -121,7 +126,11 @@ def number(value: float) -> str:
 
 def _memory(figures: CellFigures) -> str:
     growth = figures.ready.memory.growth
-    return "?" if growth is None else f"{growth / MEGABYTE:.1f} MiB"
+    if growth is None:
+        return "?"
+    return (
+        f"{growth / MEGABYTE:.1f} MiB, {growth / (figures.cell.batch * figures.cell.world_cells):.0f} B/cell"
+    )
 
 
 def _footnotes(report: Report) -> list[str]:
@@ -132,7 +141,7 @@ def _footnotes(report: Report) -> list[str]:
         f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
         "CPUs: processor time by time; less than the threads means that others were at work",
         "to first step: compiling, which all lines of a backend share, and the first step",
-        "state: bytes a cell of the worlds' tensors",
+        "state: the worlds' tensors, which are there before memory is measured",
     ]
     hows = dict.fromkeys(figures.ready.memory.how for figures in report.cells)
     return [*notes, *(f"memory: {how}" for how in hows)]

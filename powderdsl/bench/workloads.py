@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SHAPES, GUSTS = 26, 4
 """In 64×64 cells; larger worlds have more, so that a cell has as much to do."""
 PER_CELLS = 64 * 64
-REACH = 6
+REACH = 7
 """Of the shapes. They cover about a quarter of the world."""
 GUST_SIDE, GUST_SPEED = 10, 20.0
 NOISE = 3.0

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from powderdsl.backends.native_build import NoCompiler, find_compiler
+from powderdsl.backends.native_compilers import NoCompiler, find_compiler
 from powderdsl.bench.figures import Event, Report, Started, make_report, report_data
 from powderdsl.bench.machine import load_average, this_machine
 from powderdsl.bench.measure import measure_events
@@ -39,7 +39,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     "backends",
     type=click.Choice(list(BACKENDS)),
     multiple=True,
-    help="What runs the rules.  [default: torch, and native if there is a compiler]",
+    help="What runs the rules.  [default: torch, and native or cuda where they run]",
 )
 @click.option(
     "--batch",
@@ -157,9 +157,9 @@ def command(
 
 
 def _usual_backends(device: str) -> tuple[str, ...]:
-    """What runs here without asking: native code only on the CPU, and if it can be compiled."""
+    """What runs here without asking: torch, and the fastest code for the device, if it can be compiled."""
     if device != "cpu":
-        return ("torch",)
+        return ("torch", "cuda") if device.startswith("cuda") else ("torch",)
     try:
         find_compiler()
     except NoCompiler as error:
