@@ -28,7 +28,8 @@ MAX_LINES = 500
 _MODEL = ("diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
 _PROGRAMS = ("programs", "native_start", "auto_program")
-_SCREEN = (*_COMPILER, *_PROGRAMS, "draw", "observe", "simulator", "worlds", "media", "terminal")
+_STEPS = ("observe", "simulator", "provenance")
+_SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _EVERYTHING = (*_SCREEN, "ledgers", "pack_tests", "testing", "bench", "envs", "web", "experiments", "cli")
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -50,6 +51,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "draw": _MODEL,
     "observe": (*_COMPILER, "draw"),
     "simulator": (*_COMPILER, "programs", "observe"),
+    "provenance": (*_MODEL, "simulator"),
+    "tracing": (*_MODEL, "reference", "provenance", "simulator"),  # explains by what the oracle does
     "worlds": _MODEL,
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
     "media": _SCREEN[: _SCREEN.index("media")],
@@ -75,7 +78,7 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("backends.torch_*", *_PROGRAMS, "observe", "simulator", "testing", "envs", "experiments")
+_TORCH = ("backends.torch_*", *_PROGRAMS, *_STEPS, "testing", "envs", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),
