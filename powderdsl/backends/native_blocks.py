@@ -77,19 +77,29 @@ def _all_text(statement: str | Lanes) -> str:
 
 
 def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
-    """One loop over worlds. Fields that nothing else reads are written over by each world: they need one lane."""
+    """One loop over lanes, which are worlds. Fields that nothing else reads are written over by each: they need one lane.
+
+    Lanes that are strips read each other: there are as many rounds as sweeps, and a round makes one sweep of all lanes.
+    """
     written = {name for sweep in run for name in sweep.fields}
     used = sorted({name for sweep in run for name in _VARIABLE.findall(sweep.rows) if name.startswith("f")})
     places = " ".join(
-        f"const int l{name} = {'0' if name in written - seen_outside else 'l'};" for name in used
+        f"const int l{name} = {'l & strips' if name in written - seen_outside else 'l'};" for name in used
     )
     before = "\n".join(sweep.before for sweep in run)
+    several = len(run) > 1
     rows = "\n".join(
-        f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}" if sweep.by_row else f"{{\n{sweep.rows}\n}}"
-        for sweep in run
+        (f"if (!strips || part == {number}) " if several else "")
+        + (
+            f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}"
+            if sweep.by_row
+            else f"{{\n{sweep.rows}\n}}"
+        )
+        for number, sweep in enumerate(run)
     )
+    rounds = f"for (int part = 0; part <= ({len(run) - 1} & strips); part++) " if several else ""
     after = "\n".join(sweep.after for sweep in run)
-    loop = f"{before}\nfor (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
+    loop = f"{before}\n{rounds}for (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
     outputs = [output for sweep in run for output in sweep.outputs]
     declared = " ".join(f"{'Field' if name.startswith('f') else 'Plane'}* {name};" for name, _ in outputs)
     if any(sweep.asked is None for sweep in run):

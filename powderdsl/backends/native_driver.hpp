@@ -8,16 +8,27 @@ struct Batch {
   Grid g;
   int worlds;
   std::vector<Group> groups;
+  int lanes() const { return g.strips ? worlds * LANES : worlds; }  // what lies side by side, in all groups
+  // Where a lane's cells begin in arrays of worlds; `apart`: from one world to the next, `row`: from row to row.
+  int64_t at(int lane, int64_t apart, int64_t row) const {
+    return g.strips ? lane / LANES * apart + lane % LANES * g.height * row : lane * apart;
+  }
 };
 
-static Grid make_grid(int height, int width) {
-  return Grid{height, width, (width + 63) / 64, (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO)};
+constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES worlds is too large to be kept near
+// Strips waste no lanes where there are few worlds, and keep less at hand where worlds are large.
+static Grid make_grid(int worlds, int height, int width) {
+  const int words = (width + 63) / 64, stride = (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO);
+  const bool large = sizeof(V) * height * words > LARGE_PLANE;
+  const bool strips = height % LANES == 0 && (worlds < LANES || large);
+  return Grid{strips ? height / LANES : height, width, words, stride, strips};
 }
-static bool fixed_flag(const FixedPlane& f, const Grid& g, int y, int x) {
+static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int x) {
+  if (g.strips) y += lane * g.height;
   switch (f.kind) {
     case 0: return (y % f.a) >> f.b & 1;
     case 1: return (x % f.a) >> f.b & 1;
-    default: return y + f.a >= 0 && y + f.a < g.height && x + f.b >= 0 && x + f.b < g.width;
+    default: return y + f.a >= 0 && y + f.a < g.world_height() && x + f.b >= 0 && x + f.b < g.width;
   }
 }
 static Context* new_context(const Grid& g) {
@@ -25,13 +36,15 @@ static Context* new_context(const Grid& g) {
   c->g = g;
   int rest = g.width - 64 * (g.words - 1);
   c->valid_last = splat(rest == 64 ? ~0ull : (1ull << rest) - 1);
+  const int whole = g.world_height();
+  for (int y = -HALO; y < whole + HALO; y++) c->lines.push_back(((y % whole) + whole) % whole);
   for (int y = -HALO; y < g.height + HALO; y++) {
-    c->lines.push_back(((y % g.height) + g.height) % g.height);
-    c->wrapped.push_back(c->lines.back() * g.words);
+    if (!g.strips) c->wrapped.push_back(c->lines[y + HALO] * g.words);
+    else c->wrapped.push_back(y < 0 ? g.above(y) : y < g.height ? y * g.words : g.below(y));
   }
   for (int dx = -HALO; dx <= HALO; dx++) c->turn[dx + HALO] = ((dx % g.width) + g.width) % g.width;
-  c->nothing = new Plane{aligned<V>(g.cells()), 1, true};
-  c->everything = new Plane{aligned<V>(g.cells()), 1, false};
+  c->nothing = new Plane{aligned<V>(g.cells() + g.halos()), 1, true, 0, 0};
+  c->everything = new Plane{aligned<V>(g.cells() + g.halos()), 1, false, 0, 0};
   for (int i = 0; i < g.cells(); i++) c->everything->data[i] = c->valid(i % g.words);
   c->calm = new Field{nullptr, aligned<uint8_t>(LANES * g.height), 1, true};
   c->nothing_row = aligned<V>(g.words);
@@ -43,7 +56,7 @@ static Context* new_context(const Grid& g) {
     V* plane = aligned<V>(g.cells());
     for (int y = 0; y < g.height; y++)
       for (int x = 0; x < g.width; x++)
-        if (fixed_flag(f, g, y, x)) plane[y * g.words + x / 64] |= splat(1ull << (x % 64));
+        for (int l = 0; l < LANES; l++) plane[y * g.words + x / 64][l] |= (u64)fixed_flag(f, g, l, y, x) << (x % 64);
     c->fixed.push_back(plane);
   }
   return c;
@@ -70,7 +83,7 @@ static std::vector<Context*> contexts;
 static Context* borrow(const Grid& g) {
   std::lock_guard<std::mutex> hold(contexts_lock);
   for (size_t i = 0; i < contexts.size(); i++)
-    if (contexts[i]->g.height == g.height && contexts[i]->g.width == g.width) {
+    if (contexts[i]->g == g) {
       Context* c = contexts[i];
       contexts.erase(contexts.begin() + i);
       return c;
@@ -115,27 +128,30 @@ static void reset_slots(Context& c) {
 struct Clocks {
   const u64 *seed, *index, *step;
 };
-static void begin_step(Context& c, const Clocks& k, int first, long done) {
+static int world_of(const Context& c, int number, int lane) {  // unused lanes are the last world once more
+  return c.g.strips ? number : number * LANES + std::min(lane, c.lanes - 1);
+}
+static void begin_step(Context& c, const Clocks& k, int number, long done) {
+  const u32 strip = c.g.strips ? (u32)c.g.height * ((c.g.width + 31) / 32) * 32 : 0;  // hashes from one strip to the next
   for (int s = 0; s < STREAMS; s++)
     for (int l = 0; l < LANES; l++) {
-      int world = first + std::min(l, c.lanes - 1);
+      int world = world_of(c, number, l);
       u64 step = k.step[world] + done;
       u32 a = key(k.seed[world], k.index[world], step, STREAM_IDENT[s], 0x243F6A88u);
       u32 b = key(k.seed[world], k.index[world], step, STREAM_IDENT[s], 0x85A308D3u);
-      c.k0[s][2 * l] = c.k0[s][2 * l + 1] = a;
+      c.k0[s][2 * l] = c.k0[s][2 * l + 1] = a + l * strip * 0x9E3779B1u;  // as draw_plane multiplies
       c.k1[s][2 * l] = c.k1[s][2 * l + 1] = b;
     }
   for (int i = 0; i < STEP_PLANES; i++)
     for (int l = 0; l < LANES; l++) {
-      u64 step = k.step[first + std::min(l, c.lanes - 1)] + done;
+      u64 step = k.step[world_of(c, number, l)] + done;
       c.step_bits[i][l] = (step % STEP_TABLE[i].a) >> STEP_TABLE[i].b & 1 ? ~0ull : 0;
     }
 }
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
-  int first = number * LANES;
-  c.lanes = std::min(LANES, b.worlds - first);
+  c.lanes = std::min(LANES, b.lanes() - number * LANES);
   for (int l = 0; l < LANES; l++) {
-    int world = first + std::min(l, c.lanes - 1);
+    int world = world_of(c, number, l);
     for (int i = 0; i < PARAM_PLANES; i++) c.param_bits[i][l] = planes[(size_t)i * b.worlds + world] ? ~0ull : 0;
     for (int i = 0; i < PARAM_REALS; i++) c.param_real[i][l] = reals[(size_t)i * b.worlds + world];
   }
@@ -149,7 +165,7 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
   }
   for (int i = 0; i < REALS; i++) c.real[i] = group.real[i];
   for (long s = 0; s < steps; s++) {
-    begin_step(c, k, first, s);
+    begin_step(c, k, number, s);
     reset_slots(c);
     run_passes(c);
   }
@@ -213,7 +229,7 @@ template <class T> static void load_values(Batch& b, int slot, int bits, const T
       Plane* p = b.groups[n].slot[slot + i];
       memset(p->data, 0, sizeof(V) * g.cells());
       bool some = false;
-      for (int l = 0; l < std::min(LANES, b.worlds - (int)n * LANES); l++) {
+      for (int l = 0; l < std::min(LANES, b.lanes() - (int)n * LANES); l++) {
         const T* cell = data + ((size_t)n * LANES + l) * g.height * g.width;
         u64* out = (u64*)p->data;
         for (int y = 0; y < g.height; y++)
@@ -227,18 +243,26 @@ template <class T> static void load_values(Batch& b, int slot, int bits, const T
           }
       }
       p->zero = !some;
+      p->around = p->beyond = 0;
     }
 }
 
 #define API extern "C" __attribute__((visibility("default")))
-API void* pd_new(int worlds, int height, int width) {
-  Batch* b = new Batch{make_grid(height, width), worlds, std::vector<Group>((worlds + LANES - 1) / LANES)};
+static Batch* new_batch(int worlds, const Grid& g) {
+  Batch* b = new Batch{g, worlds, {}};
+  b->groups.resize((b->lanes() + LANES - 1) / LANES);
   for (Group& group : b->groups) {
-    for (int i = 0; i < SLOTS; i++) group.slot[i] = new_plane(b->g), group.slot[i]->refs = 1, group.slot[i]->zero = true;
+    for (int i = 0; i < SLOTS; i++) {
+      Plane* p = group.slot[i] = new_plane(g);
+      p->refs = 1;
+      p->zero = true;
+      p->around = p->beyond = 0;
+    }
     for (int i = 0; i < REALS; i++) group.real[i] = new_field(b->g), group.real[i]->refs = 1;
   }
   return b;
 }
+API void* pd_new(int worlds, int height, int width) { return new_batch(worlds, make_grid(worlds, height, width)); }
 API void pd_free(void* batch) {
   Batch* b = (Batch*)batch;
   for (Group& group : b->groups) {
@@ -249,7 +273,7 @@ API void pd_free(void* batch) {
 }
 API void* pd_copy(const void* batch) {
   const Batch* a = (const Batch*)batch;
-  Batch* b = (Batch*)pd_new(a->worlds, a->g.height, a->g.width);
+  Batch* b = new_batch(a->worlds, a->g);
   for (size_t n = 0; n < a->groups.size(); n++) {
     for (int i = 0; i < SLOTS; i++) {
       const Plane* from = a->groups[n].slot[i];
@@ -281,12 +305,13 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
     group.real[slot]->still = true;
     memset(group.real[slot]->live, 0, LANES * b.g.height);
   }
-  for (int world = 0; world < b.worlds; world++) {
-    Field* f = b.groups[world / LANES].real[slot];
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    Field* f = b.groups[lane / LANES].real[slot];
+    const float* cells = data + b.at(lane, world_stride, b.g.width);
     for (int y = 0; y < b.g.height; y++) {
-      int r = world % LANES * b.g.height + y;
+      int r = lane % LANES * b.g.height + y;
       float* row = f->data + (size_t)r * b.g.stride + HALO;
-      memcpy(row, data + world * world_stride + (int64_t)y * b.g.width, sizeof(float) * b.g.width);
+      memcpy(row, cells + (int64_t)y * b.g.width, sizeof(float) * b.g.width);
       f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
       if (f->live[r]) f->still = false;
       finish_row(*c, row);

@@ -87,5 +87,5 @@ def _busy(sweep: Sweep, node: Node, dy: int, wraps: bool) -> str:
     if dy == 0:
         return f"{name}->live[l{name} * height + y]"
     if wraps:
-        return f"{name}->live[l{name} * height + c.line(y + {dy})]"
-    return f"(y + {dy} >= 0 && y + {dy} < height && {name}->live[l{name} * height + y + {dy}])"
+        return f"{name}->live[c.line(l{name}, y + {dy})]"
+    return f"(c.has_line(l{name}, y + {dy}) && {name}->live[l{name} * height + y + {dy}])"

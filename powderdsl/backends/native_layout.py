@@ -23,6 +23,10 @@ class Layout:
     moving: int = 0
     """Planes that most movements carry along."""
     reach: int = 1
+    around: int = 0
+    """Rows away that planes are read at, at most, around the edges."""
+    beyond: int = 0
+    """The same with nothing outside."""
 
 
 def layout_of(program: Program) -> Layout:
@@ -54,6 +58,10 @@ def _place(node: Node, layout: Layout) -> None:
             number(layout.fixed, (2, attr[0], attr[1]))
         case "shift" | "swap" | "arrive" if node.type.name == "real":
             layout.reach = max(layout.reach, abs(attr[1]))
+        case "shift" if not attr[2]:
+            layout.beyond = max(layout.beyond, abs(attr[0]))
+        case "shift" | "swap" | "arrive":
+            layout.around = max(layout.around, abs(attr[0]))
 
 
 def number(table: dict, key: object) -> int:

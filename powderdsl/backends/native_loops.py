@@ -48,6 +48,8 @@ class Loop:
         self.lines: list[str] = []
         self.memo: dict[tuple[int, int], str] = {}
         self.used: set[str] = set()
+        self.edges: dict[tuple[str, str], int] = {}
+        """How many rows away planes are read, by the call that makes these ready and the plane."""
         self.counter = [0]
 
     def inner(self) -> Loop:
@@ -56,6 +58,7 @@ class Loop:
         nested.memo = dict(self.memo)
         nested.counter = self.counter
         nested.used = self.used
+        nested.edges = self.edges
         return nested
 
     def have(self, node: Node) -> bool:
@@ -80,12 +83,28 @@ class Loop:
         self.used.add(name)
         return name
 
-    def row(self, dy: int) -> str:
-        return "y * words" if dy == 0 else f"c.row(y + {dy})"
+    def row(self, plane: str, dy: int) -> str:
+        if dy == 0:
+            return "y * words"
+        self.reads(plane, dy)
+        return f"c.row(y + {dy})"
+
+    def reads(self, plane: str, dy: int, wraps: bool = True) -> None:
+        """Note that rows of a plane are read that may lie in another strip."""
+        if wraps:
+            self.layout.around = max(self.layout.around, abs(dy))
+        key = ("edges" if wraps else "bare_edges", plane)
+        if dy:
+            self.edges[key] = max(self.edges.get(key, 0), abs(dy))
+
+    def ready(self) -> str:
+        """Statements before the loop: rows of other strips that it reads."""
+        return " ".join(f"{call}(c, {plane}, {rows});" for (call, plane), rows in self.edges.items())
 
     def expression(self, node: Node, dy: int) -> str:
         if self.have(node):
-            return f"{self.plane(node)}->data[{self.row(dy)} + w]"
+            plane = self.plane(node)
+            return f"{plane}->data[{self.row(plane, dy)} + w]"
         args = node.args
         match node.op:
             case "const":
@@ -145,9 +164,10 @@ class Loop:
         plane = self.plane(source)
         if wraps:
             if not sx:
-                return f"{plane}->data[{self.row(dy + sy)} + w]"
-            return f"columns(c, {plane}->data + {self.row(dy + sy)}, w, {sx})"
+                return f"{plane}->data[{self.row(plane, dy + sy)} + w]"
+            return f"columns(c, {plane}->data + {self.row(plane, dy + sy)}, w, {sx})"
         assert dy == 0
+        self.reads(plane, sy, wraps=False)
         if not sx:
             return f"row_or_nothing(c, {plane}, y + {sy})[w]"
         return f"columns_zero(c, row_or_nothing(c, {plane}, y + {sy}), w, {sx})"

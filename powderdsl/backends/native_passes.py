@@ -45,7 +45,7 @@ class PassWriter(ValueWriter):
             current.update(step.writes)
         self.finish()
         body = self.block.text()
-        return f"// pass {self.number}\nOUTLINE void pass_{self.number}(Context& c) {{\nconst int words = c.g.words, height = c.g.height, width = c.g.width; (void)words; (void)height; (void)width;\n{body}\n}}"
+        return f"// pass {self.number}\nOUTLINE void pass_{self.number}(Context& c) {{\nconst int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0; (void)words; (void)height; (void)width; (void)strips;\n{body}\n}}"
 
     def borrow(self) -> None:
         """Slots that the pass both reads and writes: nobody else holds their planes while it runs."""
@@ -232,7 +232,7 @@ class PassWriter(ValueWriter):
         takes = " ".join(f"{name} = take(c); V a{name} = splat(0);" for name in names.values())
         ends = " ".join(f"{name}->zero = !any(a{name});" for name in names.values())
         self.block.statements.append(
-            f"{takes}\nfor (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) {{ const V valid = c.valid(w); (void)valid;\n"
+            f"{loop.ready()}\n{takes}\nfor (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) {{ const V valid = c.valid(w); (void)valid;\n"
             + "\n".join(lines) + f"\n}}\n{ends}"
         )  # fmt: skip
         text = self.block.text()

@@ -1,4 +1,5 @@
 // The library that generated code builds on. One group = LANES worlds side by side: lane l of every vector is world l.
+// Or, in strips: one world, cut into LANES strips of as many rows, one below the other; lane l is strip l.
 // A plane is one bit a cell: 64 columns in a word, a vector holds the same word of all worlds of the group.
 // Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
 #include <algorithm>
@@ -131,6 +132,7 @@ struct Plane {
   V* data;
   int refs;
   bool zero;  // known to hold nothing
+  int around, beyond;  // rows of the halos that are filled, above and below: of the torus, and with nothing outside
 };
 struct Field {
   float* data;    // HALO, then [LANES][height][stride]; between rows lie the halos of both
@@ -140,15 +142,23 @@ struct Field {
 };
 
 struct Grid {
-  int height, width, words, stride;
+  int height, width, words, stride;  // height of a lane
+  bool strips;
   int cells() const { return height * words; }
+  // Strips have halos: behind the rows of a plane lie those above and below on the torus, then the bare ones.
+  int above(int y) const { return (height - 1 - y) * words; }  // y < 0
+  int below(int y) const { return (AROUND_ROWS + y) * words; }  // y >= height
+  int halos() const { return strips ? 2 * (AROUND_ROWS + BEYOND_ROWS) * words : 0; }
+  int world_height() const { return strips ? height * LANES : height; }
+  bool operator==(const Grid& g) const { return height == g.height && width == g.width && strips == g.strips; }
 };
 
 // Everything one thread needs to run groups: buffers, row tables, keys.
 struct Context {
   Grid g;
   V valid_last;
-  std::vector<int> wrapped, lines;  // [height + 32]: word offset and number of row y - 16 on the torus
+  std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
+  std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus
   int turn[2 * HALO + 1];    // dx mod width, for rotations
   std::vector<Plane*> planes, all_planes;
   std::vector<Field*> fields, all_fields;
@@ -169,7 +179,13 @@ struct Context {
 
   V valid(int w) const { return w == g.words - 1 ? valid_last : splat(~0ull); }
   int row(int y) const { return wrapped[y + HALO]; }
-  int line(int y) const { return lines[y + HALO]; }
+  // Rows of a field: the row y of a lane, around the edges of the world; and whether there is such a row.
+  int line(int lane, int y) const {
+    return g.strips ? lines[lane * g.height + y + HALO] : lane * g.height + lines[y + HALO];
+  }
+  bool has_line(int lane, int y) const {
+    return g.strips ? (u32)(lane * g.height + y) < (u32)(LANES * g.height) : (u32)y < (u32)g.height;
+  }
   int active_words() const { return (g.height + 63) / 64; }
 };
 
@@ -210,12 +226,12 @@ template <class T> static void drop(Spare<T>& spare, T* t, size_t size, size_t m
   release(t);
 }
 constexpr size_t SPARE_BYTES = 1 << 28;  // at most this much waits, of each kind
-static size_t plane_size(const Grid& g) { return sizeof(V) * g.cells(); }
+static size_t plane_size(const Grid& g) { return sizeof(V) * (g.cells() + g.halos()); }
 static size_t field_floats(const Grid& g) { return (size_t)LANES * g.height * g.stride + HALO; }
 static size_t field_size(const Grid& g) { return sizeof(float) * field_floats(g); }
 static Plane* new_plane(const Grid& g) {  // what it holds is not defined
   Plane* p = reuse(spare_planes, plane_size(g));
-  return p ? p : new Plane{aligned<V>(g.cells()), 0, true};
+  return p ? p : new Plane{aligned<V>(g.cells() + g.halos()), 0, true, 0, 0};
 }
 static Field* new_field(const Grid& g) {
   Field* f = reuse(spare_fields, field_size(g) + g.height);
@@ -233,6 +249,7 @@ ALWAYS Plane* take(Context& c) {
     c.planes.pop_back();
   }
   p->refs = 1;
+  p->around = p->beyond = 0;
   return p;
 }
 ALWAYS Plane* keep(Plane* p) { p->refs++; return p; }
@@ -282,7 +299,43 @@ ALWAYS V columns_zero(const Context& c, const V* row, int w, int dx) {
   return dx > 0 ? row[0] >> dx : (row[0] << -dx) & c.valid_last;
 }
 ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
-  return y >= 0 && y < c.g.height ? p->data + y * c.g.words : c.nothing_row;
+  if (__builtin_expect(y >= 0 && y < c.g.height, 1)) return p->data + y * c.g.words;
+  if (!c.g.strips) return c.nothing_row;
+  return p->data + 2 * AROUND_ROWS * c.g.words + (y < 0 ? c.g.above(y) : c.g.below(y) + (BEYOND_ROWS - AROUND_ROWS) * c.g.words);
+}
+
+// Strips. What each lane sees `by` lanes on, around.
+ALWAYS V turned(V v, int by) {
+#if defined(__AVX512F__)
+  return (V)_mm512_permutexvar_epi64((__m512i)(V{0, 1, 2, 3, 4, 5, 6, 7} + splat(by)), (__m512i)v);  // by its low bits
+#else
+  V r;
+  for (int l = 0; l < LANES; l++) r[l] = v[(l + by) & (LANES - 1)];
+  return r;
+#endif
+}
+ALWAYS int strips_on(const Context& c, int y) {  // how many strips below its own the row y of a strip lies
+  return y >= 0 ? y / c.g.height : -((c.g.height - 1 - y) / c.g.height);
+}
+OUTLINE void fill_halo(const Context& c, Plane* p, int rows, bool around) {
+  const int words = c.g.words, height = c.g.height;
+  for (int i = 1; i <= rows; i++)
+    for (int y : {-i, height - 1 + i}) {
+      const int by = strips_on(c, y);
+      const V* from = p->data + (y - by * height) * words;
+      V* to = around ? p->data + c.row(y) : (V*)row_or_nothing(c, p, y);
+      V kept = splat(~0ull);
+      if (!around) for (int l = 0; l < LANES; l++) kept[l] = l + by >= 0 && l + by < LANES ? ~0ull : 0;
+      for (int w = 0; w < words; w++) to[w] = turned(from[w], by) & kept;
+    }
+  (around ? p->around : p->beyond) = rows;
+}
+// To be called before rows of other strips are read, up to `rows` away.
+ALWAYS void edges(const Context& c, Plane* p, int rows) {
+  if (c.g.strips && p->around < rows) fill_halo(c, p, rows, true);
+}
+ALWAYS void bare_edges(const Context& c, Plane* p, int rows) {
+  if (c.g.strips && p->beyond < rows) fill_halo(c, p, rows, false);
 }
 
 // Draws: bit j of 32 columns is one hash; two make a word.
@@ -337,8 +390,9 @@ OUTLINE float draw_cell(const Context& c, int stream, int lane, int y, int x, in
 }
 
 // Movements on whole planes.
-OUTLINE Plane* shifted(Context& c, const Plane* p, int dy, int dx) {
+OUTLINE Plane* shifted(Context& c, Plane* p, int dy, int dx) {
   if (p->zero) return keep(c.nothing);
+  edges(c, p, abs(dy));
   Plane* r = take(c);
   V some = splat(0);
   for (int y = 0; y < c.g.height; y++) {
@@ -355,6 +409,7 @@ OUTLINE Plane* shifted(Context& c, const Plane* p, int dy, int dx) {
 // Movers (and `targets`, the same seen from the other side) exchange what they hold.
 OUTLINE Plane* swap_plane(Context& c, Plane* content, const Plane* movers, const Plane* targets, Plane* rest, int dy, int dx) {
   if (content->zero && rest->zero) return keep(rest);
+  edges(c, content, abs(dy));
   Plane* r = take(c);
   V some = splat(0);
   for (int y = 0; y < c.g.height; y++) {
@@ -372,6 +427,7 @@ OUTLINE Plane* swap_plane(Context& c, Plane* content, const Plane* movers, const
 }
 OUTLINE Plane* arrive_plane(Context& c, Plane* content, const Plane* targets, Plane* rest, int dy, int dx) {
   if (targets->zero || (content->zero && rest->zero)) return keep(rest);
+  edges(c, content, abs(dy));
   Plane* r = take(c);
   V some = splat(0);
   for (int y = 0; y < c.g.height; y++) {
@@ -389,7 +445,10 @@ OUTLINE Plane* arrive_plane(Context& c, Plane* content, const Plane* targets, Pl
 }
 // A plane of this owner alone, to be written over.
 static void own(Context& c, Plane*& p) {
-  if (p != c.nothing && p != c.everything && p->refs == 1) return;
+  if (p != c.nothing && p != c.everything && p->refs == 1) {
+    p->around = p->beyond = 0;
+    return;
+  }
   Plane* copy = take(c);
   if (p->zero) memset(copy->data, 0, sizeof(V) * c.g.cells());
   else memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
@@ -399,6 +458,18 @@ static void own(Context& c, Plane*& p) {
 }
 // Planes that move together, in place.
 enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
+// A row that exchanges with one of other strips, `by` of them on.
+OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int by, int dx) {
+  const int words = c.g.words;
+  V* seen = c.change + words;
+  for (int k = 0; k < n; k++) {
+    V *here = data[k] + here_row * words, *there = data[k] + there_row * words;
+    for (int w = 0; w < words; w++) seen[w] = turned(there[w], by);
+    for (int w = 0; w < words; w++) c.change[w] = (here[w] ^ (dx ? columns(c, seen, w, dx) : seen[w])) & m[w];
+    for (int w = 0; w < words; w++) here[w] ^= c.change[w];
+    for (int w = 0; w < words; w++) there[w] ^= turned(dx ? columns(c, c.change, w, -dx) : c.change[w], -by);
+  }
+}
 // Movers exchange what they hold with their targets. No cell is both.
 OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
   if (movers->zero) return;
@@ -413,6 +484,11 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
   const int words = c.g.words, by = c.turn[dx + HALO], back = c.g.width - by;
   for (int y = 0; y < c.g.height; y++) {
     const V* m = movers->data + y * words;
+    if (c.g.strips && (u32)(y + dy) >= (u32)c.g.height) {
+      const int by = strips_on(c, y + dy);
+      if (any_word(m, words)) swap_strips(c, m, data, n, y, y + dy - by * c.g.height, by, dx);
+      continue;
+    }
     if (words > 1 && dx) {
       if (!any_word(m, words)) continue;
       for (int k = 0; k < n; k++) {
@@ -487,10 +563,11 @@ template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* mov
   const int edge = dy > 0 ? height - 1 : 0;
   const V* m = movers->data + edge * words;
   if (!dy || !any_word(m, words)) return;
-  for (int w = 0; w < words; w++) targets[w] = dx ? columns(c, m, w, -dx) : m[w];
+  const int lanes_back = c.g.strips ? -dy : 0;
+  for (int w = 0; w < words; w++) targets[w] = turned(dx ? columns(c, m, w, -dx) : m[w], lanes_back);
   for (int k = 0; k < n; k++) {
-    V* there = data[k] + c.row(edge + dy);
-    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | c.late[k * words + w];
+    V* there = data[k] + (dy > 0 ? 0 : height - 1) * words;
+    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c.late[k * words + w], lanes_back);
   }
 }
 OUTLINE Plane* cleared(Context& c, Plane* old, const Plane* where) {  // old and not where
@@ -511,14 +588,17 @@ OUTLINE Plane* joined(Context& c, Plane* old, Plane* where) {  // old or where
 }
 
 // Real rows.
+ALWAYS const float* real_line(const Context& c, const Field* f, int line) {
+  return f->live[line] ? f->data + (size_t)line * c.g.stride + HALO : c.zeros + HALO;
+}
 ALWAYS const float* real_row(const Context& c, const Field* f, int lane, int y) {
-  return f->live[lane * c.g.height + y] ? f->data + ((size_t)lane * c.g.height + y) * c.g.stride + HALO : c.zeros + HALO;
+  return real_line(c, f, lane * c.g.height + y);
 }
 ALWAYS const float* real_row_wrapped(const Context& c, const Field* f, int lane, int y) {
-  return real_row(c, f, lane, c.line(y));
+  return real_line(c, f, c.line(lane, y));
 }
 ALWAYS const float* real_row_or_nothing(const Context& c, const Field* f, int lane, int y) {
-  return y >= 0 && y < c.g.height ? real_row(c, f, lane, y) : c.zeros + HALO;
+  return c.has_line(lane, y) ? real_line(c, f, lane * c.g.height + y) : c.zeros + HALO;
 }
 ALWAYS F inside_columns(F value, int x, int dx, int width) {
   if (__builtin_expect(x + dx >= 0 && x + dx + CHUNK <= width, 1)) return value;

@@ -8,7 +8,7 @@ from powderdsl.backends.native_layout import Layout, layout_of, literal
 from powderdsl.backends.native_passes import PassWriter
 from powderdsl.ir.ops import Program
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Part of every cache key: raise it when generated code changes meaning."""
 
 SNAP = 2.0**-20
@@ -42,6 +42,8 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"#define MOVING {layout.moving}",
         f"#define ACTIVE {layout.active}",
         f"#define REACH {layout.reach}",
+        f"#define AROUND_ROWS {layout.around}",
+        f"#define BEYOND_ROWS {layout.beyond}",
         f"#define SNAP {literal(SNAP)}",
         f"#define PASSES {len(program.passes)}",
     ])  # fmt: skip

@@ -202,7 +202,7 @@ class ValueWriter:
         ends = " ".join(f"{name}->zero = !any(a{name});" for name, _ in outputs)
         body = "\n".join(loop.lines)
         self.block.statements.append(
-            f"{declared}{nothing}{{\n{takes}\n"
+            f"{declared}{nothing}{{\n{loop.ready()}\n{takes}\n"
             "for (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) { const V valid = c.valid(w); (void)valid;\n"
             f"{body}\n{stores}\n}}\n{ends}\n}}"
         )

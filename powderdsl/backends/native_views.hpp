@@ -73,13 +73,13 @@ template <class Put> ALWAYS void each_run(const Grid& g, Put put) {
     for (int w = 0; w < g.words; w++) put(y * g.words + w, y * g.width + 64 * w, std::min(64, g.width - 64 * w));
 }
 template <class T> static void store_values(const Batch& b, int slot, int bits, int negative, T* data, int64_t apart) {
-  for (int world = 0; world < b.worlds; world++) {
-    Planes p = planes_of(b.groups[world / LANES], slot, bits, negative);
-    T* out = data + world * apart;
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    Planes p = planes_of(b.groups[lane / LANES], slot, bits, negative);
+    T* out = data + b.at(lane, apart, b.g.width);
     each_run(b.g, [&](int i, int cell, int count) {
-      if (count == 64) return cells_of(p, world % LANES, i, out + cell);
+      if (count == 64) return cells_of(p, lane % LANES, i, out + cell);
       T part[64];
-      cells_of(p, world % LANES, i, part);
+      cells_of(p, lane % LANES, i, part);
       memcpy(out + cell, part, sizeof(T) * count);
     });
   }
@@ -94,12 +94,12 @@ API void pd_store(const void* batch, int slot, int bits, int negative, int item,
 // Pictures: `palette` has red, green and blue of each number in its three low bytes.
 API void pd_rgb(const void* batch, int slot, int bits, const u32* palette, uint8_t* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
-  for (int world = 0; world < b.worlds; world++) {
-    Planes p = planes_of(b.groups[world / LANES], slot, bits, 0);
-    uint8_t* out = data + world * apart;
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    Planes p = planes_of(b.groups[lane / LANES], slot, bits, 0);
+    uint8_t* out = data + b.at(lane, apart, 3 * b.g.width);
     each_run(b.g, [&](int i, int cell, int count) {
       uint8_t ids[64];
-      cells_of(p, world % LANES, i, ids);
+      cells_of(p, lane % LANES, i, ids);
       uint8_t* pixel = out + 3 * (size_t)cell;
       for (int x = 0; x < count - 1; x++, pixel += 3) memcpy(pixel, palette + ids[x], 4);  // the next mends the fourth
       memcpy(pixel, palette + ids[count - 1], 3);
@@ -125,9 +125,9 @@ static void store_real(const Grid& g, const Field* f, int lane, float* out) {
     else memset(out, 0, sizeof(float) * g.width);
   }
 }
-static void store_channel(const Batch& b, const Channel& c, const float* tables, int world, float* out) {
-  const Group& group = b.groups[world / LANES];
-  int lane = world % LANES;
+static void store_channel(const Batch& b, const Channel& c, const float* tables, int number, float* out) {
+  const Group& group = b.groups[number / LANES];
+  int lane = number % LANES;
   if (c.kind == 0) {
     memset(out, 0, sizeof(float) * b.g.height * b.g.width);
   } else if (c.kind == 4) {
@@ -159,23 +159,23 @@ static void store_channel(const Batch& b, const Channel& c, const float* tables,
 }
 API void pd_channels(const void* batch, int count, const Channel* channels, const float* tables, float* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
-  for (int world = 0; world < b.worlds; world++)
+  for (int lane = 0; lane < b.lanes(); lane++)
     for (int i = 0; i < count; i++)
-      store_channel(b, channels[i], tables, world, data + world * apart + (int64_t)i * b.g.height * b.g.width);
+      store_channel(b, channels[i], tables, lane, data + b.at(lane, apart, b.g.width) + (int64_t)i * b.g.world_height() * b.g.width);
 }
 API void pd_store_real(const void* batch, int slot, float* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
-  for (int world = 0; world < b.worlds; world++)
-    store_real(b.g, b.groups[world / LANES].real[slot], world % LANES, data + world * apart);
+  for (int lane = 0; lane < b.lanes(); lane++)
+    store_real(b.g, b.groups[lane / LANES].real[slot], lane % LANES, data + b.at(lane, apart, b.g.width));
 }
 
 // Planes as they are: [plane][row][word] of each world.
 API void pd_planes(const void* batch, int count, const int* slots, u64* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
-  for (int world = 0; world < b.worlds; world++)
+  for (int lane = 0; lane < b.lanes(); lane++)
     for (int k = 0; k < count; k++) {
-      const Plane* p = b.groups[world / LANES].slot[slots[k]];
-      u64* out = data + world * apart + (int64_t)k * b.g.cells();
-      for (int i = 0; i < b.g.cells(); i++) out[i] = word_of(p, world % LANES, i);
+      const Plane* p = b.groups[lane / LANES].slot[slots[k]];
+      u64* out = data + b.at(lane, apart, b.g.words) + (int64_t)k * b.g.world_height() * b.g.words;
+      for (int i = 0; i < b.g.cells(); i++) out[i] = word_of(p, lane % LANES, i);
     }
 }
