@@ -19,8 +19,8 @@ constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES w
 // Strips waste no lanes where there are few worlds, and keep less at hand where worlds are large.
 static Grid make_grid(int worlds, int height, int width) {
   const int words = (width + 63) / 64, stride = (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO);
-  const bool large = sizeof(V) * height * words > LARGE_PLANE;
-  const bool strips = height % LANES == 0 && (worlds < LANES || large);
+  const bool large = sizeof(V) * height * words >= LARGE_PLANE;
+  const bool strips = height % LANES == 0 && (worlds <= LANES / 2 || large);
   return Grid{strips ? height / LANES : height, width, words, stride, strips};
 }
 static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int x) {

@@ -1,0 +1,58 @@
+"""Native code cuts a large world, or one of few, into strips that lie side by side: the worlds are the same."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from powderdsl.backends.native_build import Building, NoCompiler, building, find_compiler
+from powderdsl.compiler import load
+from powderdsl.diagnostics import CompileError
+from powderdsl.simulator import compile as compile_ruleset
+from powderdsl.testing.cases import load_text, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.testing.compare import assert_same
+from powderdsl.testing.rulemaker import random_ruleset_text
+
+STRIPS = [(1, 8, 8), (2, 16, 70), (1, 64, 64), (3, 128, 65), (1, 256, 256), (9, 520, 20), (2, 8, 1)]
+"""Strips of one row, of more rows than one list of active rows has, of words that are not full; large and many."""
+
+FIRST, LAST = (int(seed) for seed in os.environ.get("POWDERDSL_SEEDS", "60..66").split(".."))
+
+
+@pytest.fixture(autouse=True)
+def needs_compiler() -> None:
+    try:
+        find_compiler()
+    except NoCompiler:
+        pytest.skip("no C++ compiler on this machine")
+
+
+@pytest.mark.parametrize("name", ["powderworld", "forest_fire", "langtons_ant", "margolus", "wireworld"])
+def test_shipped_rulesets_in_strips(name: str) -> None:
+    """With edges that wrap and with nothing outside, parities of rows, reals, draws, and parameters by world."""
+    ruleset = load(name)
+    simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("dense", "native")]
+    for seed, shape in enumerate(STRIPS):
+        assert_same(
+            ruleset, random_start(ruleset, Choices.seeded(seed), shape), steps=3, simulators=simulators
+        )
+
+
+def test_random_rulesets_in_strips(tmp_path: Path) -> None:
+    compared = 0
+    for seed in range(FIRST, LAST):
+        try:
+            ruleset = load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
+        except CompileError:
+            continue
+        with building(Building("-O0", tmp_path)):
+            simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("dense", "native")]
+        choices = Choices.seeded(seed)
+        for height in (8, 16):
+            shape = (choices.whole(1, 4), height, choices.pick((1, 5, 33, 64, 70, 130)))
+            assert_same(ruleset, random_start(ruleset, choices, shape), steps=3, simulators=simulators)
+        compared += 1
+    assert compared >= (LAST - FIRST) / 2
