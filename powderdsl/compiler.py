@@ -27,6 +27,7 @@ BACKENDS = {
     "dense": "torch, always one tensor element a cell: the readable one",
     "planes": "torch, always packed bit planes",
     "native": "generated C++ for the CPU; compiled once, then kept",
+    "cuda": "generated CUDA C++ for a GPU: whole worlds on the chip, all steps of a call in one launch",
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext, suppress
 from functools import cache
 from typing import Protocol
 
@@ -117,10 +118,10 @@ class TorchProgram:
 
 
 class CompiledProgram:
-    """Native code for whole steps; torch where draws are given or passes chosen."""
+    """Native code or kernels for whole steps; torch where draws are given or passes chosen."""
 
-    def __init__(self, native: Runnable, rest: Callable[[], Runnable]):
-        self._native, self._rest = native, rest
+    def __init__(self, native: Runnable, rest: Callable[[], Runnable], running: str = "native"):
+        self._native, self._rest, self.running = native, rest, running
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
@@ -152,6 +153,11 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         return torch_program().planes()
     if backend == "native":
         return CompiledProgram(_native(ruleset, lowered, device, threads), torch_program)
+    if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
+        from powderdsl.backends.torch_cuda import cuda_program
+
+        with suppress(CompileError) if backend == "auto" else nullcontext():
+            return CompiledProgram(cuda_program(lowered(), device), torch_program, "cuda")
     if backend == "auto" and device.type == "cpu":
         from powderdsl.auto_program import AutoProgram
         from powderdsl.native_start import native_program, ready_program

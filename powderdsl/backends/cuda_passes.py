@@ -148,7 +148,7 @@ class PassSchedule:
 
     def stages(self, guards: list[Node]) -> tuple[tuple[Statement, ...], ...]:
         """The masks of a moment: first what is cheap, and the rest only where that leaves something."""
-        stages = []
+        stages: list[tuple[Statement, ...]] = []
         split = {id(g): self.split(g) for g in guards if not self.have(g)}
         if any(self.needs(g) for g in guards if not self.have(g)):
             if all(cheap for cheap, _ in split.values()):
@@ -165,20 +165,16 @@ class PassSchedule:
             self.ensure([need for g in guards if not self.have(g) for need in self.needs(g)])
         before, self.statements = self.statements, []
         loop = WordLoop(self.planes, self.layout)
-        outputs, some = [], []
-        for guard in guards:
-            if self.have(guard):
-                some.append(loop.value(guard))
-                continue
-            name = f"g{len(outputs)}"
-            self.mask(guard, *self.split(guard), loop, name)
-            outputs.append((self.fresh("p"), name))
-            self.planes[id(guard)] = outputs[-1][0]
-            some.append(name)
-        loop_phase = WordPhase(
-            tuple(loop.lines), tuple(outputs), dict(loop.reads), f"({' | '.join(some)}) != 0"
-        )
-        stages.append((*before, loop_phase))
+        open_guards = [g for g in guards if not self.have(g)]
+        names = {id(g): f"g{number}" for number, g in enumerate(open_guards)}
+        for guard in open_guards:
+            self.mask(guard, *self.split(guard), loop, names[id(guard)])
+            loop.memo[id(guard), 0, 0] = names[id(guard)]
+        some = [names.get(id(g)) or loop.value(g) for g in guards]
+        # Only now do they stand in planes: in this loop other words cannot be read yet.
+        outputs = tuple((self.new(g), names[id(g)]) for g in open_guards)
+        question = WordPhase(tuple(loop.lines), outputs, dict(loop.reads), f"({' | '.join(some)}) != 0")
+        stages.append((*before, question))
         return tuple(stages)
 
     def split(self, guard: Node) -> tuple[list[Node], list[Node]]:

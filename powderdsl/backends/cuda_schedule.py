@@ -150,7 +150,7 @@ def make_plan(
                 if number is None:
                     number = _free(name, plan, busy, pool)
                     if old := plan.follows.get(name, ""):  # it must still be there to be copied
-                        plan.last[old] = max(plan.last[old], plan.ends[name])
+                        plan.last[old] = max(plan.last.get(old, -1), plan.ends[name])
                 pool.size[name[0]] = max(pool.size[name[0]], number + 1)
                 plan.buffer[name] = number
                 busy[name[0], number] = name
@@ -195,7 +195,7 @@ def _taken_over(
     if old in phase.reads and isinstance(phase, CellPhase) and old[0] == "p":
         return None  # one lane writes what the others read
     number = plan.buffer[old]
-    return number if plan.last[old] <= position and busy.get((old[0], number)) == old else None
+    return number if plan.last.get(old, -1) <= position and busy.get((old[0], number)) == old else None
 
 
 def _free(name: str, plan: Plan, busy: Mapping[tuple[str, int], str], pool: Pool) -> int:

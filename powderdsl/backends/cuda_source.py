@@ -62,7 +62,9 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
         plan = make_plan(
             schedule.statements, schedule.homes, schedule.changed, schedule.prefers, pool, rounds <= HELD
         )
-        body = Emitter(plan, pending).text(schedule.statements)
+        emitter = Emitter(plan, pending)
+        body = emitter.text(schedule.statements)
+        pending = emitter.pending
         passes.append(f"OUTLINE void pass_{number}(const Block c) {{\n(void)c;\n{body}\n}}")
     uniform = (
         4
