@@ -20,6 +20,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+# Not later: a fork in the middle of an import, which a thread makes, leaves the child waiting for it for ever.
+from filelock import FileLock, Timeout
+
 LIBRARY, ABOUT = "program.so", "about.json"
 BUILDING, GONE = ".build-", ".gone-"
 
@@ -157,8 +160,6 @@ def turn(folder: Path, key: str) -> Iterator[None]:
 
     The kernel lets go of the lock of a process that dies. Where there are no locks, nobody waits.
     """
-    from filelock import FileLock, Timeout
-
     lock = FileLock(folder / f"{key}.lock")
     try:
         lock.acquire(timeout=PATIENCE)

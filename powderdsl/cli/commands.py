@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "test": ("test_command", "Run the tests that stand in packs."),
     "fuzz": ("fuzz_command", "Compare all backends on random rules and worlds."),
     "bench": ("bench_command", "Measure how fast rules run, on each backend, batch and size."),
+    "cache": ("cache_command", "List or remove compiled code that is kept on this machine."),
     "new": ("new_command", "Write a first pack: an element, a rule and a test."),
     "render": ("render_command", "Draw a world as a picture, without running it."),
     "explain": ("explain_command", "Say what a diagnostic code means, and how to mend it."),
