@@ -272,13 +272,13 @@ def watched(ruleset: Ruleset, seeds: range, shape: tuple[int, int, int] | None =
     return watch
 
 
-@pytest.mark.parametrize("first", range(0, 60, 20))
+@pytest.mark.parametrize("first", range(0, 60, 10))
 def test_random_rules_keep_to_their_ledger(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "powderdsl.ledgers.changes.BUDGET", 50_000
     )  # some are found too large: that is sound too
     tried = 0
-    for seed in range(first, first + 20):
+    for seed in range(first, first + 10):
         try:
             ruleset = load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
         except CompileError:
@@ -286,7 +286,7 @@ def test_random_rules_keep_to_their_ledger(first: int, monkeypatch: pytest.Monke
         tried += 1
         watch = watched(ruleset, range(4))
         assert watch.denied == [], f"seed {seed}"
-    assert tried > 15
+    assert tried > 6
 
 
 def test_contradictions_are_seen() -> None:
