@@ -72,7 +72,9 @@ def record_step(world: World, number: int = 0) -> Step:
     table = {slot.name: slot for slot in slots(ruleset)}
     state = {name: value.cpu().numpy() for name, value in one.state.items()}
     clock = reference.Clock(*(part.cpu().numpy() for part in (one.seed, one.index, one.step)))
-    params = {p.name: np.full(1, float(p.default), _PARAMS[p.kind.name]) for p in ruleset.params}
+    params: dict[str, Array] = {
+        p.name: np.full(1, float(p.default), _PARAMS[p.kind.name]) for p in ruleset.params
+    }
     step = Step(ruleset, _widened(state, table))
     rules = _rules_by_moment(ruleset)
     lets: dict[str, tuple[Let, reference.Context]] = {}
