@@ -63,7 +63,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "envs": _SCREEN,
     "web": _SCREEN,
     "experiments": (*_SCREEN, "envs", "web"),
-    "cli": (*_EVERYTHING, "user_cache"),
+    "cli": (*_EVERYTHING[:-1], "user_cache"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }
