@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from powderdsl.backends.cuda_cells import Cells, quiet_reads
-from powderdsl.backends.cuda_schedule import CellOutput, CellPhase, Finish, Guarded, Statement, WordPhase
+from powderdsl.backends.cuda_schedule import (
+    CellOutput,
+    CellPhase,
+    Finish,
+    Guarded,
+    Statement,
+    WordPhase,
+    flat,
+)
 from powderdsl.backends.cuda_words import REALS, WordLoop, Words, joined
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_loops import DRAWS, is_uniform
@@ -294,9 +304,32 @@ class PassSchedule:
             else:
                 pairs.append((self.planes[id(node)], self.layout.planes[slot]))
         self.statements.append(Finish(tuple(pairs)))
+        self.statements = without_unread(self.statements)
+
+    @property
+    def open_homes(self) -> frozenset[tuple[str, int]]:
+        """Buffers of all slots that the pass leaves changed."""
+        tables = {"p": self.layout.planes, "f": self.layout.reals}
+        kinds = [("f" if node.type == REAL else "p", slot) for slot, node in self.pass_.outputs]
+        return frozenset((kind, tables[kind][slot]) for kind, slot in kinds)
 
     @property
     def changed(self) -> frozenset[str]:
         """Variables of slots that the pass leaves changed."""
         outputs = {slot for slot, _ in self.pass_.outputs}
         return frozenset(name for slot, name in self.slots.items() if slot in outputs)
+
+
+def without_unread(statements: list[Statement]) -> list[Statement]:
+    """The same without fields that were stored for neighbours who then did not ask."""
+    read = {name for s in flat(statements) if isinstance(s, WordPhase | CellPhase) for name in s.reads}
+    read |= {name for s in flat(statements) if isinstance(s, Finish) for name, _ in s.pairs}
+    read |= {old for s in flat(statements) if isinstance(s, Guarded) for _, old in s.keeps}
+    read |= {o.keeps for s in flat(statements) if isinstance(s, CellPhase) for o in s.outputs}
+
+    def kept(statement: Statement) -> Statement:
+        if not isinstance(statement, CellPhase):
+            return statement
+        return replace(statement, outputs=tuple(o for o in statement.outputs if o.name in read))
+
+    return [s for s in map(kept, statements) if not isinstance(s, CellPhase) or s.outputs]
