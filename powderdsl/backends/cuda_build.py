@@ -9,13 +9,15 @@ from __future__ import annotations
 import ctypes
 import glob
 import hashlib
-import os
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
+from powderdsl.backends import native_cache
 from powderdsl.backends.cuda_source import KernelSource
 from powderdsl.user_cache import cache_folder
 
@@ -114,18 +116,27 @@ def machine_code(text: str, architecture: str, version: str) -> bytes:
     options = (f"--gpu-architecture={architecture}", *OPTIONS)
     key = "\0".join([text, f"{major.value}.{minor.value}", *options])
     try:
-        folder = cache_folder("cuda")
+        folder = cache_folder("native")
     except OSError as error:
         raise NoCuda(f"no cache folder: {error}") from None
-    target = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.cubin"
-    if target.is_file():
-        os.utime(target)
-        return target.read_bytes()
+    name = hashlib.sha256(key.encode()).hexdigest()[:32]
+    found = native_cache.find(folder, name)
+    if found is not None:
+        return found.read_bytes()
+    began = time.perf_counter()
     code = compile_text(compiler, text, options)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
-        unit = Path(scratch) / "kernel.cubin"
-        unit.write_bytes(code)
-        os.replace(unit, target)
+    with suppress(OSError), tempfile.TemporaryDirectory(dir=folder, prefix=native_cache.BUILDING) as scratch:
+        built = Path(scratch) / "built"
+        built.mkdir()
+        (built / native_cache.LIBRARY).write_bytes(code)
+        about = {
+            "ruleset": "",
+            "backend": "cuda",
+            "compiler": f"NVRTC {major.value}.{minor.value}",
+            "created": time.time(),
+            "seconds": round(time.perf_counter() - began, 2),
+        }
+        native_cache.add(folder, name, built, about)
     return code
 
 

@@ -1,6 +1,6 @@
-"""Compiled libraries on disk: a folder for each, which appears whole or not at all, and is checked before it is loaded.
+"""Compiled code on disk, libraries and kernels for GPUs: a folder for each, which appears whole or not at all, and is checked before it is loaded.
 
-<key>/program.so, about.json    a library, and what is known of it
+<key>/program, about.json    a library, and what is known of it
 <key>.json                      what a program needs besides its library (`native_code`)
 <key>.lock                      held by who is compiling
 .build-…, .gone-…               on the way in, on the way out
@@ -23,7 +23,7 @@ from typing import Any
 # Not later: a fork in the middle of an import, which a thread makes, leaves the child waiting for it for ever.
 from filelock import FileLock, Timeout
 
-LIBRARY, ABOUT = "program.so", "about.json"
+LIBRARY, ABOUT = "program", "about.json"
 BUILDING, GONE = ".build-", ".gone-"
 
 LIMIT = 512 << 20

@@ -253,7 +253,7 @@ def test_auto_changes_over_to_the_same_worlds_and_remembers(
         expected = oracle.step(start_of(oracle), steps + 5)
         for world in worlds:
             assert find_difference(expected.state, world.state) is None
-        assert len(list(tmp_path.glob("*/program.so"))) == 1
+        assert len(list(tmp_path.glob("*/program"))) == 1
 
         # Other values of parameters, other tests and comments: nothing is compiled, it starts natively.
         text = RULES.replace("30%", "99%").replace("passes:", "# a comment\npasses:")
@@ -268,7 +268,7 @@ def test_auto_changes_over_to_the_same_worlds_and_remembers(
 def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
     with building(Building("-O0", tmp_path)):
         powderdsl.compile(rules, backend="native")
-        (library,) = tmp_path.glob("*/program.so")
+        (library,) = tmp_path.glob("*/program")
         (start,) = tmp_path.glob("*.json")
         whole = start.read_bytes()
         for damage in (whole[:40], b"[]", b'{"library": 3}', whole.replace(b'"layout"', b'"lay"'), b"\xff"):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.backends import native_cache
+from powderdsl.backends import cuda_build, native_cache
 from powderdsl.backends.native_build import Building, build, building, run_guarded
 from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for
 from tests.cli.commands import environment_with
@@ -57,10 +57,10 @@ def test_a_library_is_found_with_what_is_known_of_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda place: (place / "program.so").write_bytes(b"cod"),
-        lambda place: (place / "program.so").write_bytes(b"code" + bytes(1)),
-        lambda place: (place / "program.so").write_bytes(b"COde"),
-        lambda place: (place / "program.so").unlink(),
+        lambda place: (place / "program").write_bytes(b"cod"),
+        lambda place: (place / "program").write_bytes(b"code" + bytes(1)),
+        lambda place: (place / "program").write_bytes(b"COde"),
+        lambda place: (place / "program").unlink(),
         lambda place: (place / "about.json").unlink(),
         lambda place: (place / "about.json").write_text("{"),
         lambda place: (place / "about.json").write_text("[]"),
@@ -341,3 +341,26 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refused = powderdsl("cache", "list")
     assert refused.exit_code == 2
     assert "others may write" in refused.stderr
+
+
+def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Nvrtc:
+        """What asks for the version; compiling is made up as well, so no GPU is needed."""
+
+        def nvrtcVersion(self, major: object, minor: object) -> None:
+            pass
+
+    compiled = []
+
+    def compile_text(compiler: object, text: str, options: object) -> bytes:
+        compiled.append(text)
+        return text.encode()
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cuda_build, "nvrtc", lambda version: Nvrtc())
+    monkeypatch.setattr(cuda_build, "compile_text", compile_text)
+    wanted = [("a", "sm_90"), ("a", "sm_80"), ("a", "sm_90"), ("b", "sm_90")]
+    assert [cuda_build.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
+    assert compiled == ["a", "a", "b"]
+    found = native_cache.entries(tmp_path / "powderdsl" / "native")
+    assert [one.about.backend for one in found] == ["cuda"] * 3
