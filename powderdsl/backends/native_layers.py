@@ -23,7 +23,9 @@ def choices(node: Node, have: Callable[[Node], bool]) -> list[Node]:
         node = node.args[2]
     if len(chain) < FEWEST:
         return []
-    for choice in chain:  # a choice may build on the one below it, which the row still holds, not on those before
+    for (
+        choice
+    ) in chain:  # a choice may build on the one below it, which the row still holds, not on those before
         seen = {id(choice.args[2])}
         stack = [choice.args[1]]
         while stack:
