@@ -18,7 +18,7 @@ from powderdsl.backends.cuda_words import REALS, WordLoop, Words, joined
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_loops import DRAWS, is_uniform
 from powderdsl.backends.native_sweeps import conjuncts, leading, quiet, stored_parts, sweep_needs, unchanged
-from powderdsl.ir.ops import REAL, Node, PassGraph, Step, walk
+from powderdsl.ir.ops import REAL, Node, PassGraph, Step, nodes_of, walk
 
 
 class PassSchedule:
@@ -50,6 +50,10 @@ class PassSchedule:
         self.leaders = {
             id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))
         }
+        for node in nodes_of(pass_):
+            if node.op == "input":
+                real = node.type == REAL
+                (self.fields if real else self.planes)[id(node)] = self.slot(str(node.attr), real)
         current: dict[str, Node] = {}
         for step in pass_.moments:
             self.moment(step, current)
@@ -70,14 +74,6 @@ class PassSchedule:
 
     def have(self, node: Node) -> bool:
         return id(node) in self.planes or id(node) in self.fields
-
-    def inputs(self, nodes: list[Node]) -> None:
-        """Slots that the nodes read."""
-        for node in nodes:
-            for inner in walk(node):
-                if inner.op == "input" and not self.have(inner):
-                    name = self.slot(str(inner.attr), inner.type == REAL)
-                    (self.fields if inner.type == REAL else self.planes)[id(inner)] = name
 
     def slot(self, slot: str, real: bool) -> str:
         if slot not in self.slots:
@@ -100,7 +96,6 @@ class PassSchedule:
         if not writes:
             return
         nodes = [node for _, node in writes]
-        self.inputs([*guards, *nodes])
         olds = {id(node): self.old(slot, current.get(slot)) for slot, node in writes}
         if not guards or always:
             for node in nodes:
@@ -139,12 +134,7 @@ class PassSchedule:
             return
         self.ensure([need for node in asked for need in self.needs(node)])
         others = [n for n in self.all_comparisons if not self.have(n) and n not in asked]
-        ready = []
-        for node in others:
-            if all(need.op == "input" for need in self.needs(node)):
-                self.inputs([node])
-                ready.append(node)
-        self.ensure([*asked, *(n for n in ready if not self.needs(n))])
+        self.ensure([*asked, *(n for n in others if not self.needs(n))])
 
     def old(self, slot: str, node: Node | None) -> str:
         """The plane that holds a slot's value before the moment; "" if nothing holds."""
@@ -223,7 +213,6 @@ class PassSchedule:
 
     def ensure(self, nodes: list[Node]) -> None:
         """Store nodes, and before them everything they need."""
-        self.inputs(nodes)
         wanted = [
             node
             for node in dict.fromkeys(nodes)
