@@ -142,7 +142,7 @@ def _parts_of(write: Write) -> tuple[Part, ...]:
 
 
 def _misses(step: Step, cell: Cell, slots: Sequence[str], every_rule: bool) -> list[Miss]:
-    """Rules that did not happen where they would have written the cell; those of one line once, unless all are asked."""
+    """Rules that did not happen where they would have written the cell; those of one line once a place, unless all are asked."""
     found: dict[Any, Miss] = {}
     for scene in step.scenes:
         for rule in scene.rules:
@@ -155,7 +155,7 @@ def _misses(step: Step, cell: Cell, slots: Sequence[str], every_rule: bool) -> l
             for place in places:
                 if scene.happened(rule.rule, place) or not (every_rule or _nearly(rule.rule, scene, place)):
                     continue
-                key = (rule.number, place) if every_rule else (rule.span, rule.pass_name)
+                key = (rule.number if every_rule else (rule.span, rule.pass_name), place)
                 if key not in found:
                     policy = scene.moment.policy
                     found[key] = Miss(rule, place, _condition(rule.rule, scene, place), policy)

@@ -31,10 +31,10 @@ def test_the_text_names_the_rule_the_source_and_what_it_read():
 def test_a_near_miss_has_the_caret_under_the_part_that_failed():
     result = powderdsl("trace", RULES, *FAST, "--at", "2,1", "--step", 40, "--of", "element")
     lines = result.stdout.splitlines()
-    first = next(number for number, line in enumerate(lines) if line == "almost, but for `below.density < 4`")
+    first = next(number for number, line in enumerate(lines) if line == "almost, but for `below.density < 3`")
     source, carets = lines[first + 3], lines[first + 4]
     assert source[carets.index("^") : carets.rindex("^") + 1] == "d > below.density"
-    assert "below.density is 5 (wall at 3,1)" in carets
+    assert "below.density is 4 (sand at 2,1)" in carets
 
 
 def test_json_has_a_stable_form():
