@@ -45,6 +45,22 @@ def shipped_rules() -> list[str]:
     return sorted(path.stem for path in shipped("rules").glob("*.yaml"))
 
 
+def shipped_tests() -> list[str]:
+    """What of that stands by itself: rulesets, and packs that need no other and belong to no ruleset."""
+    reporter = Reporter()
+    found = [
+        decl
+        for path in sorted(shipped("rules").glob("*.yaml"))
+        if (source := read_source(path, reporter)) and (decl := read_file(source, reporter))
+    ]
+    inside = {scalar.text for decl in found if isinstance(decl, RulesetDecl) for scalar in decl.packs}
+    return [
+        decl.name.text
+        for decl in found
+        if isinstance(decl, RulesetDecl) or not (decl.needs or decl.name.text in inside)
+    ]
+
+
 def load(*names: str | Path, params: Mapping[str, Any] | None = None) -> Ruleset:
     """Read rule files into a checked model.
 

@@ -17,7 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "check": ("check_command", "Find the mistakes in rule files, all at once."),
     "compile": ("compile_command", "Print what a stage of the compiler makes of rules."),
     "show": ("show_command", "List elements, reactions, passes and parameters."),
-    "test": ("test_command", "Run the tests that stand in packs."),
+    "test": ("test_command", "Run the tests of packs, and hold their invariants against the rules."),
     "trace": ("trace_command", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
     "fuzz": ("fuzz_command", "Compare all backends on random rules and worlds."),
     "bench": ("bench_command", "Measure how fast rules run, on each backend, batch and size."),
