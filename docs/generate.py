@@ -53,6 +53,7 @@ SHAPES = {
     "lines": "expressions",
     "line": "an expression",
     "block": "a block",
+    "statements": "invariants",
     "any": "see below",
 }
 """Shapes of `schema.Key`, as readers see them."""

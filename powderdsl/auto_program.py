@@ -101,7 +101,7 @@ class AutoProgram:
             found.append("native: it was compiled before")
         elif native is not None and build is not None:
             found.append(
-                f"torch for {steps['torch']} steps while native was compiled ({build.seconds:.0f} s), "
+                f"torch for {steps['torch']} steps while native was made ready ({build.seconds:.0f} s), "
                 f"then native for {steps['native']}"
             )
         elif self._problem:
@@ -109,7 +109,7 @@ class AutoProgram:
             found.append(f"native code is faster: {CURE}")
         elif build is not None and not build.lost:
             found.append(
-                f"torch for {steps['torch']} steps; native is being compiled ({build.seconds:.0f} s)"
+                f"torch for {steps['torch']} steps; native is being made ready ({build.seconds:.0f} s)"
             )
         else:
             found.append(f"torch: native is compiled from {WORTH:g} s of work, or by --backend native")
@@ -149,7 +149,7 @@ class AutoProgram:
         cells = job.state["element"].numel()
         if self._pace is None or self._pace[0] != cells:
             return min(left, 1)
-        return max(1, min(left, int(SLICE / max(self._pace[1], 1e-9))))
+        return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
 
     def _account(self, job: Job, count: int, left: int, seconds: float) -> None:
         """Take note of steps made on torch, and begin to compile if that has become worth it."""

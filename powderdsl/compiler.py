@@ -27,6 +27,7 @@ BACKENDS = {
     "dense": "torch, always one tensor element a cell: the readable one",
     "planes": "torch, always packed bit planes",
     "native": "generated C++ for the CPU; compiled once, then kept",
+    "cuda": "generated CUDA C++ for a GPU: whole worlds on the chip, all steps of a call in one launch",
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""
@@ -42,6 +43,22 @@ def shipped(folder: str) -> Path:
 def shipped_rules() -> list[str]:
     """Names of the packs and rulesets that come with powderdsl."""
     return sorted(path.stem for path in shipped("rules").glob("*.yaml"))
+
+
+def shipped_tests() -> list[str]:
+    """What of that stands by itself: rulesets, and packs that need no other and belong to no ruleset."""
+    reporter = Reporter()
+    found = [
+        decl
+        for path in sorted(shipped("rules").glob("*.yaml"))
+        if (source := read_source(path, reporter)) and (decl := read_file(source, reporter))
+    ]
+    inside = {scalar.text for decl in found if isinstance(decl, RulesetDecl) for scalar in decl.packs}
+    return [
+        decl.name.text
+        for decl in found
+        if isinstance(decl, RulesetDecl) or not (decl.needs or decl.name.text in inside)
+    ]
 
 
 def load(*names: str | Path, params: Mapping[str, Any] | None = None) -> Ruleset:

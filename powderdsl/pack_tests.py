@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -46,43 +46,100 @@ class ExampleResult:
         return not self.problem
 
 
-def run_examples(ruleset: Ruleset, backend: str = "reference", device: str = "cpu") -> list[ExampleResult]:
+def run_examples(
+    ruleset: Ruleset,
+    backend: str = "planes",
+    device: str = "cpu",
+    *,
+    sim: Simulator | None = None,
+    seen: Callable[[World], None] | None = None,
+) -> list[ExampleResult]:
     """Run every test of a ruleset's packs, in the order of the files.
 
     A test runs with its own seed, or with each of SEEDS. It passes if the last world looks as `expect` says
-    and every condition under `always` holds in every cell after every step.
+    and every condition under `always` holds in every cell after every step. Tests of one size run as one batch.
+
+    Args:
+        sim: what runs them, instead of a new simulator of this ruleset.
+        seen: called with the worlds of each batch at its end.
     """
-    sim = compile(ruleset, backend=backend, device=device)
-    return [_run(example, sim) for example in ruleset.tests]
+    sim = sim or compile(ruleset, backend=backend, device=device)
+    sizes: dict[tuple[int, int], list[int]] = {}
+    for number, example in enumerate(ruleset.tests):
+        sizes.setdefault((len(example.given), len(example.given[0])), []).append(number)
+    results: dict[int, ExampleResult] = {}
+    for numbers in sizes.values():
+        batch = [_Running.of(ruleset.tests[number], sim) for number in numbers]
+        found = _run(batch, sim, seen)
+        results |= dict(zip(numbers, found, strict=True))
+    return [results[number] for number in range(len(ruleset.tests))]
 
 
-def _run(example: Example, sim: Simulator) -> ExampleResult:
-    legend = dict(example.legend)
-    ids = {char: _id(sim.ruleset, name) for char, name in legend.items()}
-    given = np.array([[ids[char] for char in row] for row in example.given], dtype=np.uint8)
-    seeds = SEEDS if example.seed is None else (example.seed,)
-    world = sim.world(np.repeat(given[None], len(seeds), axis=0), seed=list(seeds))
-    # Conditions that hold always are looked at after each step; otherwise only the end counts.
-    stride = 1 if example.always else max(example.steps, 1)
-    for step in range(stride, example.steps + 1, stride):
-        world = sim.step(world, steps=stride)
-        for condition in example.always:
+@dataclass(frozen=True)
+class _Running:
+    """A test with what its characters mean, and the seeds it runs with."""
+
+    example: Example
+    ids: Mapping[str, int]
+    seeds: tuple[int, ...]
+
+    @classmethod
+    def of(cls, example: Example, sim: Simulator) -> _Running:
+        ids = {char: _id(sim.ruleset, name) for char, name in dict(example.legend).items()}
+        return cls(example, ids, SEEDS if example.seed is None else (example.seed,))
+
+    def stops(self) -> set[int]:
+        """The steps after which it is looked at: conditions that hold always want every one."""
+        steps = self.example.steps
+        return set(range(1, steps + 1)) if self.example.always else {steps} if steps else set()
+
+    def look(self, world: World, step: int) -> ExampleResult | None:
+        """What is wrong after a step; `world` holds this test's worlds alone."""
+        example, sim = self.example, world.sim
+        for condition in example.always if step else ():
             holds = reference.evaluate(condition, _context(world))
             if not holds.all():
                 index, row, column = (int(part[0]) for part in np.nonzero(~holds))
                 words = one_line(condition.span) if condition.span else "a condition"
                 problem = f"`{words}` does not hold at row {row}, column {column}"
-                return _failure(example, seeds, index, step, world, ids, problem)
-    wanted = _wanted(example, ids)
-    if wanted is not None:
+                return _failure(example, self.seeds, index, step, world, self.ids, problem)
+        wanted = _wanted(example, self.ids)
+        if wanted is None or step < example.steps:
+            return None
         differs = (to_numpy(world.ids) != wanted) & (wanted >= 0)
-        if differs.any():
-            index, row, column = (int(part[0]) for part in np.nonzero(differs))
-            found = _name(sim.ruleset, int(world.ids[index, row, column]))
-            asked = _name(sim.ruleset, int(wanted[row, column]))
-            problem = f"row {row}, column {column} is `{found}`, not `{asked}`"
-            return _failure(example, seeds, index, example.steps, world, ids, problem)
-    return ExampleResult(example, seeds)
+        if not differs.any():
+            return None
+        index, row, column = (int(part[0]) for part in np.nonzero(differs))
+        found = _name(sim.ruleset, int(world.ids[index, row, column]))
+        asked = _name(sim.ruleset, int(wanted[row, column]))
+        problem = f"row {row}, column {column} is `{found}`, not `{asked}`"
+        return _failure(example, self.seeds, index, step, world, self.ids, problem)
+
+
+def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | None) -> list[ExampleResult]:
+    """Tests of one size, all at once: each has a slice of the batch."""
+    grids = [
+        np.array([[one.ids[char] for char in row] for row in one.example.given], dtype=np.uint8)
+        for one in batch
+    ]
+    copies = [np.repeat(ids[None], len(one.seeds), axis=0) for ids, one in zip(grids, batch, strict=True)]
+    world = sim.world(np.concatenate(copies), seed=[seed for one in batch for seed in one.seeds])
+    ends = np.cumsum([len(one.seeds) for one in batch])
+    results: dict[int, ExampleResult] = {}
+    now = 0
+    for stop in sorted({0}.union(*(one.stops() for one in batch))):
+        world = sim.step(world, steps=stop - now)
+        now = stop
+        for number, one in enumerate(batch):
+            if number in results or not (stop in one.stops() or one.example.steps == stop):
+                continue
+            own = world.select(slice(int(ends[number]) - len(one.seeds), int(ends[number])))
+            problem = one.look(own, stop)
+            if problem is not None:
+                results[number] = problem
+    if seen is not None:
+        seen(world)
+    return [results.get(number, ExampleResult(one.example, one.seeds)) for number, one in enumerate(batch)]
 
 
 def _failure(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext, suppress
 from functools import cache
 from typing import Protocol
 
@@ -76,20 +77,18 @@ def find_device(name: str | torch.device) -> torch.device:
 
 
 PLANES_FROM = 1 << 16
-"""Cells of a batch from which packed words beat one tensor element a cell (measured on CPU: 16 worlds of 64 × 64)."""
+"""Cells of a batch from which packed words beat one tensor element a cell on a device. On the CPU they always do."""
 
 
 class TorchProgram:
-    """Torch in its two forms, which give the same worlds: cells for little work, packed planes for more."""
+    """Torch in its two forms, which give the same worlds: cells for little work on a device, else packed planes."""
 
     running = "torch"
 
     def __init__(self, program: Program, device: torch.device):
-        from powderdsl.backends.torch_dense import DenseProgram
-
         self.program = program
         self.device = device
-        self._cells: Runnable = DenseProgram(program, device)
+        self._cells: Runnable | None = None
         self._planes: Runnable | None = None
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
@@ -101,26 +100,35 @@ class TorchProgram:
         return profile_of(self._fit_for(job), job)
 
     def _fit_for(self, job: Job) -> Runnable:
-        big = job.state["element"].numel() >= PLANES_FROM
-        return self.planes() if big else self._cells
+        if self.device.type == "cpu" or job.state["element"].numel() >= PLANES_FROM:
+            return self.planes()
+        if self._cells is None:
+            from powderdsl.backends.torch_dense import DenseProgram
+
+            self._cells = DenseProgram(self.program, self.device)
+        return self._cells
 
     def planes(self) -> Runnable:
         """The program on packed words, made when first needed; passes that planes cannot carry run on cells."""
+        from powderdsl.backends.torch_arrays import ArrayProgram
         from powderdsl.backends.torch_mixed import packed_program
         from powderdsl.backends.torch_planes import PlanesProgram
 
+        def packed(cells: Program, planes: Program) -> Runnable:
+            if self.device.type == "cpu":
+                return ArrayProgram(cells, planes)
+            return PlanesProgram(cells, planes, self.device)
+
         if self._planes is None:
-            self._planes = packed_program(
-                self.program, self.device, lambda cells, planes: PlanesProgram(cells, planes, self.device)
-            )
+            self._planes = packed_program(self.program, self.device, packed)
         return self._planes
 
 
 class CompiledProgram:
-    """Native code for whole steps; torch where draws are given or passes chosen."""
+    """Native code or kernels for whole steps; torch where draws are given or passes chosen."""
 
-    def __init__(self, native: Runnable, rest: Callable[[], Runnable]):
-        self._native, self._rest = native, rest
+    def __init__(self, native: Runnable, rest: Callable[[], Runnable], running: str = "native"):
+        self._native, self._rest, self.running = native, rest, running
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
@@ -152,6 +160,11 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         return torch_program().planes()
     if backend == "native":
         return CompiledProgram(_native(ruleset, lowered, device, threads), torch_program)
+    if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
+        from powderdsl.backends.torch_cuda import cuda_program
+
+        with suppress(CompileError) if backend == "auto" else nullcontext():
+            return CompiledProgram(cuda_program(lowered(), device), torch_program, "cuda")
     if backend == "auto" and device.type == "cpu":
         from powderdsl.auto_program import AutoProgram
         from powderdsl.native_start import native_program, ready_program

@@ -277,10 +277,8 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
     """The state after one simultaneous sub-step. `at.lets` gains the moment's lets."""
     for let in moment.lets:
         at.lets[let.name] = evaluate(let.value, at)
-    masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None}
+    masks = masks_of(moment, at)
     claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
-    if moment.policy != "prove":
-        _settle_claims(moment.policy, claims, masks)
     writes = [(rule, masks[id(rule)]) for rule in moment.rules if isinstance(rule, Assign)]
     effects = [(effect, masks[id(rule)]) for rule in claims for effect in rule.effects]
     values = {id(write): evaluate(write.value, at) for write, _ in (*writes, *effects)}
@@ -315,6 +313,15 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
                 np.isin(state["element"], sorted(slot.of)), state[name], _default(slot, state[name])
             )
     return state
+
+
+def masks_of(moment: Moment, at: Context) -> dict[int, Array]:
+    """Where each rule of a moment happens, bool [B, H, W] by `id`. `at.lets` has the moment's lets."""
+    masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None}
+    if moment.policy != "prove":
+        claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
+        _settle_claims(moment.policy, claims, masks)
+    return masks
 
 
 def _default(slot: Slot, like: Array) -> Array:
@@ -403,7 +410,11 @@ def settle(state: State, table: Mapping[str, Slot]) -> State:
     return settled
 
 
-def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
+Seen = Callable[[Pass, Moment, Context, State], None]
+"""Called after a moment with what it read, its lets among it, and what it left."""
+
+
+def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | None = None) -> State:
     """The state after one pass."""
     scratch = {
         f.name: Slot(f.name, f.kind, f.default, False, True, None, "", 2 if f.kind.name == "vec2" else 1)
@@ -415,7 +426,10 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
     at.lets = {}
     everything = {**table, **scratch}
     for moment in pass_.moments:
-        at.state = run_moment(moment, at, everything)
+        after = run_moment(moment, at, everything)
+        if seen is not None:
+            seen(pass_, moment, at, after)
+        at.state = after
     return settle({name: value for name, value in at.state.items() if name in table}, table)
 
 
@@ -435,6 +449,7 @@ def step(
     passes: frozenset[str] | None = None,
     draws: Mapping[str, Array] | None = None,
     lap: Callable[[str], None] | None = None,
+    seen: Seen | None = None,
 ) -> State:
     """One step of every world.
 
@@ -445,6 +460,7 @@ def step(
         passes: names of the passes to run; all of them by default.
         draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
         lap: called with the name of each pass when it is done.
+        seen: called after each moment; it changes nothing and keeps copies of contexts, which go on changing.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
     wide = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
@@ -458,7 +474,7 @@ def step(
     at = Context(ruleset, working, params, dict(draws or {}), clock)
     for pass_ in ruleset.passes:
         if passes is None or pass_.name in passes:
-            at.state = run_pass(pass_, at, table)
+            at.state = run_pass(pass_, at, table, seen)
             if lap is not None:
                 lap(pass_.name)
     return {name: value.astype(table[name].dtype) for name, value in at.state.items()}

@@ -30,14 +30,14 @@ DEVICE void load(const Block& c, const Worlds& a) {
     const u32* from = a.planes + (size_t)world_of(a, l) * SLOTS * WORDS + at;
     for (int s = 0; s < SLOTS; s++) P(s)[i] = from[(size_t)s * WORDS];
   }
-  for (int s = 0; s < REALS; s++)
+  for (int s = 0; s < FIELDS; s++)  // what is no slot's begins as nothing: where a field lives must always be right
     FOR_BUSY_WORDS(i, [](int) { return true; }) {
       PLACE(i);
       const float* from = a.reals + ((size_t)world_of(a, l) * REALS + s) * HEIGHT * WIDTH;
       u32 lives = 0;
       LANES {
         CELL;
-        const float v = from[y * WIDTH + x];
+        const float v = s < REALS ? from[y * WIDTH + x] : 0.0f;
         if (inside) F(s)[cell] = v;
         BALLOT(lives, inside && v != 0);
       }

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from powderdsl.backends.cuda_cells import Cells, quiet_reads
-from powderdsl.backends.cuda_schedule import CellOutput, CellPhase, Finish, Guarded, Statement, WordPhase
+from powderdsl.backends.cuda_schedule import (
+    CellOutput,
+    CellPhase,
+    Finish,
+    Guarded,
+    Statement,
+    WordPhase,
+    flat,
+)
 from powderdsl.backends.cuda_words import REALS, WordLoop, Words, joined
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_loops import DRAWS, is_uniform
 from powderdsl.backends.native_sweeps import conjuncts, leading, quiet, stored_parts, sweep_needs, unchanged
-from powderdsl.ir.ops import REAL, Node, PassGraph, Step, walk
+from powderdsl.ir.ops import REAL, Node, PassGraph, Step, nodes_of, walk
 
 
 class PassSchedule:
@@ -40,6 +50,10 @@ class PassSchedule:
         self.leaders = {
             id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))
         }
+        for node in nodes_of(pass_):
+            if node.op == "input":
+                real = node.type == REAL
+                (self.fields if real else self.planes)[id(node)] = self.slot(str(node.attr), real)
         current: dict[str, Node] = {}
         for step in pass_.moments:
             self.moment(step, current)
@@ -60,14 +74,6 @@ class PassSchedule:
 
     def have(self, node: Node) -> bool:
         return id(node) in self.planes or id(node) in self.fields
-
-    def inputs(self, nodes: list[Node]) -> None:
-        """Slots that the nodes read."""
-        for node in nodes:
-            for inner in walk(node):
-                if inner.op == "input" and not self.have(inner):
-                    name = self.slot(str(inner.attr), inner.type == REAL)
-                    (self.fields if inner.type == REAL else self.planes)[id(inner)] = name
 
     def slot(self, slot: str, real: bool) -> str:
         if slot not in self.slots:
@@ -90,7 +96,6 @@ class PassSchedule:
         if not writes:
             return
         nodes = [node for _, node in writes]
-        self.inputs([*guards, *nodes])
         olds = {id(node): self.old(slot, current.get(slot)) for slot, node in writes}
         if not guards or always:
             for node in nodes:
@@ -129,12 +134,7 @@ class PassSchedule:
             return
         self.ensure([need for node in asked for need in self.needs(node)])
         others = [n for n in self.all_comparisons if not self.have(n) and n not in asked]
-        ready = []
-        for node in others:
-            if all(need.op == "input" for need in self.needs(node)):
-                self.inputs([node])
-                ready.append(node)
-        self.ensure([*asked, *(n for n in ready if not self.needs(n))])
+        self.ensure([*asked, *(n for n in others if not self.needs(n))])
 
     def old(self, slot: str, node: Node | None) -> str:
         """The plane that holds a slot's value before the moment; "" if nothing holds."""
@@ -148,7 +148,7 @@ class PassSchedule:
 
     def stages(self, guards: list[Node]) -> tuple[tuple[Statement, ...], ...]:
         """The masks of a moment: first what is cheap, and the rest only where that leaves something."""
-        stages = []
+        stages: list[tuple[Statement, ...]] = []
         split = {id(g): self.split(g) for g in guards if not self.have(g)}
         if any(self.needs(g) for g in guards if not self.have(g)):
             if all(cheap for cheap, _ in split.values()):
@@ -165,20 +165,16 @@ class PassSchedule:
             self.ensure([need for g in guards if not self.have(g) for need in self.needs(g)])
         before, self.statements = self.statements, []
         loop = WordLoop(self.planes, self.layout)
-        outputs, some = [], []
-        for guard in guards:
-            if self.have(guard):
-                some.append(loop.value(guard))
-                continue
-            name = f"g{len(outputs)}"
-            self.mask(guard, *self.split(guard), loop, name)
-            outputs.append((self.fresh("p"), name))
-            self.planes[id(guard)] = outputs[-1][0]
-            some.append(name)
-        loop_phase = WordPhase(
-            tuple(loop.lines), tuple(outputs), dict(loop.reads), f"({' | '.join(some)}) != 0"
-        )
-        stages.append((*before, loop_phase))
+        open_guards = [g for g in guards if not self.have(g)]
+        names = {id(g): f"g{number}" for number, g in enumerate(open_guards)}
+        for guard in open_guards:
+            self.mask(guard, *self.split(guard), loop, names[id(guard)])
+            loop.memo[id(guard), 0, 0] = names[id(guard)]
+        some = [names.get(id(g)) or loop.value(g) for g in guards]
+        # Only now do they stand in planes: in this loop other words cannot be read yet.
+        outputs = tuple((self.new(g), names[id(g)]) for g in open_guards)
+        question = WordPhase(tuple(loop.lines), outputs, dict(loop.reads), f"({' | '.join(some)}) != 0")
+        stages.append((*before, question))
         return tuple(stages)
 
     def split(self, guard: Node) -> tuple[list[Node], list[Node]]:
@@ -217,7 +213,6 @@ class PassSchedule:
 
     def ensure(self, nodes: list[Node]) -> None:
         """Store nodes, and before them everything they need."""
-        self.inputs(nodes)
         wanted = [
             node
             for node in dict.fromkeys(nodes)
@@ -298,9 +293,32 @@ class PassSchedule:
             else:
                 pairs.append((self.planes[id(node)], self.layout.planes[slot]))
         self.statements.append(Finish(tuple(pairs)))
+        self.statements = without_unread(self.statements)
+
+    @property
+    def open_homes(self) -> frozenset[tuple[str, int]]:
+        """Buffers of all slots that the pass leaves changed."""
+        tables = {"p": self.layout.planes, "f": self.layout.reals}
+        kinds = [("f" if node.type == REAL else "p", slot) for slot, node in self.pass_.outputs]
+        return frozenset((kind, tables[kind][slot]) for kind, slot in kinds)
 
     @property
     def changed(self) -> frozenset[str]:
         """Variables of slots that the pass leaves changed."""
         outputs = {slot for slot, _ in self.pass_.outputs}
         return frozenset(name for slot, name in self.slots.items() if slot in outputs)
+
+
+def without_unread(statements: list[Statement]) -> list[Statement]:
+    """The same without fields that were stored for neighbours who then did not ask."""
+    read = {name for s in flat(statements) if isinstance(s, WordPhase | CellPhase) for name in s.reads}
+    read |= {name for s in flat(statements) if isinstance(s, Finish) for name, _ in s.pairs}
+    read |= {old for s in flat(statements) if isinstance(s, Guarded) for _, old in s.keeps}
+    read |= {o.keeps for s in flat(statements) if isinstance(s, CellPhase) for o in s.outputs}
+
+    def kept(statement: Statement) -> Statement:
+        if not isinstance(statement, CellPhase):
+            return statement
+        return replace(statement, outputs=tuple(o for o in statement.outputs if o.name in read))
+
+    return [s for s in map(kept, statements) if not isinstance(s, CellPhase) or s.outputs]

@@ -12,7 +12,7 @@ constexpr u32 LAST_WORD = WIDTH % 32 ? (1u << WIDTH % 32) - 1 : ~0u;
 #if !defined(EMULATED)
 #define DEVICE static __device__ __forceinline__
 #define OUTLINE static __device__ __noinline__
-#define KERNEL extern "C" __global__ void __launch_bounds__(THREADS)
+#define KERNEL extern "C" __global__ void __launch_bounds__(THREADS, BLOCKS)
 #define TABLE static __device__ const
 #define THREAD ((int)threadIdx.x)
 #define BLOCK ((int)blockIdx.x)
@@ -141,7 +141,7 @@ DEVICE u32 draw_plane(int stream, int l, int y, int w, int j) {
   return h ^ h >> 16;
 }
 // Which of the wanted cells draw below a constant, `bits` in a row from the highest; stops when all are decided.
-OUTLINE u32 draw_below(int stream, int l, int y, int w, u32 wanted, int bits, u64 limit) {
+DEVICE u32 draw_below(int stream, int l, int y, int w, u32 wanted, int bits, u64 limit) {
   u32 below = 0, open = wanted;
   for (int j = bits - 1; j >= 0 && open && limit << (63 - j); j--) {
     const u32 p = draw_plane(stream, l, y, w, bits - 1 - j);

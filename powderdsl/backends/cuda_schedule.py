@@ -117,6 +117,7 @@ def make_plan(
     statements: Sequence[Statement],
     homes: Mapping[str, int],
     changed: frozenset[str],
+    open_homes: frozenset[tuple[str, int]],
     prefers: Mapping[str, str],
     pool: Pool,
     inplace: bool,
@@ -126,6 +127,7 @@ def make_plan(
     Args:
         homes: the slots' buffers of variables that the pass finds there.
         changed: those of them whose slots the pass leaves changed: their buffers may be taken over.
+        open_homes: buffers of all slots that the pass changes: until its end they may hold anything.
         prefers: whose buffer a variable would take over best, besides what the statements say.
         inplace: whether a phase may write planes whose other words it reads, holding back all it writes.
     """
@@ -145,12 +147,11 @@ def make_plan(
         busy = {key: name for key, name in busy.items() if plan.last.get(name, -1) >= position}
         if isinstance(statement, WordPhase | CellPhase):
             for name in names_of(statement):
-                old = plan.follows.get(name) or prefers.get(name, "")
-                number = _taken_over(old, statement, position, plan, busy, inplace) if old else None
+                number = _taken_over(name, prefers, statement, position, plan, busy, inplace)
                 if number is None:
-                    number = _free(name, plan, busy, pool)
+                    number = _free(name, plan, busy, pool, open_homes)
                     if old := plan.follows.get(name, ""):  # it must still be there to be copied
-                        plan.last[old] = max(plan.last[old], plan.ends[name])
+                        plan.last[old] = max(plan.last.get(old, -1), plan.ends[name])
                 pool.size[name[0]] = max(pool.size[name[0]], number + 1)
                 plan.buffer[name] = number
                 busy[name[0], number] = name
@@ -181,27 +182,45 @@ def _number(statement: Statement, position: int, plan: Plan) -> None:
 
 
 def _taken_over(
-    old: str,
+    name: str,
+    prefers: Mapping[str, str],
     phase: WordPhase | CellPhase,
     position: int,
     plan: Plan,
     busy: Mapping[tuple[str, int], str],
     inplace: bool,
 ) -> int | None:
-    """The buffer of `old`, if nobody needs it after this phase and the phase may write it."""
-    across = phase.reads.get(old, False)
-    if across and not (inplace and isinstance(phase, WordPhase)):
-        return None
-    if old in phase.reads and isinstance(phase, CellPhase) and old[0] == "p":
-        return None  # one lane writes what the others read
-    number = plan.buffer[old]
-    return number if plan.last[old] <= position and busy.get((old[0], number)) == old else None
+    """The buffer of another variable that nobody needs after this phase: of what it follows on, or in its slot's home."""
+    home = busy.get((name[0], plan.wanted.get(name, -1)), "")
+    for old in (plan.follows.get(name, ""), prefers.get(name, ""), home):
+        if not old or plan.last.get(old, -1) > position:
+            continue
+        number = plan.buffer[old]
+        if busy.get((old[0], number)) != old:
+            continue
+        across = phase.reads.get(old, False)
+        if across and not (inplace and isinstance(phase, WordPhase)):
+            continue
+        if old in phase.reads and isinstance(phase, CellPhase) and old[0] == "p":
+            continue  # one lane writes what the others read
+        return number
+    return None
 
 
-def _free(name: str, plan: Plan, busy: Mapping[tuple[str, int], str], pool: Pool) -> int:
+def _free(
+    name: str,
+    plan: Plan,
+    busy: Mapping[tuple[str, int], str],
+    pool: Pool,
+    open_homes: frozenset[tuple[str, int]],
+) -> int:
     """The buffer of the slot that the variable ends in, or the first that nobody needs."""
     kind = name[0]
     home = plan.wanted.get(name)
     if home is not None and (kind, home) not in busy:
         return home
-    return next(n for n in range(pool.slots[kind], FOREVER) if (kind, n) not in busy)
+    return next(
+        n
+        for n in range(FOREVER)
+        if (kind, n) not in busy and (n >= pool.slots[kind] or (kind, n) in open_homes)
+    )

@@ -24,6 +24,13 @@ HELD = 4
 """Rounds of a loop over words up to which a thread holds back what it writes in registers."""
 
 
+RESERVED = 1024
+"""Bytes of shared memory that the system takes of each block."""
+
+REGISTERS, ENOUGH = 65_536, 128
+"""Registers of a multiprocessor, and how many a thread should have."""
+
+
 @dataclass(frozen=True)
 class KernelSource:
     """A translation unit, and what launching it takes."""
@@ -60,10 +67,18 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
         schedule = PassSchedule(pass_, layout)
         rounds = -(-group * words // threads)
         plan = make_plan(
-            schedule.statements, schedule.homes, schedule.changed, schedule.prefers, pool, rounds <= HELD
+            schedule.statements,
+            schedule.homes,
+            schedule.changed,
+            schedule.open_homes,
+            schedule.prefers,
+            pool,
+            rounds <= HELD,
         )
-        body = Emitter(plan, pending).text(schedule.statements)
-        passes.append(f"OUTLINE void pass_{number}(const Block c) {{\n(void)c;\n{body}\n}}")
+        emitter = Emitter(plan, pending)
+        body = emitter.text(schedule.statements)
+        pending = emitter.pending
+        passes.append(f"DEVICE void pass_{number}(const Block& c) {{\n(void)c;\n{body}\n}}")
     uniform = (
         4
         * group
@@ -79,6 +94,9 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     fields = 4 * group * (height * width + words) * pool.size["f"]
     planes_fit = uniform + planes <= shared_limit
     fields_fit = planes_fit and uniform + planes + fields <= shared_limit
+    shared = uniform + (planes if planes_fit else 0) + (fields if fields_fit else 0)
+    # As many blocks as the chip's memory holds, but not so many that registers run out.
+    blocks = max(1, min(shared_limit // (shared + RESERVED), REGISTERS // (threads * ENOUGH)))
     head = {
         "HEIGHT": height, "WIDTH": width, "ROW_WORDS": row_words, "GROUP": group,
         "PLANES_ON_CHIP": int(planes_fit), "FIELDS_ON_CHIP": int(fields_fit),
@@ -90,7 +108,7 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     text = "\n".join([
         f"// {len(program.passes)} passes for grids of {height} x {width}, generated; version {GENERATOR_VERSION}",
         *(f"#define {name} {value}" for name, value in head.items()),
-        f"#if !defined(EMULATED)\n#define THREADS {threads}\n#endif",
+        f"#if !defined(EMULATED)\n#define THREADS {threads}\n#define BLOCKS {blocks}\n#endif",
         (folder / "cuda_runtime.cuh").read_text(encoding="utf-8"),
         *_tables(program, layout, width, row_words),
         "\n\n".join(passes),
@@ -100,7 +118,6 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
         "}",
         (folder / "cuda_driver.cuh").read_text(encoding="utf-8"),
     ])  # fmt: skip
-    shared = uniform + (planes if planes_fit else 0) + (fields if fields_fit else 0)
     scratch = (0 if planes_fit else planes) + (0 if fields_fit else fields)
     return KernelSource(text, layout, group, threads, shared, scratch)
 

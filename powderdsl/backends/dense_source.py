@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import linecache
 import re
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from powderdsl.ir.ops import Node, PassGraph, nodes_of
 
@@ -201,3 +204,13 @@ _PLANE = re.compile(r"\b[ns][0-9]+\b")
 def comment(text: str) -> str:
     """File names come from outside: nothing in them may end the comment."""
     return "".join(char if char.isprintable() and ord(char) < 128 else "?" for char in text)
+
+
+def load_source(source: str, name: str, constants: Mapping[str, object]) -> Callable[..., Any]:
+    """The function of some generated source. It holds only names made up here, and constants passed beside it."""
+    filename = f"<powderdsl {name} {abs(hash(source)):x}>"
+    linecache.cache[filename] = (len(source), None, source.splitlines(True), filename)
+    namespace = dict(constants)
+    exec(compile(source, filename, "exec"), namespace)
+    function: Callable[..., Any] = namespace[name]  # type: ignore[assignment]
+    return function

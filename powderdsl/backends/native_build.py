@@ -132,11 +132,14 @@ def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
     Raises:
         NoCompiler: it cannot be started, or takes longer than TIMEOUT.
     """
+    # In a program frozen into one file, sys.executable is that program: there nothing guards.
+    frozen = getattr(sys, "frozen", False) or not sys.executable
+    guard = [] if frozen else [sys.executable, "-I", "-S", compiler_guard.__file__]
     # Nothing is ever written: the guard waits until the last process that has our end is gone.
     theirs, ours = os.pipe()
     try:
         process = subprocess.Popen(
-            [sys.executable, "-I", "-S", compiler_guard.__file__, *command],
+            [*guard, *command],
             stdin=theirs,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

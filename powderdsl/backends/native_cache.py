@@ -1,6 +1,6 @@
-"""Compiled libraries on disk: a folder for each, which appears whole or not at all, and is checked before it is loaded.
+"""Compiled code on disk, libraries and kernels for GPUs: a folder for each, which appears whole or not at all, and is checked before it is loaded.
 
-<key>/program.so, about.json    a library, and what is known of it
+<key>/program, about.json    a library, and what is known of it
 <key>.json                      what a program needs besides its library (`native_code`)
 <key>.lock                      held by who is compiling
 .build-…, .gone-…               on the way in, on the way out
@@ -20,7 +20,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-LIBRARY, ABOUT = "program.so", "about.json"
+# Not later: a fork in the middle of an import, which a thread makes, leaves the child waiting for it for ever.
+from filelock import FileLock, Timeout
+
+LIBRARY, ABOUT = "program", "about.json"
 BUILDING, GONE = ".build-", ".gone-"
 
 LIMIT = 512 << 20
@@ -157,8 +160,6 @@ def turn(folder: Path, key: str) -> Iterator[None]:
 
     The kernel lets go of the lock of a process that dies. Where there are no locks, nobody waits.
     """
-    from filelock import FileLock, Timeout
-
     lock = FileLock(folder / f"{key}.lock")
     try:
         lock.acquire(timeout=PATIENCE)

@@ -1,4 +1,5 @@
 // Batches of worlds, packing, threads and the entry points. Comes after the generated passes.
+#include <unistd.h>
 
 struct Group {
   Plane* slot[SLOTS + 1];
@@ -219,6 +220,8 @@ struct Pool {
 static std::mutex pool_use;
 static Pool& pool() {  // never destroyed: its threads may outlive main
   static Pool* p = new Pool();
+  static pid_t owner = getpid();
+  if (getpid() != owner) p = new Pool(), owner = getpid();  // a fork has none of its parent's threads
   return *p;
 }
 

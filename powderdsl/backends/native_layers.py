@@ -7,7 +7,7 @@ from collections.abc import Callable
 from powderdsl.backends.native_blocks import Lanes
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_sweeps import Sweep
-from powderdsl.ir.ops import REAL, Node
+from powderdsl.ir.ops import REAL, Node, walk
 
 FEWEST = 3
 """Choices from which a field of their own pays."""
@@ -23,17 +23,25 @@ def choices(node: Node, have: Callable[[Node], bool]) -> list[Node]:
         node = node.args[2]
     if len(chain) < FEWEST:
         return []
-    seen = {id(choice) for choice in chain}
-    stack = [choice.args[1] for choice in chain]
-    while stack:
-        part = stack.pop()
-        if id(part) in seen or have(part):
-            continue
-        seen.add(id(part))
-        if part.op in ("select", "draw"):
-            return []
-        stack.extend(part.args)
+    for (
+        choice
+    ) in chain:  # a choice may build on the one below it, which the row still holds, not on those before
+        seen = {id(choice.args[2])}
+        stack = [choice.args[1]]
+        while stack:
+            part = stack.pop()
+            if id(part) in seen or have(part):
+                continue
+            seen.add(id(part))
+            if part.op in ("select", "draw") or (part.op == "shift" and reads(part, choice.args[2])):
+                return []
+            stack.extend(part.args)
     return chain
+
+
+def reads(node: Node, other: Node) -> bool:
+    """Whether a value is computed from another."""
+    return any(inner is other for inner in walk(node))
 
 
 def layer_lanes(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from powderdsl.ir.ops import Node, Program, nodes_of
+from powderdsl.ir.ops import Node, Program, nodes_of, walk
 
 
 @dataclass
@@ -38,7 +38,8 @@ def layout_of(program: Program) -> Layout:
     for i, (name, _, _) in enumerate(program.streams):
         layout.streams[name] = i
     for pass_ in program.passes:
-        for node in nodes_of(pass_):
+        guards = (inner for step in pass_.moments for guard in step.guards for inner in walk(guard))
+        for node in (*nodes_of(pass_), *guards):
             _place(node, layout)
     return layout
 

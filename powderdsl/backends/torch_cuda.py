@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from powderdsl.backends import torch_words
+from powderdsl.backends import cuda_build, torch_words
 from powderdsl.backends.cuda_source import KernelSource, cuda_source
 from powderdsl.backends.torch_dense import Kernels
 from powderdsl.backends.torch_job import Job
+from powderdsl.backends.torch_mixed import Part, packed_program
+from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import Program, SlotType
 
@@ -44,6 +46,68 @@ Launch = Callable[[Arguments], None]
 
 Compile = Callable[[KernelSource], Launch]
 """Makes a kernel of its source, for one device."""
+
+
+def compiler_for(device: torch.device) -> Compile:
+    """Makes kernels for a CUDA device. What it returns raises CompileError (PD701) if that fails."""
+
+    def compile(source: KernelSource) -> Launch:
+        version = torch.version.cuda or ""
+        try:
+            with torch.cuda.device(device):
+                torch.empty(1, device=device)  # the context is there from now on
+                architecture = cuda_build.architecture(torch.cuda.current_device())
+                code = cuda_build.machine_code(source.text, architecture, version)
+                start = cuda_build.load_kernel(code, source)
+        except cuda_build.NoCuda as error:
+            raise refusal(str(error)) from None
+
+        def launch(arguments: Arguments) -> None:
+            with torch.cuda.device(device):
+                stream = torch.cuda.current_stream(device).cuda_stream
+                start(worlds_of(arguments), arguments.blocks, stream)
+
+        return launch
+
+    return compile
+
+
+def worlds_of(arguments: Arguments) -> cuda_build.Worlds:
+    """The arguments as the kernel takes them."""
+    addresses = (tensor.data_ptr() for tensor in arguments.tensors)
+    return cuda_build.Worlds(*addresses, len(arguments.clock[0]), arguments.steps)
+
+
+def cuda_program(program: Program, device: torch.device) -> Part:
+    """A program for a CUDA device; passes that planes cannot carry run on cells.
+
+    Raises:
+        CompileError: PD701 if there is no such device, driver or NVRTC.
+    """
+    problem = "its kernels run on a CUDA device" if device.type != "cuda" else ""
+    try:
+        if not problem:
+            with torch.cuda.device(device):
+                torch.empty(1, device=device)
+                limit = cuda_build.shared_limit(torch.cuda.current_device())
+            cuda_build.nvrtc(torch.version.cuda or "")
+            compile = compiler_for(device)
+            return packed_program(
+                program, device, lambda cells, planes: CudaProgram(cells, planes, compile, limit)
+            )
+    except cuda_build.NoCuda as error:
+        problem = str(error)
+    raise refusal(problem)
+
+
+def refusal(problem: str) -> CompileError:
+    """What a user reads where the backend cannot be had."""
+    reporter = Reporter()
+    helps = ["run on the device `cuda`, or on the backend `native` or `torch`"]
+    reporter.error(
+        "PD701", "the cuda backend is not available", None, notes=problem.splitlines(), helps=helps
+    )
+    return CompileError(reporter.diagnostics)
 
 
 class DeviceState(Mapping[str, Tensor]):
@@ -111,9 +175,9 @@ class CudaProgram:
             if isinstance(state, DeviceState) and state.program is self
             else self._pack(state, source)
         )
-        flags, numbers = self._parameters(job.params, batch, source)
-        blocks = -(-batch // source.group)
         device = after.planes.device
+        flags, numbers = self._parameters(job.params, batch, source, device)
+        blocks = -(-batch // source.group)
         scratch = torch.empty(max(1, blocks * source.scratch // 4), dtype=torch.int32, device=device)
         seed, index, start = (part.contiguous() for part in job.clock)
         launch(
@@ -127,11 +191,10 @@ class CudaProgram:
         return DeviceState(self, state.planes.clone(), state.reals.clone(), state.like)
 
     def _parameters(
-        self, params: Mapping[str, Tensor], batch: int, source: KernelSource
+        self, params: Mapping[str, Tensor], batch: int, source: KernelSource, device: torch.device
     ) -> tuple[Tensor, Tensor]:
         """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
         layout = source.layout
-        device = next(iter(params.values())).device if params else torch.device("cpu")
         flags = torch.zeros(max(1, len(layout.param_planes)), batch, dtype=torch.uint8, device=device)
         views: dict[tuple[str, str], Tensor] = {}
         for (name, how, bit), number in layout.param_planes.items():

@@ -6,7 +6,6 @@ rule files. Flags are bool, whole numbers int32, reals float32, all [B, H, W] or
 
 from __future__ import annotations
 
-import linecache
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.backends import torch_random
-from powderdsl.backends.dense_source import pass_source
+from powderdsl.backends.dense_source import load_source, pass_source
 from powderdsl.backends.torch_job import Job
 from powderdsl.backends.torch_laps import Laps, unwatched
 from powderdsl.ir.ops import Program
@@ -242,9 +241,7 @@ class DenseProgram:
 
 
 def compiled(source: str, name: str, constants: Mapping[str, object], device: torch.device) -> PassFunction:
-    """Compile generated source. It holds only names that `pass_source` made up, and constants passed beside it."""
-    filename = f"<powderdsl {name} {abs(hash(source)):x}>"
-    linecache.cache[filename] = (len(source), None, source.splitlines(True), filename)
+    """The function of a pass's source on this device."""
     namespace: dict[str, object] = {"torch": torch}
     for key, value in constants.items():
         dtype = (
@@ -257,6 +254,4 @@ def compiled(source: str, name: str, constants: Mapping[str, object], device: to
         if dtype == torch.int32 and max(value if isinstance(value, tuple) else (value,)) >= 1 << 31:
             dtype = torch.int64  # thresholds of draws of 32 bits
         namespace[key] = torch.tensor(value, dtype=dtype, device=device)
-    exec(compile(source, filename, "exec"), namespace)
-    function: PassFunction = namespace[name]  # type: ignore[assignment]
-    return function
+    return load_source(source, name, namespace)

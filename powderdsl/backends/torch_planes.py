@@ -19,6 +19,12 @@ from powderdsl.backends.torch_laps import Laps, unwatched
 from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import Program, SlotType
 
+_CHANGES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "add": torch.add,
+    "sub": torch.sub,
+    "mul": torch.mul,
+}
+
 
 @dataclass
 class PlaneKernels:
@@ -52,35 +58,41 @@ class PlaneKernels:
             x = torch_words.columns(x, dx, self.width, self.valid, wraps)
         return torch_words.rows(x, dy, wraps, dim) if dy else x
 
-    def swap(
-        self, contents: tuple[Tensor, ...], movers: Tensor, rests: tuple[Tensor, ...] | None, dy: int, dx: int
-    ) -> tuple[Tensor, ...]:
-        """Movers and targets exchanged, in all planes. Where nothing else changed, by the xor of the two."""
-        movers = self.full(movers)
-        content = torch.stack([self.full(c) for c in contents])
-        if rests is None:
-            difference = (content ^ self.shift(content, dy, dx, True)) & movers
-            return (content ^ difference ^ self.shift(difference, -dy, -dx, True)).unbind(0)
-        rest = torch.stack([self.full(r) for r in rests])
-        targets = self.shift(movers, -dy, -dx, True)
-        there, back = self.shift(content, dy, dx, True), self.shift(content, -dy, -dx, True)
-        rest = rest ^ (targets & (rest ^ back))
-        return (rest ^ (movers & (rest ^ there))).unbind(0)
+    @staticmethod
+    def some(*flags: Tensor) -> bool:
+        """Whether one of some flags may hold anywhere: to know, one would have to wait for the device."""
+        return True
 
-    def arrive(
-        self, contents: tuple[Tensor, ...], movers: Tensor, rests: tuple[Tensor, ...] | None, dy: int, dx: int
-    ) -> tuple[Tensor, ...]:
+    def stack(self, planes: tuple[Tensor, ...]) -> Tensor:
+        return torch.stack([self.full(plane) for plane in planes])
+
+    def swap(self, block: Tensor, movers: Tensor, dy: int, dx: int) -> Tensor:
+        """Movers and targets exchanged, in all planes: by the xor of the two."""
+        difference = (block ^ self.shift(block, dy, dx, True)) & movers
+        return block ^ difference ^ self.shift(difference, -dy, -dx, True)
+
+    def swap_onto(self, block: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
+        """The same where something else has changed as well: `rest` has the cells that do not move."""
+        result = self.arrive(block, movers, rest, dy, dx)
+        return result ^ (movers & (result ^ self.shift(block, dy, dx, True)))
+
+    def arrive(self, block: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
         """Targets get what the movers held."""
         targets = self.shift(movers, -dy, -dx, True)
-        back = self.shift(torch.stack([self.full(c) for c in contents]), -dy, -dx, True)
-        rest = torch.stack([self.full(r) for r in rests or contents])
-        return (rest ^ (targets & (rest ^ back))).unbind(0)
+        return rest ^ (targets & (rest ^ self.shift(block, -dy, -dx, True)))
 
     def pack(self, cells: Tensor) -> Tensor:
         return torch_words.pack(cells.expand(self.dense.shape))
 
-    def unpack(self, words: Tensor) -> Tensor:
+    def cells(self, words: Tensor) -> Tensor:
+        """A flag as bool cells."""
         return torch_words.unpack(self.full(words), self.width)
+
+    places = cells
+
+    def moved(self, cells: Tensor, dy: int, dx: int) -> Tensor:
+        """The cells whose neighbours (dy, dx) some cells are."""
+        return self.dense.roll(cells, dy, dx)
 
     # Draws
 
@@ -102,7 +114,7 @@ class PlaneKernels:
         self._planes[stream, 0] = found
         return found
 
-    def chance(self, stream: str, bits: int, limit: int) -> Tensor:
+    def chance(self, stream: str, bits: int, limit: int, where: Tensor | None = None) -> Tensor:
         """Draw below a constant: from its lowest set bit up, one gate a plane."""
         low = (limit & -limit).bit_length() - 1
         planes = self.planes(stream, bits - low)
@@ -112,12 +124,18 @@ class PlaneKernels:
             result = plane | result if limit >> i & 1 else plane & result
         return result & self.valid
 
-    def below(self, stream: str, bits: int, limit: tuple[Tensor, ...]) -> Tensor:
+    def below(self, stream: str, bits: int, limit: tuple[Tensor, ...], where: Tensor | None = None) -> Tensor:
         """Draw below a limit given plane by plane, most significant first: the borrow of a subtraction."""
         result = self.zero
         for plane, bound in zip(reversed(self.planes(stream, bits)), reversed(limit[1:]), strict=True):
             result = (plane & (bound | result)) | (bound & result)
         return (result | limit[0]) & self.valid
+
+    def below_param(
+        self, stream: str, bits: int, name: str, view: str, where: Tensor | None = None
+    ) -> Tensor:
+        """Draw below a parameter."""
+        return self.below(stream, bits, tuple(self.param(name, view, i) for i in range(bits, -1, -1)))
 
     def draw_real(self, stream: str, bits: int) -> Tensor:
         return self.dense.draw_real(stream)
@@ -163,17 +181,46 @@ class PlaneKernels:
     def shift_cells(self, x: Tensor, dy: int, dx: int, wraps: bool) -> Tensor:
         return self.dense.roll(x, dy, dx) if wraps else self.dense.reach(x, dy, dx)
 
-    def swap_cells(self, content: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
-        roll = self.dense.roll
-        return torch.where(
-            movers, roll(content, dy, dx), torch.where(roll(movers, -dy, -dx), roll(content, -dy, -dx), rest)
-        )
+    def copy(self, x: Tensor) -> Tensor:
+        """A copy that is a number for each cell."""
+        return self.dense.full(x).clone()
 
-    def arrive_cells(self, content: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
-        return torch.where(self.dense.roll(movers, -dy, -dx), self.dense.roll(content, -dy, -dx), rest)
+    @staticmethod
+    def choose(cells: Tensor, yes: Tensor, no: Tensor, over: bool) -> Tensor:
+        """`yes` where the cells hold, else `no`; `over`: `no` is not needed any more."""
+        return torch.where(cells, yes, no)
 
-    divide = staticmethod(Kernels.divide)
-    settle = staticmethod(Kernels.settle)
+    @staticmethod
+    def update(cells: Tensor, no: Tensor, other: Tensor, over: bool, change: str) -> Tensor:
+        """`no`, and where the cells hold `no` + `other`, or what else the change is."""
+        return torch.where(cells, _CHANGES[change](no, other), no)
+
+    def carry(
+        self,
+        source: Tensor,
+        target: Tensor,
+        no: Tensor,
+        other: Tensor,
+        over: bool,
+        change: str,
+        dy: int,
+        dx: int,
+    ) -> Tensor:
+        """`no`, and at the target cells changed by what `other` has at the neighbour (dy, dx)."""
+        return self.update(target, no, self.dense.roll(other, dy, dx), over, change)
+
+    @staticmethod
+    def sqrt(x: Tensor) -> Tensor:
+        """Torch's float32 square root is not always rounded correctly on CPUs; from float64 it is."""
+        return torch.sqrt(x.double()).float()
+
+    min = staticmethod(torch.minimum)
+    max = staticmethod(torch.maximum)
+    div = staticmethod(Kernels.divide)
+
+    def settle(self, x: Tensor, over: bool, low: float, high: float) -> Tensor:
+        """No NaN, within bounds, nothing smaller than SNAP."""
+        return self.dense.full(Kernels.settle(x, low, high))
 
 
 def planes_kernel_source(program: Program, only: str | None = None) -> str:
@@ -240,7 +287,9 @@ class PlanesProgram:
                 if slot.type.name == "flag":
                     planes[name] = kernels.valid if slot.default else kernels.zero
                 else:
-                    planes[name] = torch.full((), slot.default, dtype=torch.float32, device=self.device)
+                    planes[name] = torch.full(
+                        kernels.dense.shape, slot.default, dtype=torch.float32, device=self.device
+                    )
 
     def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """State slots as planes."""
@@ -248,9 +297,9 @@ class PlanesProgram:
         for slot in self._slots:
             base, _, part = slot.name.rpartition(".")
             if part in ("row", "column") and base in state:
-                planes[slot.name] = state[base][:, ("row", "column").index(part)]
+                planes[slot.name] = state[base][:, ("row", "column").index(part)].clone()
             elif slot.type.name == "real":
-                planes[slot.name] = state[slot.name]
+                planes[slot.name] = state[slot.name].clone()
             elif slot.type.name == "flag":
                 planes[slot.name] = torch_words.pack(state[slot.name] != 0)
             else:
@@ -273,13 +322,13 @@ class PlanesProgram:
             elif old.dtype == torch.float32:
                 packed[name] = kernels.dense.full(planes[name]).clone()
             elif types[name].name == "flag":
-                packed[name] = kernels.unpack(planes[name]).to(old.dtype)
+                packed[name] = kernels.cells(planes[name]).to(old.dtype)
             else:
                 count, signed = planes_of(types[name].lo, types[name].hi)
                 value = torch.zeros((), dtype=old.dtype, device=self.device)
                 for i in range(count):
                     weight = -(1 << i) if signed and i == count - 1 else 1 << i
-                    bit = kernels.unpack(planes[f"{name}:{i}"]).to(old.dtype)
+                    bit = kernels.cells(planes[f"{name}:{i}"]).to(old.dtype)
                     value = value + (bit << i if weight > 0 and old.dtype == torch.uint8 else bit * weight)
                 packed[name] = value.to(old.dtype)
         return packed

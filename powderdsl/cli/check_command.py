@@ -16,9 +16,9 @@ from powderdsl.cli.show_command import table
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short
+from powderdsl.ledgers.account import ledger_data, ledger_text
 from powderdsl.ledgers.book import Ledger
 from powderdsl.ledgers.book import ledger as make_ledger
-from powderdsl.ledgers.report import ledger_data, ledger_text
 from powderdsl.model.types import Ruleset
 
 if TYPE_CHECKING:

@@ -118,9 +118,11 @@ def command(
     head = f"{ruleset.name}: {many} of {height}×{width}, {steps} steps in {took:.2f} s"
     if verbose:
         rate = count * height * width * steps / max(took, 1e-9)
-        head += f" ({rate:,.0f} cells/s; {sim.backend} on {sim.device}, {counted(used, 'thread')})"
+        head += f" ({rate:,.0f} cells/s; {sim.running} on {sim.device}, {counted(used, 'thread')})"
     click.echo(head + (f" -> {out}" if out else ""), err=True)
     if verbose:
+        for note in sim.notes:
+            click.echo(f"  {note}", err=True)
         click.echo(_populations(start, end), err=True)
 
 

@@ -1,44 +1,221 @@
-"""`powderdsl test`: the tests that stand in packs."""
+"""`powderdsl test`: the tests and the invariants of packs, and which rules never happened meanwhile."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import FAILED, OK, counted
-from powderdsl.cli.options import backend_option, load_rules, rules_argument, set_option
-from powderdsl.model.text import place_of
+from powderdsl.cli.exits import FAILED, OK, BadInput, counted
+from powderdsl.cli.options import WholeType, backend_option, check_writable, load_rules, set_option
+from powderdsl.compiler import shipped_tests
+from powderdsl.model.text import one_line, place_of
 
 if TYPE_CHECKING:
+    from powderdsl.model.types import Ruleset
     from powderdsl.pack_tests import ExampleResult
+    from powderdsl.properties.outcomes import Result
+    from powderdsl.properties.search import Plan
+
+MAX_SECONDS = 24 * 3600
 
 
 @click.command("test")
-@rules_argument
-@backend_option("reference")
+@click.argument("rules", nargs=-1, metavar="[RULES]...")
+@backend_option("planes")
 @set_option
-def command(rules: str, backend: str, settings: dict[str, str]) -> int:
-    """Run the tests that stand in packs.
+@click.option("--examples", type=WholeType(0, 10_000_000), default=1000, show_default=True,
+              help="Random worlds that each invariant is tried on.")  # fmt: skip
+@click.option("--drawn", type=WholeType(0, 1_000_000), default=100, show_default=True,
+              help="More worlds, drawn by Hypothesis.")  # fmt: skip
+@click.option("--seconds", type=WholeType(1, MAX_SECONDS), default=60, show_default=True,
+              help="Random worlds end after so many seconds for each RULES.")  # fmt: skip
+@click.option("--seed", type=WholeType(0, 2**31 - 1), default=0, show_default=True,
+              help="Other worlds for another seed, the same for the same.")  # fmt: skip
+@click.option(
+    "--replay", type=click.Path(dir_okay=False, path_type=Path), help="Only try this counterexample again."
+)
+@click.option("--picture", type=click.Path(dir_okay=False, path_type=Path),
+              help="Draw the first counterexample, before and after, as a .png.")  # fmt: skip
+@click.option(
+    "--keep/--no-keep",
+    default=None,
+    help="Keep counterexamples in .powderdsl/.  [default: unless $CI is set]",
+)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object instead of text.")
+def command(
+    rules: tuple[str, ...],
+    backend: str,
+    settings: dict[str, str],
+    examples: int,
+    drawn: int,
+    seconds: int,
+    seed: int,
+    replay: Path | None,
+    picture: Path | None,
+    keep: bool | None,
+    as_json: bool,
+) -> int:
+    """Run the tests of packs, and hold their invariants against the rules.
 
-    A test without a seed runs with five. Exit code: 0 if all pass, 1 if one fails, 2 for bad rules.
+    Without RULES, all that come with powderdsl. A test without a seed runs with five. Invariants are proven where that
+    is possible, else tried on random worlds; one that breaks is shown by a small world, kept in .powderdsl/, and tried
+    first from then on.
+
+    Exit code: 0 if all holds, 1 if something fails, 2 for bad rules.
     """
-    ruleset = load_rules(rules, settings)
-    if not ruleset.tests:
-        click.echo(f"{ruleset.name}: no tests")
-        return OK
-    from powderdsl.pack_tests import run_examples
+    if picture is not None:
+        if picture.suffix.lower() != ".png":
+            raise BadInput(f"--picture must end in .png, not `{picture}`")
+        check_writable(picture)
+    if replay is not None and len(rules) != 1:
+        raise BadInput("--replay takes the one RULES that the counterexample breaks")
+    from powderdsl.properties.keep import is_kept
+    from powderdsl.properties.search import Plan
 
-    results = run_examples(ruleset, backend=backend)
-    for result in results:
-        click.echo(f"{'ok  ' if result.passed else 'FAIL'}  {result.example.pack}: {result.example.name}")
-        if not result.passed:
-            click.echo("\n".join(f"      {line}".rstrip() for line in _failure_lines(result)))
-    failed = sum(not result.passed for result in results)
-    outcome = f"{failed} failed" if failed else "all passed"
-    click.echo(f"{ruleset.name}: {counted(len(results), 'test')}, {outcome}")
-    return FAILED if failed else OK
+    plan = Plan(examples, float(seconds), seed)
+    session = _Session(backend, plan, drawn, is_kept() if keep is None else keep, picture, as_json)
+    for name in rules or shipped_tests():
+        ruleset = load_rules(name, settings)
+        if replay is not None:
+            session.replay(name, ruleset, replay)
+        else:
+            session.test(name, ruleset)
+    if as_json:
+        click.echo(json.dumps(session.data, indent=2, ensure_ascii=False))
+    return FAILED if session.failed else OK
+
+
+class _Session:
+    """One call of the command: what is asked, and what came of it so far."""
+
+    def __init__(self, backend: str, plan: Plan, drawn: int, keep: bool, picture: Path | None, as_json: bool):
+        self.backend, self.plan, self.drawn, self.keep = backend, plan, drawn, keep
+        self.picture, self.as_json = picture, as_json
+        self.failed = False
+        self.data: dict[str, Any] = {}
+
+    def say(self, *lines: str) -> None:
+        if not self.as_json:
+            click.echo("".join(f"{line}\n" for line in lines), nl=False)
+
+    def test(self, name: str, ruleset: Ruleset) -> None:
+        """Tests, invariants, coverage of one ruleset."""
+        from powderdsl.pack_tests import run_examples
+        from powderdsl.properties.running import Runner
+
+        start = monotonic()
+        runner = Runner(ruleset, self.backend)
+        tests = run_examples(ruleset, sim=runner.sim, seen=lambda world: runner.note(world.state))
+        for test in tests:
+            self.say(f"{'ok  ' if test.passed else 'FAIL'}  {test.example.pack}: {test.example.name}")
+            if not test.passed:
+                self.say(*(f"      {line}".rstrip() for line in _failure_lines(test)))
+        results = self._properties(name, runner)
+        missed = [span for span in runner.lines if span not in runner.happened]
+        for span in missed:
+            self.say(f"never happened: {place_of(span)}: {one_line(span)}")
+        self.say(
+            f"{ruleset.name}: {len(runner.lines) - len(missed)} of {counted(len(runner.lines), 'rule')} happened"
+            f" on {runner.worlds_run:,} worlds in {monotonic() - start:.0f} s"
+        )
+        broken = sum(not result.holds for result in results)
+        failed = sum(not test.passed for test in tests)
+        declared = [result for result in results if result.prop.owner != "automatic"]
+        parts = [counted(len(tests), "test")]
+        parts += [counted(len(declared), "invariant")] if declared else []
+        bad = [f"{number} {word}" for number, word in ((failed, "failed"), (broken, "broken")) if number]
+        self.say(f"{ruleset.name}: {', '.join(parts)}, {', '.join(bad) or 'all passed'}")
+        self.failed |= bool(bad)
+        self.data[name] = _data(tests, results, runner.lines, missed)
+
+    def _properties(self, name: str, runner: Any) -> list[Result]:
+        from powderdsl.properties.drawn import has_hypothesis, try_drawn
+        from powderdsl.properties.keep import file_of, kept_examples, write_example
+        from powderdsl.properties.search import Search
+
+        search = Search.of(runner, self.plan)
+        properties = {trial.prop.text: trial.prop for trial in search.trials}
+        if self.keep:
+            for prop, sample, steps in kept_examples(runner.ruleset, properties, name):
+                search.try_sample(sample, steps)
+                self.say(f"tried again: {prop.owner}: {prop.text}")
+        search.try_random()
+        if has_hypothesis():
+            try_drawn(search, self.drawn)
+        else:
+            self.say("Hypothesis is not installed: only random worlds were tried")
+        results = search.finish()
+        for result in results:
+            self._tell(result, runner.ruleset)
+            if result.counterexample is not None and self.keep:
+                path = file_of(name, result.prop)
+                write_example(path, name, result.prop, result.counterexample)
+                self.say(f"      again: powderdsl test {name} --replay {path}")
+        return results
+
+    def _tell(self, result: Result, ruleset: Ruleset) -> None:
+        from powderdsl.properties.outcomes import counterexample_lines, picture, result_line
+
+        if result.prop.owner == "automatic" and result.holds:
+            return
+        self.say(result_line(result))
+        found = result.counterexample
+        if found is not None:
+            self.say(*(f"      {line}" for line in counterexample_lines(found, ruleset)))
+            if self.picture is not None:
+                from powderdsl.media import write_png
+
+                write_png(self.picture, picture(found, ruleset))
+                self.say(f"      drawn: {self.picture}")
+                self.picture = None
+
+    def replay(self, name: str, ruleset: Ruleset, path: Path) -> None:
+        """Try one counterexample again, as it is."""
+        from powderdsl.properties.breaks import breaks
+        from powderdsl.properties.keep import read_example
+        from powderdsl.properties.outcomes import Result, result_data
+        from powderdsl.properties.running import Runner
+        from powderdsl.properties.search import as_it_is, find_property
+
+        text, sample, steps = read_example(path, ruleset)
+        prop = find_property(ruleset, text)
+        if prop is None:
+            raise BadInput(f"{path}: {ruleset.name} has no invariant `{text}`")
+        runner = Runner(ruleset, self.backend)
+        broken = bool(breaks(prop.claim, runner, sample, steps).first.any())
+        found = as_it_is(prop.claim, runner, sample, steps) if broken else None
+        result = Result(prop, "broken" if broken else "tested", 1, "", found)
+        self._tell(result, ruleset)
+        self.failed |= broken
+        self.data[name] = {"properties": [result_data(result)]}
+
+
+def _data(
+    tests: Sequence[ExampleResult], results: Sequence[Result], lines: Sequence[Any], missed: Sequence[Any]
+) -> dict[str, Any]:
+    from powderdsl.properties.outcomes import result_data
+
+    return {
+        "tests": [
+            {
+                "test": one.example.name,
+                "pack": one.example.pack,
+                "place": place_of(one.example.span),
+                "passed": one.passed,
+                "problem": one.problem,
+                "seed": one.seed,
+                "steps": one.step,
+            }
+            for one in tests
+        ],
+        "properties": [result_data(result) for result in results],
+        "rules": {"all": len(lines), "never": [place_of(span) for span in missed]},
+    }
 
 
 def _failure_lines(result: ExampleResult) -> Iterator[str]:

@@ -75,6 +75,8 @@ _ROWS = (
     ("PD507", "unused-definition", _WARNING),
     ("PD508", "expansion-too-large", _ERROR),
     ("PD509", "rule-does-nothing", _WARNING),
+    ("PD510", "invariant-says-nothing", _WARNING),
+    ("PD511", "invariant-cannot-hold", _ERROR),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 from unicodedata import combining, east_asian_width
 
@@ -54,6 +54,23 @@ def _block(label: Label, caret: str, gutter: int) -> list[str]:
     ]
 
 
+def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
+    """The source lines of labels with carets, the first label's as `^`; and the width of the line numbers."""
+    placed = [label for label in labels if label.span]
+    gutter = max((len(str(label.span.line)) for label in placed if label.span), default=1)
+    lines: list[str] = []
+    name = None
+    for label in placed:
+        assert label.span is not None
+        if label.span.source.name != name:
+            arrow = "-->" if name is None else ":::"
+            name = label.span.source.name
+            lines.append(f"{' ' * gutter}{arrow} {label.span.place}")
+            lines.append(f"{' ' * gutter} |")
+        lines.extend(_block(label, "^" if label is labels[0] else "-", gutter))
+    return lines, gutter
+
+
 def render_text(diagnostic: Diagnostic, *, colour: bool = False) -> str:
     """The full text with source lines and carets. Ends without a line break."""
 
@@ -62,18 +79,8 @@ def render_text(diagnostic: Diagnostic, *, colour: bool = False) -> str:
 
     severity = diagnostic.severity
     head = paint(f"{severity.value}[{diagnostic.code}]", COLOURS[severity]) + f": {diagnostic.message}"
-    lines = [head]
-    labels = [label for label in (diagnostic.primary, *diagnostic.secondary) if label.span]
-    gutter = max((len(str(label.span.line)) for label in labels if label.span), default=1)
-    name = None
-    for label in labels:
-        assert label.span is not None
-        if label.span.source.name != name:
-            arrow = "-->" if name is None else ":::"
-            name = label.span.source.name
-            lines.append(f"{' ' * gutter}{arrow} {label.span.place}")
-            lines.append(f"{' ' * gutter} |")
-        lines.extend(_block(label, "^" if label is diagnostic.primary else "-", gutter))
+    places, gutter = source_lines([diagnostic.primary, *diagnostic.secondary])
+    lines = [head, *places]
     lines.extend(f"{' ' * gutter} = note: {note}" for note in diagnostic.notes)
     lines.extend(f"{' ' * gutter} = help: {text}" for text in diagnostic.helps)
     lines.append(f"{' ' * gutter} = more: powderdsl explain {diagnostic.code}")

@@ -53,13 +53,13 @@ def find_wants(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Wants]:
 def _wants(rule: Rule, asked: Asked, lets: list[Let], named: Ids) -> Wants:
     """What one rule asks for. `lets` were fixed earlier in the pass."""
     nodes = list(_nodes_of(rule, {**{let.name: let.value for let in lets}, **asked.lets}))
-    asks_fields = any(node.op == "field" and node.kind == ELEMENT for node in nodes)
+    reads_names = any(node.op in ("field", "let") and node.kind == ELEMENT for node in nodes)
     sets = [frozenset(node.value) for node in nodes if node.op == "member"]
     candidates = [frozenset({number}) for number in asked.facts.ids] + sorted(set(sets), key=_by_size)
     needs: list[Ids] = []
     copies: set[int] = set()
     for ids in candidates:
-        if any(known <= ids for known in needs) or (asks_fields and ids & named):
+        if any(known <= ids for known in needs) or (reads_names and ids & named):
             continue
         world = Lacking(asked, ids, lets)
         if not world.may(rule):

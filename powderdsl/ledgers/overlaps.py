@@ -89,14 +89,11 @@ def _writes(rules: list[Rule], asked: Asked, pass_: Pass, known: dict[Overlap, N
     for writes in (plain, effects):
         for i, (b, second, second_rule) in enumerate(writes):
             for a, first, first_rule in writes[:i]:
-                outcome = _order_matters(a, b)
+                outcome = order_matters(a, b)
                 if not outcome or first is None or second is None:
                     continue
-                if (
-                    asked.moment.policy != "prove"
-                    and _own_cells(first_rule, a)
-                    and _own_cells(second_rule, b)
-                ):
+                apart = first_rule is not second_rule and asked.moment.policy != "prove"
+                if apart and _own_cells(first_rule, a) and _own_cells(second_rule, b):
                     continue  # rules that happen never share a cell
                 overlap = Overlap(
                     outcome, rule_line(first_rule, pass_), rule_line(second_rule, pass_), a.field
@@ -111,7 +108,7 @@ def _own_cells(rule: Rule, effect: Assign) -> bool:
     return not isinstance(rule, Assign) and effect.offset in footprint(rule)
 
 
-def _order_matters(a: Assign, b: Assign) -> str:
+def order_matters(a: Assign, b: Assign) -> str:
     """Which of OUTCOMES applies if these two write one cell, or nothing."""
     if a.field != b.field or (a.op == b.op == ":=" and a.value == b.value):
         return ""

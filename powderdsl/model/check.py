@@ -12,6 +12,7 @@ from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_examples
 from powderdsl.model.expressions import Typer
+from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
 from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
 from powderdsl.model.satisfy import Facts
@@ -45,6 +46,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     _sets(typer)
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
+    invariants = check_invariants(composition, typer)
     typer.unknown.report()
     reporter.raise_if_errors()
 
@@ -73,6 +75,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
         passes=without_dead_overrides(passes, frozenset(name for name, ids in stored.items() if not ids)),
         matrix=matrix,
         tests=examples,
+        invariants=invariants,
     )
 
 

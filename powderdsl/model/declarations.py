@@ -111,6 +111,7 @@ class PackDecl:
     also: tuple[AlsoDecl, ...]
     passes: tuple[PassDecl, ...]
     tests: tuple[TestDecl, ...]
+    invariants: tuple[Syntax, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -124,3 +125,4 @@ class RulesetDecl:
     slots: int | None
     matrix: tuple[Scalar, ...]
     params: tuple[tuple[Scalar, Syntax], ...] = field(default=())
+    invariants: tuple[Syntax, ...] = ()

@@ -77,6 +77,7 @@ class _PackReader(Reader):
             self.number(entries, "slots", 1, 256),
             self.words(entries.get("matrix", (None, None))[1]),
             tuple(params),
+            self.statements(entries.get("invariants", (None, None))[1]),
         )
 
     def pack(self, tree: Mapping) -> PackDecl | None:
@@ -116,7 +117,13 @@ class _PackReader(Reader):
             also=tuple(self.also(key, node) for key, node in self._pairs(value("also"))),
             passes=tuple(self.pass_(key, node) for key, node in self.named(value("passes"), "a pass")),
             tests=tuple(t for node in self._items(value("tests")) if (t := self.test(node))),
+            invariants=self.statements(value("invariants")),
         )
+
+    def statements(self, node: Node | None) -> tuple[Syntax, ...]:
+        """Invariants: a line, or a list of lines."""
+        items = () if node is None else node.items if isinstance(node, Sequence) else (node,)
+        return tuple(line for item in items if (line := self.line(item, "invariant")))
 
     def _pairs(self, node: Node | None) -> tuple[tuple[Scalar, Node], ...]:
         if node is None:

@@ -15,7 +15,7 @@ from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
 class Key:
     """A key: one line for the docs, whether it must be there, and the shape of its value.
 
-    Shapes: ``text word words number flag mapping list line lines block any``.
+    Shapes: ``text word words number flag mapping list line lines statements block any``.
     """
 
     shape: str
@@ -47,6 +47,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "elements": Key("mapping", "the pack's elements"),
         "also": Key("mapping", "tags and property values for elements of other packs"),
         "passes": Key("mapping", "what happens in a step"),
+        "invariants": Key("statements", "what is true of every world, a statement a line"),
         "tests": Key("list", "small worlds, and what becomes of them"),
     },
     "ruleset": {
@@ -56,6 +57,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "slots": Key("number", "how many element ids there are, vacant ones included"),
         "matrix": Key("words", "the channels of `World.matrix()`"),
         "params": Key("mapping", "other values for the packs' parameters"),
+        "invariants": Key("statements", "what is true of every world, a statement a line"),
     },
     "property": {
         "type": Key("line", "its kind", True),

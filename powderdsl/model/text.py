@@ -118,6 +118,11 @@ def show_offset(offset: Offset) -> str:
     return _PLACES.get(offset, f"at({offset[0]}, {offset[1]})")
 
 
+def show_expr(ruleset: Ruleset, expr: Expr) -> str:
+    """An expression of the model as one writes it in rules, with names for numbers."""
+    return _Printer(ruleset).expr(expr)
+
+
 class _Printer:
     """Prints one ruleset; remembers the kernels it met, to name and list them."""
 

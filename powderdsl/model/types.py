@@ -288,6 +288,68 @@ class Example:
 
 
 @dataclass(frozen=True)
+class Unchanging:
+    """Cells that hold one of these elements keep it for good."""
+
+    ids: frozenset[int]
+
+
+@dataclass(frozen=True)
+class Total:
+    """The sum of a whole number over all cells is ``constant``, ``never rises`` or ``never falls`` from step to step.
+
+    `ids` are the elements that are counted, if it is such a number; `value` is an int then too, 1 or 0.
+    """
+
+    value: Expr
+    trend: str
+    ids: frozenset[int] | None
+
+
+@dataclass(frozen=True)
+class Never:
+    """In no cell the condition comes to hold after so many steps in a row, where it did not hold at the start."""
+
+    condition: Expr
+    steps: int
+
+
+@dataclass(frozen=True)
+class Local:
+    """What a cell holds after a step depends on nothing farther than so many cells away, rows or columns."""
+
+    radius: int
+
+
+@dataclass(frozen=True)
+class Symmetric:
+    """A step of a turned world gives the turned world. `turn` is ``mirrored`` or ``rotated``."""
+
+    turn: str
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """Once a field's numbers lie in lo..hi everywhere, they stay there. Both parts of a vector are numbers."""
+
+    field: str
+    lo: int
+    hi: int
+
+
+Claim = Unchanging | Total | Never | Local | Symmetric | Bounded
+
+
+@dataclass(frozen=True)
+class Invariant:
+    """What a pack says of every world. `pack` is the ruleset's name where the ruleset says it."""
+
+    claim: Claim
+    pack: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
 class Ruleset:
     """A checked ruleset. `slots` is the number of ids: one-hot layouts have this many channels, some may be vacant."""
 
@@ -303,6 +365,7 @@ class Ruleset:
     passes: tuple[Pass, ...]
     matrix: tuple[str, ...]
     tests: tuple[Example, ...] = ()
+    invariants: tuple[Invariant, ...] = ()
 
     def element(self, name: str) -> Element | None:
         """The element of a plain or qualified name."""

@@ -165,6 +165,11 @@ def _shift_of_constant(node: Node, build: Builder) -> Node | None:
     return None
 
 
+def _inside(node: Node, build: Builder) -> Node | None:
+    """A cell lies inside its own grid."""
+    return build.flag(True) if node.op == "inside" and node.attr[:2] == (0, 0) else None
+
+
 def _below(node: Node, build: Builder) -> Node | None:
     if node.op != "below":
         return None
@@ -209,5 +214,5 @@ def _count(node: Node, build: Builder) -> Node | None:
 
 FOLD: tuple[Rewrite, ...] = (
     _not, _and_or, _xor, _in_set, _compare, _whole_constants, _select, _movement, _shift_of_constant, _below, _count, _divide,
-    _root,
+    _root, _inside,
 )  # fmt: skip

@@ -18,7 +18,7 @@ from powderdsl.user_cache import cache_folder
 
 MAX_LENGTH = 2000
 MAX_DEPTH = 48
-STARTS = ("rule", "expression", "header")
+STARTS = ("rule", "expression", "header", "invariant")
 
 
 @lru_cache(maxsize=1)
@@ -51,7 +51,7 @@ def reserved_words() -> frozenset[str]:
 
 
 def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | None:
-    """Parse a YAML scalar as `rule`, `expression` or `header`; report and return None if it is none."""
+    """Parse a YAML scalar as one of STARTS; report and return None if it is none."""
     span = scalar.content
     if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
         reporter.error(

@@ -7,33 +7,19 @@ import hashlib
 import os
 import subprocess
 import tempfile
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
-from torch import Tensor
-
 from powderdsl.backends.cuda_source import KernelSource
-from powderdsl.backends.native_build import find_compiler
-from powderdsl.backends.torch_cuda import Arguments, Compile, CudaProgram, Launch
-from powderdsl.backends.torch_job import Job
+from powderdsl.backends.native_compilers import find_compiler
+from powderdsl.backends.torch_cuda import Arguments, Compile, CudaProgram, Launch, worlds_of
+from powderdsl.backends.torch_mixed import packed_program
 from powderdsl.compiler import lower
-from powderdsl.ir.bits import lower_bits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulator import Simulator
 from powderdsl.simulator import compile as compile_ruleset
 
-FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-fno-strict-aliasing", "-shared", "-fPIC", "-w")
-
-
-class EmulatedWorlds(ctypes.Structure):
-    """`Worlds` of the kernel."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("planes", "reals", "scratch", "seed", "index", "step", "flags", "numbers")),
-        ("worlds", ctypes.c_int),
-        ("steps", ctypes.c_int),
-    )  # fmt: skip
+FLAGS = ("-std=c++17", "-O0", "-ffp-contract=off", "-fno-strict-aliasing", "-shared", "-fPIC", "-w")
 
 
 def emulated_text(text: str) -> str:
@@ -60,10 +46,7 @@ def compiler_for(folder: Path, order: int) -> Compile:
         emulate = ctypes.CDLL(str(target)).emulate
 
         def launch(arguments: Arguments) -> None:
-            worlds = EmulatedWorlds(
-                *(tensor.data_ptr() for tensor in arguments.tensors), len(arguments.clock[0]), arguments.steps
-            )
-            if emulate(ctypes.byref(worlds), arguments.blocks, order):
+            if emulate(ctypes.byref(worlds_of(arguments)), arguments.blocks, order):
                 raise AssertionError("some threads wait at a barrier that others never reach")
 
         return launch
@@ -71,19 +54,22 @@ def compiler_for(folder: Path, order: int) -> Compile:
     return compile
 
 
-class _Emulated:
-    def __init__(self, program: CudaProgram):
-        self.program = program
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        return self.program.run(job)
-
-
 def emulated_simulator(
-    ruleset: Ruleset, folder: Path, order: int = 0, shared_limit: int = 232448
+    ruleset: Ruleset, folder: Path, order: int = 0, shared_limit: int = 232_448
 ) -> Simulator:
-    """A simulator whose steps run the generated kernels on the CPU."""
+    """A simulator whose steps run the generated kernels on the CPU.
+
+    Args:
+        folder: for compiled kernels.
+        order: 0 or 1: which of the fibers between two barriers runs first.
+        shared_limit: bytes of shared memory that a block may have.
+    """
     simulator = compile_ruleset(ruleset, backend="dense")
-    program = lower(ruleset)
-    simulator._program = CudaProgram(program, lower_bits(program), compiler_for(folder, order), shared_limit)
+    compile = compiler_for(folder, order)
+    program = packed_program(
+        lower(ruleset),
+        simulator.device,
+        lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit),
+    )
+    simulator._program = program
     return simulator

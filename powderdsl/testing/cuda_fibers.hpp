@@ -20,6 +20,9 @@ static void run_fiber() {
   finished[me] = true;
   swapcontext(&fibers[me], &caller);
 }
+static void fill(u32* words, int count) {  // with what a GPU's memory may hold: anything
+  for (int i = 0; i < count; i++) words[i] = i % 3 ? 2654435761u * (u32)i : 0;
+}
 // `order`: the fibers from first to last (0) or from last to first (1). Returns 1 if some waited where others had ended.
 extern "C" __attribute__((visibility("default"))) int emulate(const Worlds* worlds, int blocks, int order) {
   constexpr size_t STACK = 1 << 20;
@@ -28,7 +31,8 @@ extern "C" __attribute__((visibility("default"))) int emulate(const Worlds* worl
   given = worlds;
   int wrong = 0;
   for (block = 0; block < blocks; block++) {
-    memset(chip, 0xd5, sizeof(int) * (CHIP_WORDS + 1));
+    fill(chip, CHIP_WORDS);
+    fill(worlds->scratch + (size_t)block * SCRATCH_WORDS, SCRATCH_WORDS);
     for (int f = 0; f < THREADS; f++) {
       finished[f] = false;
       getcontext(&fibers[f]);

@@ -209,7 +209,4 @@ def _told(error: Exception) -> str:
     while trace is not None:
         place = f"{Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}"
         trace = trace.tb_next
-    detail = [str(error)]
-    if isinstance(error, CompileError):
-        detail += [note for diagnostic in error.diagnostics for note in diagnostic.notes]
-    return "\n".join([f"{type(error).__name__} at {place}", *detail])
+    return f"{type(error).__name__} at {place}\n{error}"

@@ -27,7 +27,7 @@ def worlds(
         max_batch, max_side: bounds of worlds, rows and columns.
         shape: (worlds, rows, columns), if it must be this one.
     """
-    return _chosen(lambda choices: random_start(ruleset, choices, shape, max_batch, max_side))
+    return chosen(lambda choices: random_start(ruleset, choices, shape, max_batch, max_side))
 
 
 def rulesets(manner: Manner | None = None) -> st.SearchStrategy[Ruleset]:
@@ -42,11 +42,11 @@ def rulesets(manner: Manner | None = None) -> st.SearchStrategy[Ruleset]:
         except CompileError:
             reject()
 
-    return _chosen(make)
+    return chosen(make)
 
 
-def _chosen(make: Callable[[Choices], T]) -> st.SearchStrategy[T]:
-    """What a function makes of choices that Hypothesis takes: the plain option first, so that it shrinks to it."""
+def chosen(make: Callable[[Choices], T]) -> st.SearchStrategy[T]:
+    """What a function makes of choices that Hypothesis takes: plain options first, so that it shrinks to them."""
 
     @st.composite
     def strategy(draw: st.DrawFn) -> T:

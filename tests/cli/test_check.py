@@ -114,3 +114,42 @@ def test_files_that_are_not_there(tmp_path):
     assert powderdsl("check", tmp_path).exit_code == 2
     assert powderdsl("check", "").exit_code == 2
     assert powderdsl("check", "core+").exit_code == 2
+
+
+def test_the_ledger_follows_the_summary(pack):
+    result = powderdsl("check", pack(), "--ledger")
+    assert result.exit_code == 0
+    assert "ledger of core+grit: 3 elements" in result.stdout
+    assert "  becomes empty: grit.yaml:10 (grit)\n" in result.stdout
+    assert "  never rises  grit\n" in result.stdout
+
+
+def test_the_ledger_as_json(pack):
+    result = powderdsl("check", rules := pack(), "life", "--ledger", "--format", "json")
+    data = json.loads(result.stdout)
+    assert list(data) == ["diagnostics", "ledger"]
+    ledger = data["ledger"][rules]
+    assert list(ledger) == [
+        "schema", "name", "complete", "constant_sums", "never_falls", "never_rises", "elements", "rules", "fields", "overlaps",
+    ]  # fmt: skip
+    assert ledger["schema"] == 1
+    assert ledger["constant_sums"] == [["empty", "grit"], ["wall"]]
+    grit = next(one for one in ledger["elements"] if one["name"] == "grit")
+    (number,) = grit["becomes"]["empty"]
+    assert ledger["rules"][number] == {
+        "rule": "grit -> empty if count(grit) == 1 and interact < vanish",
+        "where": "grit.yaml:10",
+        "pass": "grit",
+        "pack": "grit",
+        "fires": True,
+        "changes": [["grit", "empty"]],
+        "moves": [],
+        "needs": [["grit"]],
+        "copies": [],
+    }
+
+
+def test_a_ledger_of_broken_rules(pack):
+    result = powderdsl("check", pack("count(grit)", "count(grid)"), "--ledger")
+    assert result.exit_code == 2
+    assert "ledger of" not in result.stdout

@@ -1,144 +1,84 @@
 """Random damage to rule files: loading raises nothing but CompileError, and what it raises can be printed.
 
-``FUZZ_EXAMPLES=20000 pytest tests/diagnostics/test_fuzz.py`` looks harder.
+`powderdsl fuzz --front-end --seeds 0..20000` looks harder, and at time and memory; so does
+``FUZZ_EXAMPLES=20000 pytest tests/diagnostics/test_fuzz.py``, which makes what it finds small.
 """
 
 from __future__ import annotations
 
 import os
-import re
-from functools import cache
-from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
-from powderdsl.diagnostics.render import render_json, render_short, render_text
-from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl, RulesetDecl
-from powderdsl.model.packs import read_file
-from powderdsl.model.types import Ruleset
+from powderdsl.model.declarations import PackDecl
+from powderdsl.testing import damage
+from powderdsl.testing.damage import KINDS, damaged_text, load_damaged, needed, rule_texts, run_trial, whole
+from powderdsl.testing.strategies import chosen
 
-ROOT = Path(__file__).resolve().parents[2]
-RULES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "rules").glob("*.yaml"))}
-EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "200"))
-TOKEN = re.compile(r"\w+|\s+|.", re.DOTALL)
-WORDS = sorted({token for text in RULES.values() for token in TOKEN.findall(text) if not token.isspace()})
-FUZZ = settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    derandomize="FUZZ_EXAMPLES" not in os.environ,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
-)
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "150"))
+FEWER = {"heavy": 10, "text": 3, "random rules": 3}
+"""Kinds that take long, or many choices: so many times fewer examples."""
+
+SEEDS = 200
 
 
-@cache
-def whole(name: str) -> PackDecl | RulesetDecl:
-    """A shipped file, undamaged."""
-    found = read_file(Source(f"{name}.yaml", RULES[name]), Reporter())
-    assert found is not None
-    return found
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files(kind: str) -> None:
+    @settings(
+        max_examples=max(1, EXAMPLES // FEWER.get(kind, 1)),
+        deadline=None,
+        derandomize="FUZZ_EXAMPLES" not in os.environ,
+        database=None,
+        suppress_health_check=[
+            HealthCheck.too_slow,
+            HealthCheck.data_too_large,
+            HealthCheck.filter_too_much,
+            HealthCheck.large_base_example,
+        ],
+    )
+    @given(chosen(KINDS[kind][1]))
+    def run(text: str) -> None:
+        load_damaged(text)
+
+    run()
 
 
-def needed(text: str) -> list[PackDecl]:
-    """The shipped packs that a file says it needs."""
-    names = re.search(r"^needs: \[?([\w, ]*)", text, re.MULTILINE)
-    words = [word for word in re.findall(r"\w+", names[1] if names else "") if word in RULES]
-    return [pack for word in words if isinstance(pack := whole(word), PackDecl)]
-
-
-def load(text: str, *others: PackDecl) -> Ruleset | None:
-    """What `powderdsl.load` does with a file and some packs, or None after printing what is wrong."""
-    reporter = Reporter()
-    try:
-        found = read_file(Source("fuzz.yaml", text), reporter)
-        reporter.raise_if_errors()
-        assert found is not None
-        return check([*others, found], None, reporter) if isinstance(found, PackDecl) else None
-    except CompileError as error:
-        printable(error.diagnostics)
-        return None
-
-
-def printable(diagnostics: tuple[Diagnostic, ...]) -> None:
-    """Fails unless every diagnostic points into its text and can be printed in all three ways."""
-    assert diagnostics
-    for one in diagnostics:
-        span = one.primary.span
-        assert span is None or 0 <= span.start < max(span.end, 1) <= max(len(span.source.text), 1) + 1
-        assert render_text(one)
-        assert "\n" not in render_short(one)
-    assert render_json(diagnostics, utf16=True)
-
-
-@st.composite
-def damaged(draw: st.DrawFn, units: str) -> str:
-    """A shipped file after some deletions, repetitions, exchanges and insertions of lines or tokens."""
-    text = RULES[draw(st.sampled_from(sorted(RULES)))]
-    parts = text.splitlines(keepends=True) if units == "lines" else TOKEN.findall(text)
-    for _ in range(draw(st.integers(1, 4))):
-        place = draw(st.integers(0, max(len(parts) - 1, 0)))
-        match draw(st.sampled_from(("delete", "repeat", "swap", "word", "character", "indent"))):
-            case "delete":
-                del parts[place : place + draw(st.integers(1, 3))]
-            case "repeat":
-                parts[place:place] = parts[place : place + 1] * draw(st.integers(1, 3))
-            case "swap" if len(parts) > 1:
-                other = draw(st.integers(0, len(parts) - 1))
-                parts[place], parts[other] = parts[other], parts[place]
-            case "word":
-                parts[place : place + draw(st.integers(0, 1))] = [draw(st.sampled_from(WORDS))]
-            case "character":
-                parts.insert(place, draw(st.characters(codec="utf-8")))
-            case "indent":
-                parts.insert(place, " " * draw(st.integers(1, 3)))
-    return "".join(parts)
-
-
-@FUZZ
-@given(damaged("lines"))
-def test_files_with_damaged_lines(text: str) -> None:
-    load(text, *needed(text))
-
-
-@FUZZ
-@given(damaged("tokens"))
-def test_files_with_damaged_tokens(text: str) -> None:
-    load(text, *needed(text))
-
-
-@FUZZ
+@settings(max_examples=EXAMPLES, deadline=None, derandomize=True, database=None)
 @given(st.text(max_size=200))
 def test_any_text(text: str) -> None:
-    load(text)
+    load_damaged(text)
 
 
-@FUZZ
-@given(st.lists(st.sampled_from([*WORDS, " ", " ", " ", "\n", "\n  ", "\n    - "]), max_size=60))
-def test_any_words(words: list[str]) -> None:
-    load("".join(words))
+@pytest.mark.slow
+def test_seeded_damage() -> None:
+    """The first inputs of `powderdsl fuzz --front-end`: of every kind, and not all of them refused at once."""
+    trials = [run_trial(seed) for seed in range(SEEDS)]
+    assert {trial.kind for trial in trials} == set(KINDS)
+    assert sum(trial.accepted for trial in trials) >= SEEDS // 50
+    wrong = [trial for trial in trials if trial.problem is not None and not trial.problem.startswith("took")]
+    assert wrong == []
 
 
-@FUZZ
-@given(st.lists(st.sampled_from(WORDS), max_size=14))
-def test_any_rule(words: list[str]) -> None:
-    rule = " ".join(words).replace("'", "")
-    core = whole("core")
-    assert isinstance(core, PackDecl)
-    load(f"pack: fuzz\nneeds: core\npasses:\n  fuzz:\n    do: '{rule}'\n", core)
+def test_a_mistake_of_ours_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(text: str) -> None:
+        raise RecursionError("too deep")
+
+    monkeypatch.setattr(damage, "load_damaged", broken)
+    assert run_trial(1).problem == "RecursionError: too deep"
+    monkeypatch.setattr(damage, "load_damaged", lambda text: None)
+    monkeypatch.setattr(damage, "MAX_MEGABYTES", 1)
+    assert "MB" in str(run_trial(1).problem)
 
 
-@FUZZ
-@given(st.text(alphabet="abf019.%()<>=!:+-*/,? \n", max_size=40))
-def test_any_expression(text: str) -> None:
-    fields = "fields: {f: {type: 0..9, at: place}}\n"
-    elements = 'elements: {a: {id: 0, color: "#000000"}, b: {id: 1, color: "#FFFFFF"}}\n'
-    load(f"pack: fuzz\n{elements}{fields}passes:\n  fuzz:\n    do: 'a -> b if {text}'\n")
+def test_one_seed_one_text() -> None:
+    assert damaged_text(5) == damaged_text(5)
+    assert len({damaged_text(seed) for seed in range(30)}) > 25
 
 
 def test_undamaged_files_load() -> None:
-    for name, text in RULES.items():
+    for name, text in rule_texts().items():
         if isinstance(whole(name), PackDecl) and "elements:" in text:
-            assert load(text, *needed(text)) is not None
+            assert load_damaged(text) is not None
+            assert isinstance(needed(text), list)

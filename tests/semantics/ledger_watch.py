@@ -13,6 +13,7 @@ import pytest
 from powderdsl import reference
 from powderdsl.ledgers.book import Ledger, RuleEntry
 from powderdsl.ledgers.changes import RuleLine, footprint, rule_line
+from powderdsl.ledgers.overlaps import order_matters
 from powderdsl.model.types import ELEMENT, Assign, Moment, Move, Pass, Ruleset, Swap, Transform
 
 Array = np.ndarray[Any, Any]
@@ -35,7 +36,9 @@ class Watch:
     def __post_init__(self) -> None:
         self.names = {element.id: element.name for element in self.ruleset.elements}
         self.entries: dict[RuleLine, RuleEntry] = {entry.rule: entry for entry in self.ledger.rules}
-        self.may_meet = {(one.first, one.second) for one in self.ledger.overlaps}
+        overlaps = self.ledger.overlaps
+        self.may_meet = {(one.first, one.second) for one in overlaps if not one.field}
+        self.writes = {(one.first, one.second, one.field) for one in overlaps}
         self.pass_of: dict[int, Pass] = {
             id(moment): pass_ for pass_ in self.ruleset.passes for moment in pass_.moments
         }
@@ -102,6 +105,7 @@ class Watch:
                 if isinstance(rule, Move):
                     self._overwrites(rule, line, moment, masks, before)
         self._expect(bool((explained | (before == after)).all()), f"{pass_.name}: a change without a rule")
+        self._write(moment, pass_, masks)
         if moment.policy != "prove":
             self._meet(moment, pass_, wanted)
 
@@ -163,6 +167,19 @@ class Watch:
                 if (claims[0] & claims[1]).any():
                     self.met.add(lines)
                     self._expect(lines in self.may_meet, f"{lines[0]} and {lines[1]} meet")
+
+    def _write(self, moment: Moment, pass_: Pass, masks: Any) -> None:
+        """Writes of one field of one cell whose order matters must be known to do so."""
+        plain = [(rule, rule) for rule in moment.rules if isinstance(rule, Assign)]
+        effects = [(e, rule) for rule in moment.rules if not isinstance(rule, Assign) for e in rule.effects]
+        for writes in (plain, effects):
+            cells = [reference.look(masks[id(rule)], (-w.offset[0], -w.offset[1])) for w, rule in writes]
+            for i, (b, second) in enumerate(writes):
+                for j, (a, first) in enumerate(writes[:i]):
+                    if order_matters(a, b) and (cells[i] & cells[j]).any():
+                        lines = rule_line(first, pass_), rule_line(second, pass_)
+                        self.met.add(lines)
+                        self._expect((*lines, a.field) in self.writes, f"{lines} write {a.field}")
 
     @staticmethod
     def _claimed(rule: Any, mask: Array) -> Array:

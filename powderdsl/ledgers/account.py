@@ -115,7 +115,7 @@ def _one_of(names: tuple[str, ...]) -> str:
 
 
 def _fields(ledger: Ledger) -> Iterator[str]:
-    yield "fields"
+    yield "fields" if ledger.fields else "fields: none"
     for entry in ledger.fields:
         place = "travels with its element" if entry.travels else "stays in its place"
         yield f"  {entry.name}: {entry.kind}{_bounds(entry)}, starts as {entry.default}, {place}"
@@ -129,9 +129,7 @@ def _bounds(entry: FieldEntry) -> str:
 
 
 def _overlaps(ledger: Ledger) -> Iterator[str]:
-    yield "lines that may meet"
-    if not ledger.overlaps:
-        yield "  none"
+    yield "lines that may meet" if ledger.overlaps else "lines that may meet: none"
     for outcome, words in OUTCOMES.items():
         found = [one for one in ledger.overlaps if one.outcome == outcome]
         if found:

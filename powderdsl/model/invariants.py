@@ -1,0 +1,231 @@
+"""Invariants: statements about all worlds, read as words and checked like conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from powderdsl.diagnostics import Span, suggest
+from powderdsl.model.compose import Composition
+from powderdsl.model.expressions import Typer
+from powderdsl.model.literals import read_bounds
+from powderdsl.model.operands import (
+    ELEMENT_HERE,
+    FALSE,
+    TRUE,
+    Absent,
+    Asleep,
+    Number,
+    Poisoned,
+    SetOf,
+    disjunction,
+    member,
+)
+from powderdsl.model.scope import Scope
+from powderdsl.model.types import (
+    Bounded,
+    Claim,
+    Expr,
+    Invariant,
+    Kernel,
+    Local,
+    Never,
+    Symmetric,
+    Total,
+    Unchanging,
+)
+from powderdsl.syntax.ast import Syntax
+
+MAX_STEPS = 1000
+"""Steps in a row that `never … for N steps` may ask for: each test runs them all."""
+
+MAX_RADIUS = 1000
+
+TRENDS = {"rises": "never rises", "falls": "never falls", "changes": "constant"}
+
+
+def check_invariants(composition: Composition, typer: Typer) -> tuple[Invariant, ...]:
+    """The invariants of all packs and of the ruleset. Those that need a pack which is not loaded are left out."""
+    written = [(pack.name.text, line) for pack in composition.packs for line in pack.invariants]
+    if composition.ruleset is not None:
+        written += [(composition.ruleset.name.text, line) for line in composition.ruleset.invariants]
+    found = []
+    for pack, line in written:
+        typer.absent.clear()
+        typer.start_rule(line.span)
+        try:
+            claim = _CLAIMS[line.kind](typer, line, Scope(pack, {}))
+        except Poisoned:
+            continue
+        except Asleep as asleep:
+            typer.reporter.report(
+                "PD506", f"this invariant is asleep: `{asleep.name}` is not loaded", line.span, "left out",
+                helps=[f"it wakes up with a pack that defines `{asleep.name}`"],
+            )  # fmt: skip
+            continue
+        found.append(Invariant(claim, pack, line.span))
+    return tuple(found)
+
+
+def _words(typer: Typer, words: tuple[Syntax, ...], wanted: tuple[tuple[str, ...], ...]) -> None:
+    """Report the first word that is none of those wanted in its place."""
+    for word, options in zip(words, wanted, strict=True):
+        if word.text not in options:
+            listed = " or ".join(f"`{option}`" for option in options)
+            close = [cure for cure in suggest(word.text, options) if cure.startswith("did")]
+            raise typer.fail(
+                "PD201", f"unexpected `{word.text}`", word.span, f"expected {listed}",
+                tuple(close) or _FORMS,
+            )  # fmt: skip
+
+
+_FORMS = (
+    "forms: `SET never changes`, `count(SET) is constant`, `count(SET) never rises`, `never CONDITION`, "
+    "`FIELD stays in LOW..HIGH`, `nothing reaches beyond N cells`, `mirrored worlds agree`",
+)
+
+
+def _number(typer: Typer, text: str, span: Span, least: int, most: int) -> int:
+    if len(text) > 6 or not least <= int(text) <= most:
+        raise typer.fail(
+            "PD402", f"{text[:12]} lies outside {least}..{most}", span, "out of range",
+            (f"write a number from {least} to {most}",),
+        )  # fmt: skip
+    return int(text)
+
+
+def _trend(typer: Typer, line: Syntax, scope: Scope) -> Claim:
+    """`SET never changes`, `count(…) never rises`, `count(…) never falls`."""
+    what, word = line.children
+    total = what.kind == "call" and what.text in ("count", "sum")
+    _words(typer, (word,), (tuple(TRENDS) if total else ("changes",),))
+    if total:
+        return _total_of(typer, what, TRENDS[word.text], scope)
+    return Unchanging(frozenset(_elements(typer, what, scope)))
+
+
+def _elements(typer: Typer, what: Syntax, scope: Scope) -> tuple[int, ...]:
+    operand = typer.evaluate(what, scope)
+    ids = typer.set_of(operand, what.span).ids
+    if not ids and typer.absent:
+        raise Asleep(", ".join(sorted(typer.absent)))
+    if not ids:
+        _says_nothing(typer, what.span, "no element is meant")
+    return ids
+
+
+def _total(typer: Typer, line: Syntax, scope: Scope) -> Claim:
+    """`count(…) is constant`, `sum(…) is constant`."""
+    (what,) = line.children
+    if what.kind != "is_" or what.children[0].kind != "call" or what.children[1].kind != "name":
+        raise typer.fail("PD201", "this states nothing", what.span, "not an invariant", _FORMS)
+    _words(typer, (what.children[1],), (("constant",),))
+    return _total_of(typer, what.children[0], "constant", scope)
+
+
+def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
+    if call.text not in ("count", "sum") or not call.children:
+        raise typer.fail(
+            "PD406", "a total is written `count(SET)` or `sum(VALUE)`", call.span, "not a total", _FORMS
+        )
+    for child in call.children:
+        if child.kind == "in_" and isinstance(typer.evaluate(child.children[1], scope), Kernel):
+            raise typer.fail("PD406", "an invariant counts the whole world", call.span, "has a neighbourhood")
+    operands = [typer.evaluate(child, scope) for child in call.children]
+    if all(isinstance(operand, (SetOf, Absent)) for operand in operands):
+        ids = {
+            number
+            for child, operand in zip(call.children, operands, strict=True)
+            for number in typer.set_of(operand, child.span).ids
+        }
+        if not ids and typer.absent:
+            raise Asleep(", ".join(sorted(typer.absent)))
+        if not ids or ids == set(typer.symbols.ids):
+            _says_nothing(typer, call.span, "all cells are counted" if ids else "no element is counted")
+        return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, frozenset(ids))
+    if call.text == "sum" and len(operands) == 1:
+        value = typer.value(operands[0], call.children[0].span)
+        if isinstance(value, Expr) and value.kind.name not in ("int", "flag"):
+            cure = "real numbers are rounded: their sums are constant for no rule"
+            raise typer.wrong(value, "a whole number", call.children[0].span, cure)
+        if isinstance(value, Number):
+            raise typer.wrong(value, "something that worlds have", call.children[0].span)
+        return Total(value, trend, None)
+    flags = [typer.flag(operand, child.span) for operand, child in zip(operands, call.children, strict=True)]
+    return Total(_asked(typer, disjunction(flags, call.span), call.span), trend, None)
+
+
+def _never(typer: Typer, line: Syntax, scope: Scope) -> Claim:
+    """`never CONDITION`, `never CONDITION for N steps`."""
+    duration = line.child("duration")
+    steps = 1
+    if duration is not None:
+        _words(typer, duration.children, (("steps", "step"),))
+        steps = _number(typer, duration.text, duration.span, 1, MAX_STEPS)
+    condition = typer.condition(line.children[0], scope)
+    if condition == TRUE:
+        raise typer.fail(
+            "PD511", "this invariant cannot hold", line.children[0].span, "every cell fulfils this",
+            ("say what no cell may fulfil",),
+        )  # fmt: skip
+    return Never(_asked(typer, condition, line.children[0].span), steps)
+
+
+def _asked(typer: Typer, condition: Expr, span: Span) -> Expr:
+    """The condition, unless it is no question: it may hang on a pack that is not loaded, or be false by its words."""
+    if condition == FALSE and typer.absent:
+        raise Asleep(", ".join(sorted(typer.absent)))
+    if condition in (TRUE, FALSE):
+        _says_nothing(
+            typer, span, "every cell fulfils this" if condition == TRUE else "no cell can fulfil this"
+        )
+    return condition
+
+
+def _stays(typer: Typer, line: Syntax, scope: Scope) -> Claim:
+    """`FIELD stays in LOW..HIGH`."""
+    what, bounds = line.children
+    operand = typer.evaluate(what, scope)
+    if isinstance(operand, Absent):
+        raise Asleep(operand.name)
+    if (
+        not isinstance(operand, Expr)
+        or operand.op not in ("field", "property")
+        or operand.kind.name not in ("int", "real", "vec2")
+    ):
+        raise typer.wrong(operand, "a field of numbers", what.span, "for anything else say `never CONDITION`")
+    lo, hi = read_bounds(bounds, typer)
+    name = str(operand.value)
+    field = typer.symbols.fields.get(name)
+    default = field.default if field is not None else None
+    parts = default if isinstance(default, tuple) else () if default is None else (default,)
+    outside = hi < operand.kind.lo or lo > operand.kind.hi
+    if outside or any(not lo <= part <= hi for part in parts):
+        found = f"`{name}` holds {operand.kind}" if outside else f"a fresh cell has {default}"
+        raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, ("widen the bounds",))
+    return Bounded(name, lo, hi)
+
+
+def _reach(typer: Typer, line: Syntax, scope: Scope) -> Claim:
+    """`nothing reaches beyond N cells`."""
+    _words(typer, line.children, (("nothing",), ("reaches",), ("beyond",), ("cells", "cell")))
+    return Local(_number(typer, line.text, line.span, 0, MAX_RADIUS))
+
+
+def _agree(typer: Typer, line: Syntax, scope: Scope) -> Claim:
+    """`mirrored worlds agree`, `rotated worlds agree`."""
+    _words(typer, line.children, (("mirrored", "rotated"), ("worlds",), ("agree",)))
+    return Symmetric(line.children[0].text)
+
+
+def _says_nothing(typer: Typer, span: Span, label: str) -> None:
+    typer.reporter.report("PD510", "this invariant says nothing", span, label, helps=["remove it"])
+
+
+_CLAIMS: dict[str, Callable[[Typer, Syntax, Scope], Claim]] = {
+    "trend": _trend,
+    "total": _total,
+    "never": _never,
+    "stays": _stays,
+    "reach": _reach,
+    "agree": _agree,
+}

@@ -1,0 +1,149 @@
+"""Counterexamples as files: people read them, `powderdsl test --replay` runs them, later tests try them first."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.model.state import slots
+from powderdsl.model.types import Ruleset
+from powderdsl.properties.outcomes import Counterexample, Property
+from powderdsl.properties.samples import Array, Sample
+from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.testing.reducer import to_tree
+from powderdsl.testing.rulemaker import write_yaml
+from powderdsl.testing.vocabulary import Tree
+from powderdsl.worlds.files import failure, read_source, replacing
+
+FOLDER = ".powderdsl"
+"""Where counterexamples are kept, under the working directory."""
+
+
+def is_kept() -> bool:
+    """Whether counterexamples are kept: not on machines that run tests and are thrown away."""
+    return not os.environ.get("CI")
+
+
+def file_of(rules: str, prop: Property, folder: Path = Path(FOLDER)) -> Path:
+    """The file of a property's counterexample: one for each property of some rules."""
+    words = re.sub(r"[^A-Za-z0-9]+", "-", f"{prop.owner}-{prop.text}").strip("-")[:60]
+    digest = hashlib.sha256(f"{rules}\n{prop.text}".encode()).hexdigest()[:8]
+    return folder / f"{words}-{digest}.yaml"
+
+
+def write_example(path: Path, rules: str, prop: Property, found: Counterexample) -> None:
+    """Write a counterexample.
+
+    Raises:
+        CompileError: PD613, the file cannot be written.
+    """
+    sample = found.sample
+    tree: dict[str, Tree] = {
+        "rules": rules,
+        "property": prop.text,
+        "steps": str(found.steps),
+        "seed": str(int(sample.seeds[0])),
+        "clock": str(int(sample.clock[0])),
+        "world": _rows(sample.ids[0]),
+    }
+    if sample.fields:
+        tree["fields"] = {name: _rows(values[0]) for name, values in sample.fields.items()}
+    if sample.params:
+        tree["params"] = {name: repr(float(values[0])) for name, values in sample.params.items()}
+    head = f"# Breaks `{prop.text}` ({prop.place or prop.owner})\n"
+    head += f"# Again: powderdsl test {rules} --replay {path}\n"
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_text(head + write_yaml(tree), encoding="utf-8")
+
+
+def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Sample, int]:
+    """A property's text, a world and a number of steps.
+
+    Raises:
+        CompileError: it cannot be read (PD1xx), or holds no counterexample for these rules (PD602).
+    """
+    reporter = Reporter()
+    source = read_source(path, reporter)
+    root = parse_yaml(source, reporter) if source is not None else None
+    reporter.raise_if_errors()
+    tree = to_tree(root) if root is not None else None
+    try:
+        assert isinstance(tree, dict)
+        dtypes = {slot.name: slot.dtype for slot in slots(ruleset)}
+        ids = _array(tree["world"], "uint8")
+        known = [element.id for element in ruleset.elements]
+        if ids.ndim != 2 or not ids.size or not np.isin(ids, known).all():
+            raise ValueError("cells of elements that the rules do not have")
+        fields = {name: _array(rows, dtypes[name])[None] for name, rows in _entries(tree.get("fields"))}
+        if any(values.shape[-2:] != ids.shape for values in fields.values()):
+            raise ValueError("a field of another size than the world")
+        names = {param.name for param in ruleset.params}
+        params = {
+            name: np.array([float(_line(text))])
+            for name, text in _entries(tree.get("params"))
+            if name in names
+        }
+        numbers = [int(_line(tree[key])) for key in ("steps", "seed", "clock")]
+        steps, seed, clock = numbers
+        if not 1 <= steps <= 100_000 or min(seed, clock) < 0:
+            raise ValueError("a number of steps that no test has")
+        sample = Sample(ids[None], np.array([seed], np.int64), np.array([clock], np.int64), fields, params)
+        return _line(tree["property"]), sample, steps
+    except CompileError:
+        raise
+    except (AssertionError, KeyError, ValueError, TypeError, OverflowError) as error:
+        note = (
+            f"{type(error).__name__}: {' '.join(str(error).split())}" if str(error) else "a part is missing"
+        )
+        helps = ("a counterexample is written by `powderdsl test`",)
+        raise failure(
+            "PD602", f"{path} is no counterexample for {ruleset.name}", notes=(note,), helps=helps
+        ) from None
+
+
+def kept_examples(
+    ruleset: Ruleset, properties: Mapping[str, Property], rules: str, folder: Path = Path(FOLDER)
+) -> Iterator[tuple[Property, Sample, int]]:
+    """The counterexamples that were kept for these rules. Files that no longer fit are passed over."""
+    for prop in properties.values():
+        path = file_of(rules, prop, folder)
+        if path.is_file():
+            try:
+                text, sample, steps = read_example(path, ruleset)
+            except CompileError:
+                continue
+            if text == prop.text:
+                yield prop, sample, steps
+
+
+def _rows(values: Array) -> Tree:
+    if values.ndim == 1:
+        return " ".join(str(value) for value in values)
+    return [_rows(part) for part in values]
+
+
+def _array(tree: Tree, dtype: str) -> Array:
+    def nested(part: Tree) -> list:
+        if isinstance(part, str):
+            return [np.dtype(dtype).type(word) for word in part.split()]
+        assert isinstance(part, list)
+        return [nested(item) for item in part]
+
+    return np.asarray(nested(tree), dtype)
+
+
+def _line(tree: Tree) -> str:
+    assert isinstance(tree, str)
+    return tree
+
+
+def _entries(tree: Tree | None) -> list[tuple[str, Tree]]:
+    assert tree is None or isinstance(tree, dict)
+    return list((tree or {}).items())

@@ -1,0 +1,150 @@
+"""What came of testing a property, as text for people and as plain data for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from powderdsl.diagnostics import Span
+from powderdsl.draw import palette, rgb, scale, to_numpy
+from powderdsl.model.text import one_line, place_of
+from powderdsl.model.types import Ruleset
+from powderdsl.properties.breaks import Tested
+from powderdsl.properties.samples import Array, Sample
+
+STATUSES = ("proven", "tested", "untested", "broken")
+
+MAX_DRAWN = 40
+"""Rows and columns that are drawn in full."""
+
+
+@dataclass(frozen=True)
+class Property:
+    """A claim with the words it is known by. `owner` is the pack that says it, or ``automatic``; then it has no place."""
+
+    claim: Tested
+    text: str
+    owner: str
+    span: Span | None
+
+    @property
+    def place(self) -> str:
+        """`file:line`, or nothing."""
+        return place_of(self.span) if self.span else ""
+
+
+@dataclass(frozen=True)
+class Counterexample:
+    """A small world that breaks a property after some steps.
+
+    `before` and `after` are ids [H, W] at the start and after the last step, `cell` is where it is broken.
+    `culprits` are the lines of rules without which the last step would not have broken it.
+    """
+
+    sample: Sample
+    steps: int
+    before: Array
+    after: Array
+    cell: tuple[int, int]
+    culprits: tuple[Span, ...]
+
+
+@dataclass(frozen=True)
+class Result:
+    """One of STATUSES, on how many worlds, and why. `reason` is a proof, or what stands in the way of one."""
+
+    prop: Property
+    status: str
+    worlds: int
+    reason: str
+    counterexample: Counterexample | None = None
+
+    @property
+    def holds(self) -> bool:
+        return self.status != "broken"
+
+
+def result_line(result: Result) -> str:
+    """`proven    core: … (…)`."""
+    how = {
+        "proven": result.reason,
+        "tested": f"{result.worlds:,} worlds{', ' + result.reason if result.reason else ''}",
+        "untested": result.reason,
+        "broken": result.prop.place or "of every ruleset",
+    }[result.status]
+    status = result.status.upper() if result.status == "broken" else result.status
+    return f"{status:<9} {result.prop.owner}: {result.prop.text} ({how})"
+
+
+def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[str]:
+    """The rule that broke it, the world before and after, and what else the world holds."""
+    steps = "1 step" if found.steps == 1 else f"{found.steps} steps"
+    yield f"broken at row {found.cell[0]}, column {found.cell[1]}, after {steps} with seed {int(found.sample.seeds[0])}"
+    for span in found.culprits:
+        yield f"by {place_of(span)}: {one_line(span)}"
+    glyphs = {element.id: element.glyph for element in ruleset.elements}
+    columns = [
+        [title, *(" ".join(glyphs.get(number, "?") for number in row) for row in ids[:MAX_DRAWN, :MAX_DRAWN].tolist())]
+        for title, ids in (("before", found.before), ("after", found.after))
+    ]  # fmt: skip
+    width = max(len(line) for lines in columns for line in lines) + 3
+    for lines in zip(*columns, strict=True):
+        yield "".join(line.ljust(width) for line in lines).rstrip()
+    names = {element.id: element.name for element in ruleset.elements}
+    there = np.unique([*found.before.ravel(), *found.after.ravel()]).tolist()
+    yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
+    for name, values in found.sample.fields.items():
+        yield f"{name}: {_short(values[0])}"
+    for name, values in found.sample.params.items():
+        yield f"{name} = {float(values[0]):g}"
+    if found.sample.clock.any():
+        yield f"the clock says {int(found.sample.clock[0])}"
+
+
+def _short(values: Array) -> str:
+    text = str(values.tolist())
+    return text if len(text) <= 200 else f"{text[:200]} …"
+
+
+def picture(found: Counterexample, ruleset: Ruleset) -> Array:
+    """Before and after side by side, uint8 [H', W', 3]."""
+    from powderdsl.draw import contact_sheet
+
+    colors = palette(ruleset.elements)
+    factor = max(1, min(32, 512 // max(found.before.shape)))
+    images = [to_numpy(scale(rgb(ids, colors), factor)) for ids in (found.before, found.after)]
+    return contact_sheet(images, columns=2, gap=8)
+
+
+def result_data(result: Result) -> dict[str, Any]:
+    """Plain data for JSON."""
+    data: dict[str, Any] = {
+        "property": result.prop.text,
+        "pack": result.prop.owner,
+        "place": result.prop.place,
+        "status": result.status,
+        "worlds": result.worlds,
+        "reason": result.reason,
+    }
+    found = result.counterexample
+    if found is not None:
+        data["counterexample"] = {
+            "before": found.before.tolist(),
+            "after": found.after.tolist(),
+            "steps": found.steps,
+            "row": found.cell[0],
+            "column": found.cell[1],
+            "seed": int(found.sample.seeds[0]),
+            "clock": int(found.sample.clock[0]),
+            "fields": _plain(found.sample.fields),
+            "params": _plain(found.sample.params),
+            "rules": [{"place": place_of(span), "text": one_line(span)} for span in found.culprits],
+        }
+    return data
+
+
+def _plain(arrays: Mapping[str, Array]) -> dict[str, Any]:
+    return {name: values[0].tolist() for name, values in arrays.items()}

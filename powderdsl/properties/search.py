@@ -1,0 +1,209 @@
+"""Proves what can be proven of a ruleset's properties, and tests the rest on random worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from time import monotonic
+
+import numpy as np
+
+from powderdsl.ledgers.book import Ledger, NotProven, Proven
+from powderdsl.ledgers.book import ledger as make_ledger
+from powderdsl.model.operands import ELEMENT_HERE, member
+from powderdsl.model.text import one_line
+from powderdsl.model.types import Never, Ruleset, Symmetric, Total
+from powderdsl.properties.blame import culprits
+from powderdsl.properties.breaks import (
+    Agreement,
+    Alike,
+    Breaks,
+    KnownIds,
+    Tested,
+    breaks,
+    is_paired,
+    look,
+    steps_for,
+)
+from powderdsl.properties.outcomes import Counterexample, Property, Result
+from powderdsl.properties.proofs import prove
+from powderdsl.properties.running import Runner
+from powderdsl.properties.samples import LARGE, Sample, random_samples
+from powderdsl.properties.shrink import shrink
+
+AUTOMATIC = "automatic"
+
+STEPS = (3, 3, 3, 10)
+"""How many steps batches run, one after the other."""
+
+COPIES = 1024
+"""How often a world runs where only frequencies can be compared."""
+
+FEW = {Agreement: 2, Alike: 2, Never: 4}
+"""Batches of a kind that is dear: of the oracle, of many copies, of many steps."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is tested: so many random worlds, at most so many seconds, from this seed on."""
+
+    examples: int = 1000
+    seconds: float = 60.0
+    seed: int = 0
+
+
+@dataclass
+class _Trial:
+    """A property that is being tested."""
+
+    prop: Property
+    note: str
+    worlds: int = 0
+    batches: int = 0
+    sample: Sample | None = None
+    steps: int = 0
+
+    @property
+    def claim(self) -> Tested:
+        return self.prop.claim
+
+
+@dataclass
+class Search:
+    """Tests the properties of one ruleset; worlds may be brought from outside too."""
+
+    runner: Runner
+    plan: Plan
+    ledger: Ledger
+    results: dict[str, Result] = field(default_factory=dict)
+    trials: list[_Trial] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, runner: Runner, plan: Plan, properties: Iterable[Property] | None = None) -> Search:
+        """Everything that can be proven is; the rest is to be tried."""
+        ledger = make_ledger(runner.ruleset)
+        search = cls(runner, plan, ledger)
+        for one in properties_of(runner.ruleset, ledger) if properties is None else properties:
+            declared = one.owner != AUTOMATIC
+            verdict = prove(one.claim, runner.ruleset, ledger) if declared else NotProven("")  # type: ignore[arg-type]
+            if isinstance(verdict, Proven):
+                given = f", given {verdict.given}" if verdict.given else ""
+                search.results[one.text] = Result(one, "proven", 0, verdict.reason + given)
+            else:
+                search.trials.append(_Trial(one, ""))
+        return search
+
+    def try_random(self) -> None:
+        """Random worlds, until there are enough of them, or time is over."""
+        until = monotonic() + self.plan.seconds
+        for number, sample in enumerate(
+            random_samples(self.runner.ruleset, self.plan.seed, self.plan.examples)
+        ):
+            if monotonic() > until:
+                return
+            self.try_sample(sample, STEPS[number % len(STEPS)])
+
+    def try_sample(self, sample: Sample, steps: int) -> None:
+        """Hold all properties that are not broken yet against some worlds."""
+        open_ = [trial for trial in self.trials if trial.sample is None]
+        shared = [t for t in open_ if not is_paired(t.claim) and steps_for(t.claim, steps) == steps]
+        if shared:
+            states = self.runner.states(sample, steps)
+            for trial in shared:
+                self._note(trial, sample, look(trial.claim, self.runner.ruleset, sample, states))
+        for trial in open_:
+            if trial in shared:
+                continue
+            most = FEW.get(type(trial.claim))
+            large = isinstance(trial.claim, Agreement) and sample.shape == LARGE
+            if most is not None and trial.batches >= most and not large:
+                continue
+            some = sample.select(slice(0, 4)) if isinstance(trial.claim, Alike) else sample
+            ran = steps_for(trial.claim, min(steps, 3))
+            self._note(trial, some, breaks(trial.claim, self.runner, some, ran))
+
+    def _note(self, trial: _Trial, sample: Sample, found: Breaks) -> None:
+        trial.batches += 1
+        trial.worlds += int(found.counts.sum())
+        broken = np.nonzero(found.first)[0]
+        if not len(broken):
+            return
+        first = int(broken[found.first[broken].argmin()])
+        if isinstance(trial.claim, Symmetric) and self.runner.ruleset.streams:
+            # The same numbers may be used in another way: then worlds agree in how often things happen.
+            turn = trial.claim.turn
+            trial.prop = replace(trial.prop, claim=Alike(turn, COPIES))
+            trial.note, trial.batches, trial.worlds = "in how often things happen", 0, 0
+            return
+        trial.sample, trial.steps = sample.one(first), int(found.first[first])
+
+    def finish(self) -> list[Result]:
+        """Make what was found small and name the rules; the results in the order of the properties."""
+        for trial in self.trials:
+            if trial.sample is None:
+                status = "tested" if trial.worlds else "untested"
+                note = trial.note if trial.worlds else "no random world starts as it demands"
+                self.results[trial.prop.text] = Result(trial.prop, status, trial.worlds, note)
+            else:
+                example = counterexample(trial.claim, self.runner, trial.sample, trial.steps)
+                self.results[trial.prop.text] = Result(
+                    trial.prop, "broken", trial.worlds, trial.note, example
+                )
+        order = [one.text for one in properties_of(self.runner.ruleset, self.ledger)]
+        return sorted(self.results.values(), key=lambda result: order.index(result.prop.text))
+
+
+def counterexample(claim: Tested, runner: Runner, sample: Sample, steps: int) -> Counterexample:
+    """A world that breaks a claim, made small."""
+    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps))
+
+
+def as_it_is(claim: Tested, runner: Runner, small: Sample, steps: int) -> Counterexample:
+    """A world that breaks a claim, and the rules that did it."""
+    cell = breaks(claim, runner, small, steps).cell[0]
+    states = runner.states(small, steps)
+    return Counterexample(
+        small,
+        steps,
+        states[0]["element"][0],
+        states[-1]["element"][0],
+        (int(cell[0]), int(cell[1])),
+        culprits(claim, runner.ruleset, small, steps),
+    )
+
+
+def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
+    """The declared invariants, then what every ruleset must fulfil."""
+    found = [Property(i.claim, one_line(i.span), i.pack, i.span) for i in ruleset.invariants]
+    found += [
+        Property(KnownIds(), "cells hold elements that the ruleset has", AUTOMATIC, None),
+        Property(Agreement(), "the backend gives what the reference gives", AUTOMATIC, None),
+    ]
+    found += [Property(claim, text, AUTOMATIC, None) for claim, text in _ledger_claims(ruleset, ledger)]
+    unique = {one.text: one for one in reversed(found)}
+    return [one for one in found if unique[one.text] is one]
+
+
+def find_property(ruleset: Ruleset, text: str) -> Property | None:
+    """The property that is known by these words."""
+    return next((one for one in properties_of(ruleset, make_ledger(ruleset)) if one.text == text), None)
+
+
+def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, str]]:
+    """The sums that the ledger decides, as claims: worlds that break one show a mistake in powderdsl."""
+    ids = {element.name: element.id for element in ruleset.elements}
+    tables: tuple[tuple[str, Sequence[tuple[str, ...]]], ...] = (
+        ("constant", ledger.constant_sums),
+        ("never falls", ledger.rising_sums),
+        ("never rises", ledger.falling_sums),
+    )
+    for trend, sums in tables:
+        for names in sums:
+            if len(names) == len(ledger.elements):
+                continue
+            numbers = tuple(sorted(ids[name] for name in names))
+            verb = "is constant" if trend == "constant" else trend
+            yield (
+                Total(member(ELEMENT_HERE, numbers), trend, frozenset(numbers)),
+                f"count({', '.join(names)}) {verb}",
+            )

@@ -1,0 +1,180 @@
+"""Makes a world that breaks a claim small: fewer steps, rows and columns, fewer things in it.
+
+All smaller worlds of one kind are tried in one batch, each with some seeds: where chance decides, another seed often
+does for a smaller world what the first one did for the larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from time import monotonic
+
+import numpy as np
+
+from powderdsl.properties.breaks import Agreement, Alike, Runs, Tested, breaks, is_paired, steps_for
+from powderdsl.properties.samples import Sample
+
+SEEDS = 8
+"""How many seeds each smaller world is tried with, its own first."""
+
+MAX_BATCH = 1024
+
+
+def shrink(
+    claim: Tested, runs: Runs, sample: Sample, steps: int, seconds: float = 10.0
+) -> tuple[Sample, int]:
+    """The smallest world found that still breaks the claim, and after how many steps. `sample` is one world.
+
+    It ends when nothing goes any more, or after so many seconds.
+    """
+    until = monotonic() + seconds
+    tries = 1 if isinstance(claim, Agreement | Alike) or not runs.ruleset.streams else SEEDS
+    sample, steps = _later(claim, runs, sample, steps)
+    while monotonic() < until:
+        smaller = sample
+        for group in _GROUPS:
+            while monotonic() < until:
+                found = _first(claim, runs, group(smaller), steps, tries)
+                if found is None:
+                    break
+                smaller, steps = found
+        if smaller is sample:
+            break
+        sample = smaller
+    return sample, steps
+
+
+def _later(claim: Tested, runs: Runs, sample: Sample, steps: int) -> tuple[Sample, int]:
+    """The world as it was one step before it broke the claim, if it does so from there."""
+    if is_paired(claim) or steps < 2 or steps_for(claim, steps) > steps:
+        return sample, steps
+    before = dict(runs.states(sample, steps - 1)[-1])
+    late = replace(sample, ids=before.pop("element"), clock=sample.clock + steps - 1, fields=before)
+    return (late, 1) if breaks(claim, runs, late, 1).first.any() else (sample, steps)
+
+
+def _first(
+    claim: Tested, runs: Runs, candidates: list[Sample], steps: int, tries: int
+) -> tuple[Sample, int] | None:
+    """The first of these worlds of one shape that breaks the claim, with the seed that does it soonest."""
+    most = max(MAX_BATCH // tries, 1)
+    for start in range(0, len(candidates), most):
+        some = candidates[start : start + most]
+        batch = _together([_seeded(one, number) for one in some for number in range(tries)])
+        first = breaks(claim, runs, batch, steps).first
+        broken = np.nonzero(first)[0]
+        if len(broken):
+            best = min(broken.tolist(), key=lambda i: (i // tries, first[i], i))
+            return batch.one(best), int(first[best])
+    return None
+
+
+def _seeded(sample: Sample, number: int) -> Sample:
+    return replace(sample, seeds=np.array([number - 1])) if number else sample
+
+
+def _together(samples: list[Sample]) -> Sample:
+    """Worlds of one shape that have the same fields, as one batch."""
+    first = samples[0]
+    return Sample(
+        np.concatenate([one.ids for one in samples]),
+        np.concatenate([one.seeds for one in samples]),
+        np.concatenate([one.clock for one in samples]),
+        {name: np.concatenate([one.fields[name] for one in samples]) for name in first.fields},
+        {name: np.concatenate([one.params[name] for one in samples]) for name in first.params},
+    )
+
+
+# Smaller worlds, in the order in which they are tried
+
+
+def _plain(sample: Sample) -> list[Sample]:
+    """Without its fields and parameters, at the first step."""
+    if sample.fields or sample.params or sample.clock.any():
+        return [replace(sample, fields={}, params={}, clock=np.zeros(1, np.int64))]
+    return []
+
+
+def _fresh(sample: Sample) -> list[Sample]:
+    return [replace(sample, fields={})] if sample.fields else []
+
+
+def _usual(sample: Sample) -> list[Sample]:
+    return [replace(sample, params={})] if sample.params else []
+
+
+def _fewer_fields(sample: Sample) -> list[Sample]:
+    """With one field that is 0 everywhere."""
+    return [
+        replace(sample, fields={**sample.fields, name: np.zeros_like(values)})
+        for name, values in sample.fields.items()
+        if values.any()
+    ]
+
+
+def _early(sample: Sample) -> list[Sample]:
+    return [replace(sample, clock=np.zeros(1, np.int64))] if sample.clock.any() else []
+
+
+def _parts(axis: int, halves: bool) -> Callable[[Sample], list[Sample]]:
+    """Worlds with half of the rows (axis 0) or columns (axis 1), or with one less."""
+
+    def group(sample: Sample) -> list[Sample]:
+        size = sample.shape[axis]
+        if size < 2 or (halves and size < 4):
+            return []
+        everything = np.arange(size)
+        if halves:
+            half = size // 2
+            kept = [everything[at : at + half] for at in range(size - half + 1)]
+        else:
+            kept = [np.delete(everything, gone) for gone in range(size - 1, -1, -1)]
+        return [_cut(sample, axis, keep) for keep in kept]
+
+    return group
+
+
+def _cut(sample: Sample, axis: int, keep: np.ndarray) -> Sample:
+    place = axis - 2  # rows and columns are the last axes of every array
+    return replace(
+        sample,
+        ids=np.take(sample.ids, keep, place),
+        fields={name: np.take(values, keep, place) for name, values in sample.fields.items()},
+    )
+
+
+def _fewer_kinds(sample: Sample) -> list[Sample]:
+    """All cells of one element replaced by the lowest that is there."""
+    ground = sample.ids.min()
+    return [
+        replace(sample, ids=np.where(sample.ids == kind, ground, sample.ids))
+        for kind in np.unique(sample.ids)
+        if kind != ground
+    ]
+
+
+def _fewer_cells(sample: Sample) -> list[Sample]:
+    """One cell replaced by the lowest element that is there."""
+    ground = sample.ids.min()
+    found = []
+    for row, column in np.argwhere(sample.ids[0] != ground).tolist():
+        ids = sample.ids.copy()
+        ids[0, row, column] = ground
+        found.append(replace(sample, ids=ids))
+    return found
+
+
+_GROUPS: tuple[Callable[[Sample], list[Sample]], ...] = (
+    _plain,
+    _parts(0, True),
+    _parts(1, True),
+    _parts(0, False),
+    _parts(1, False),
+    _fresh,
+    _usual,
+    _early,
+    _fewer_fields,
+    _fewer_kinds,
+    _fewer_cells,
+)

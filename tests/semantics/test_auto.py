@@ -1,0 +1,426 @@
+"""The backend `auto`: when it compiles, when it changes over, what it says; and that no cell is changed by it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import powderdsl
+from powderdsl import auto_program
+from powderdsl.auto_program import AutoProgram
+from powderdsl.backends.native_build import Building, building
+from powderdsl.backends.native_compilers import NoCompiler
+from powderdsl.backends.torch_job import Job
+from powderdsl.compiler import lower
+from powderdsl.ir.text import print_program
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.native_start import start_key
+from powderdsl.simulator import Simulator, World
+from powderdsl.testing.cases import load_text, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.testing.compare import find_difference
+from tests.cli.commands import environment_with
+from tests.cli.commands import powderdsl as command
+from tests.processes import alive, waited
+
+RULES = """\
+pack: kettle
+elements:
+  air: {id: 0, color: "#102030"}
+  drop: {id: 1, color: "#FEDCBA"}
+fields:
+  level: {type: -50..50, at: element, default: 3}
+  heat: {type: real(-9..9), at: place}
+streams: [coin]
+params: {rate: 30%}
+passes:
+  fall:
+    do: drop swaps below if below is air and coin < rate
+  warm:
+    after: fall
+    do:
+      - heat := heat * 0.7 + level / 7 - heat / 3 * (heat * 0.1 + 1) where coin < 0.7
+      - level += 1 where heat > 0.5 and level < 50
+"""
+
+
+# --- when it changes over, with programs made up for it
+
+
+@dataclass
+class Counter:
+    """A program that counts its steps in the state; it takes its time."""
+
+    name: str
+    seconds: float = 0.0
+    log: list[tuple[str, int, int]] = field(default_factory=list)
+
+    def run(self, job: Job) -> Mapping[str, Any]:
+        self.log.append((self.name, int(job.clock[2][0]), job.steps))
+        time.sleep(self.seconds * job.steps)
+        return {"element": job.state["element"] + job.steps}
+
+
+def job(steps: int, start: int = 0, **changes: Any) -> Job:
+    clock = (torch.zeros(1, dtype=torch.int64),) * 2 + (torch.tensor([start]),)
+    state = {"element": torch.full((1, 2, 2), start)}
+    return Job(state, clock, steps, {}, changes.get("draws", {}), changes.get("passes"))
+
+
+class Compiler:
+    """Gives a program when it is told to."""
+
+    def __init__(self, program: Counter):
+        self.program, self.go, self.asked = program, threading.Event(), 0
+
+    def __call__(self) -> Counter:
+        self.asked += 1
+        assert self.go.wait(60)
+        return self.program
+
+
+def made(seconds: float) -> tuple[AutoProgram, Compiler, list[tuple[str, int, int]]]:
+    log: list[tuple[str, int, int]] = []
+    torch_program = Counter("torch", seconds, log)
+    compiler = Compiler(Counter("native", 0, log))
+    return AutoProgram(lambda: torch_program, lambda: None, compiler), compiler, log
+
+
+def test_little_work_starts_no_compiler() -> None:
+    program, compiler, log = made(0.0001)
+    state = {}
+    for start in range(0, 300, 100):
+        state = program.run(job(100, start))
+    assert int(state["element"][0, 0, 0]) == 300
+    assert program.run(job(0, 300))["element"].tolist() == [[[300, 300], [300, 300]]]
+    assert compiler.asked == 0
+    assert program.running == "torch"
+    assert program.notes == ("torch: native is compiled from 2 s of work, or by --backend native",)
+    assert {name for name, _, _ in log} == {"torch"}
+
+
+def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It compiles as soon as the pace shows what is to come, and changes over within the call."""
+    monkeypatch.setattr(auto_program, "SLICE", 0.02)
+    program, compiler, log = made(0.005)
+    threading.Timer(0.3, compiler.go.set).start()
+    state = program.run(job(5000))  # 25 s on torch
+    assert int(state["element"][0, 0, 0]) == 5000
+    assert compiler.asked == 1
+    assert program.running == "native"
+    done = 0
+    for _, start, steps in log:  # no step twice, none left out
+        assert start == done
+        done += steps
+    assert [name for name, _, _ in log] == ["torch"] * (len(log) - 1) + ["native"]
+    assert log[-1][2] > 4000
+    assert program.notes[0].startswith(f"torch for {5000 - log[-1][2]} steps while native was made ready")
+    assert program.notes[0].endswith(f"then native for {log[-1][2]}")
+
+
+def test_many_short_calls_are_worth_it_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(auto_program, "WORTH", 0.05)
+    program, compiler, _ = made(0.005)
+    for start in range(30):
+        program.run(job(1, start))
+    assert compiler.asked == 1
+    assert "native is being made ready" in program.notes[0]
+    compiler.go.set()
+    assert waited(lambda: program.running == "native")
+
+
+def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
+    log: list[tuple[str, int, int]] = []
+    program = AutoProgram(
+        lambda: Counter("torch", 0, log), lambda: Counter("native", 0, log), lambda: Counter("", 0, log)
+    )
+    program.run(job(3))
+    program.run(job(4, draws={"coin": torch.zeros(1, 2, 2)}))
+    program.run(job(5, passes=frozenset({"fall"})))
+    assert log == [("native", 0, 3), ("torch", 0, 4), ("torch", 0, 5)]
+    assert program.notes == (
+        "native: it was compiled before",
+        "torch for 9 steps with given draws or chosen passes",
+    )
+
+
+@pytest.mark.parametrize("problem", [NoCompiler("no C++ compiler: tried g++"), ValueError("oh")])
+def test_without_native_code_torch_goes_on(problem: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(auto_program, "WORTH", 0.0)
+    log: list[tuple[str, int, int]] = []
+    asked = []
+
+    def fails() -> Counter:
+        asked.append(1)
+        raise problem
+
+    program = AutoProgram(lambda: Counter("torch", 0.001, log), lambda: None, fails)
+    for start in range(50):
+        program.run(job(1, start))
+    assert len(asked) == 1
+    assert str(problem) in program.notes[0]
+    assert "pip install ziglang" in program.notes[1]
+
+
+def test_threads_share_one_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(auto_program, "WORTH", 0.0)
+    program, compiler, _ = made(0.0001)
+    results = []
+
+    def run() -> None:
+        for start in range(0, 2000, 20):
+            results.append(int(program.run(job(20, start))["element"][0, 0, 0]) - start)
+
+    threads = [threading.Thread(target=run) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    compiler.go.set()
+    for thread in threads:
+        thread.join()
+    assert results == [20] * 400
+    assert compiler.asked == 1
+    assert program.running == "native"
+
+
+# --- real programs
+
+
+@pytest.fixture
+def rules() -> Ruleset:
+    return load_text(RULES, "kettle.yaml")
+
+
+def compilers() -> list[str]:
+    """Every C++ compiler of this machine, as $CXX."""
+    found = [name for name in ("g++", "clang++") if shutil.which(name)]
+    package = find_spec("ziglang")
+    if package is not None and package.origin:
+        found.append(f"'{Path(package.origin).with_name('zig')}' c++")
+    return found
+
+
+def start_of(sim: Simulator) -> World:
+    return random_start(sim.ruleset, Choices.seeded(5), (9, 21, 70)).world(sim)
+
+
+needs_compiler = pytest.mark.skipif(not compilers(), reason="no C++ compiler")
+
+
+@pytest.mark.parametrize("cxx", compilers())
+def test_every_compiler_gives_the_oracles_worlds(
+    cxx: str, rules: Ruleset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CXX", cxx)
+    oracle = powderdsl.compile(rules, backend="reference")
+    with building(Building("-O2", tmp_path)):
+        native = powderdsl.compile(rules, backend="native", threads=2)
+    assert (
+        find_difference(oracle.step(start_of(oracle), 25).state, native.step(start_of(native), 25).state)
+        is None
+    )
+
+
+@needs_compiler
+def test_auto_changes_over_to_the_same_worlds_and_remembers(
+    rules: Ruleset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(auto_program, "WORTH", 0.0)
+    with building(Building("-O0", tmp_path)):
+        sims = [powderdsl.compile(rules) for _ in range(3)]
+        assert [sim.running for sim in sims] == ["torch"] * 3
+        worlds = [start_of(sim) for sim in sims]
+        steps, end = 0, time.monotonic() + 300
+        while any(sim.running == "torch" for sim in sims) and time.monotonic() < end:
+            worlds = [world.sim.step(world) for world in worlds]
+            steps += 1
+            time.sleep(0.05)  # the worlds need not age while the compiler is busy
+        worlds = [world.sim.step(world, 5) for world in worlds]
+        assert [sim.running for sim in sims] == ["native"] * 3
+        oracle = powderdsl.compile(rules, backend="planes")
+        expected = oracle.step(start_of(oracle), steps + 5)
+        for world in worlds:
+            assert find_difference(expected.state, world.state) is None
+        assert len(list(tmp_path.glob("*/program"))) == 1
+
+        # Other values of parameters, other tests and comments: nothing is compiled, it starts natively.
+        text = RULES.replace("30%", "99%").replace("passes:", "# a comment\npasses:")
+        again = powderdsl.compile(load_text(text, "elsewhere.yaml"))
+        assert again.running == "native"
+        assert again.notes == ("native: it was compiled before",)
+        other = powderdsl.compile(load_text(RULES.replace("0.7 +", "0.6 +"), "kettle.yaml"))
+        assert other.running == "torch"
+
+
+@needs_compiler
+def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
+    with building(Building("-O0", tmp_path)):
+        powderdsl.compile(rules, backend="native")
+        (library,) = tmp_path.glob("*/program")
+        (start,) = tmp_path.glob("*.json")
+        whole = start.read_bytes()
+        for damage in (whole[:40], b"[]", b'{"library": 3}', whole.replace(b'"layout"', b'"lay"'), b"\xff"):
+            start.write_bytes(damage)
+            assert powderdsl.compile(rules).running == "torch"
+            powderdsl.compile(rules, backend="native")
+            assert start.read_bytes() == whole
+            assert powderdsl.compile(rules).running == "native"
+        library.write_bytes(library.read_bytes()[:1000])
+        # In a process of its own: this one has the library in memory.
+        program = (
+            "import sys; from pathlib import Path\n"
+            "from powderdsl.backends.native_build import Building, building\n"
+            "from powderdsl.testing.cases import load_text\n"
+            "from powderdsl.simulator import compile\n"
+            "with building(Building('-O0', Path(sys.argv[1]))):\n"
+            "    rules = load_text(sys.argv[2], 'kettle.yaml')\n"
+            "    print(compile(rules).running, compile(rules, backend='native').running, compile(rules).running)"
+        )
+        run = subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path), RULES],
+            env=environment_with(),
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert run.stdout == "torch native native\n"
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_forks_run_native_code_too(rules: Ruleset, tmp_path: Path) -> None:
+    """With its parent's memory, but without its threads: a fork starts its own, and does not wait for a build that
+    nobody does any more."""
+    program = """
+import os, sys, time
+from pathlib import Path
+from powderdsl import auto_program
+from powderdsl.backends.native_build import Building, building
+from powderdsl.testing.cases import load_text
+from powderdsl.simulator import compile
+auto_program.WORTH = 0.0
+with building(Building('-O0', Path(sys.argv[1]))):
+    rules = load_text(sys.argv[2], 'kettle.yaml')
+    auto = compile(rules, threads=2)
+    old = auto.step(auto.step(auto.world([[[0, 1]] * 3] * 33), 2), 2)   # begins to compile
+    print(auto.running, flush=True)
+    pid = os.fork()
+    while auto.running == 'torch':
+        old = auto.step(old)
+        time.sleep(0.05)
+    if pid == 0:
+        os._exit(0)
+    assert os.waitpid(pid, 0)[1] == 0
+    old = auto.step(old)   # with threads
+    pid = os.fork()
+    new = auto.step(old, 3).ids.sum()
+    if pid == 0:
+        os._exit(0)
+    assert os.waitpid(pid, 0)[1] == 0
+    print(auto.running)
+"""
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program, str(tmp_path), RULES],
+        env=environment_with(OMP_NUM_THREADS="1"),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert (run.returncode, run.stdout) == (0, "torch\nnative\n"), run.stderr
+
+
+def test_the_end_does_not_wait_for_the_compiler(tmp_path: Path) -> None:
+    """An interpreter that ends takes its compiler along, and what that had begun."""
+    compiler = tmp_path / "cc"
+    compiler.write_text(
+        f'#!/bin/sh\n[ "$1" = --version ] && echo g++ 1 && exit\necho $$ > {tmp_path}/pid\nexec sleep 1000\n'
+    )
+    compiler.chmod(0o755)
+    program = """
+import sys, time
+from pathlib import Path
+from powderdsl import auto_program
+from powderdsl.backends.native_build import Building, building
+from powderdsl.testing.cases import load_text
+from powderdsl.simulator import compile
+auto_program.WORTH = 0.0
+cache = Path(sys.argv[1])
+with building(Building('-O0', cache / 'cache')):
+    (cache / 'cache').mkdir()
+    auto = compile(load_text(sys.argv[2], 'kettle.yaml'))
+    auto.step(auto.step(auto.world([[0, 1]] * 3)))
+while not (cache / 'pid').exists():
+    time.sleep(0.02)
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path), RULES],
+        env=environment_with(CXX=str(compiler)),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (run.returncode, run.stderr) == (0, "")
+    assert not list((tmp_path / "cache").glob(".build-*"))
+    assert waited(lambda: not alive(int((tmp_path / "pid").read_text())))
+
+
+# --- what it hangs on
+
+
+@pytest.mark.parametrize("name", ["powderworld", "life", "forest_fire", "margolus", "kettle"])
+def test_values_of_parameters_take_no_part_in_what_is_compiled(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler = tmp_path / "cc"
+    compiler.write_text("#!/bin/sh\necho g++ 1\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    found = load_text(RULES, "kettle.yaml") if name == "kettle" else powderdsl.load(name)
+    changed = found.with_params({p.name: p.kind.hi or 1 for p in found.params})
+    assert start_key(changed) == start_key(found)
+    assert print_program(lower(changed)) == print_program(lower(found))
+
+
+def test_fingerprints_are_the_same_in_every_process() -> None:
+    program = (
+        "import powderdsl; from powderdsl.model.fingerprint import fingerprint;"
+        "print(fingerprint(powderdsl.load('powderworld')))"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env=environment_with(PYTHONHASHSEED=seed),
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2")
+    }
+    assert found == {fingerprint(powderdsl.load("powderworld")) + "\n"}
+
+
+def test_run_says_what_ran_and_why(tmp_path: Path) -> None:
+    quick = command(
+        "run", "life", "--size", "8x8", "--steps", "4", "-v", "--out", tmp_path / "x.npz", CXX="no-such"
+    )
+    assert quick.exit_code == 0
+    assert "torch on cpu" in quick.stderr
+    assert "  torch: no C++ compiler: $CXX is `no-such`, which cannot be run" in quick.stderr
+    native = command("run", "life", "--size", "8x8", "--backend", "native", CXX="no-such")
+    assert native.exit_code == 2
+    assert "PD701" in native.stderr
+    assert "pip install ziglang" in native.stderr

@@ -1,0 +1,211 @@
+"""The cuda backend: its kernels run on the CPU, by fibers, and give the oracle's worlds; on a GPU they do so for real."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import powderdsl
+from powderdsl.backends.cuda_source import KernelSource, cuda_source
+from powderdsl.compiler import load, lower, shipped_rules
+from powderdsl.diagnostics import CompileError
+from powderdsl.ir.segments import segments
+from powderdsl.model.types import Ruleset
+from powderdsl.simulator import compile as compile_ruleset
+from powderdsl.testing.cases import load_text, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.testing.compare import assert_same
+from powderdsl.testing.cuda_emulation import emulated_simulator
+from powderdsl.testing.rulemaker import random_ruleset_text
+
+PACKS_ALONE = {"acid", "cloner", "core", "fire", "gas", "lava", "plant", "sand", "stone", "water", "wind"}
+LARGE = "powderworld"
+RULESETS = [
+    pytest.param(name, marks=pytest.mark.slow) if name == LARGE else name
+    for name in shipped_rules()
+    if name not in PACKS_ALONE
+]
+H200 = 232_448
+"""Bytes of shared memory that a block may have there."""
+
+SIZES = [(3, 4, 5), (2, 9, 33), (2, 3, 64), (1, 2, 70)]
+"""Worlds of which several share a block, words that end early, rows of two words and of three."""
+
+SEEDS = (3, 4, 33, 55)
+"""Random rulesets with reals, movements by several masks, and offsets as large as the grid."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Compiled kernels, for all tests of this file."""
+    return tmp_path_factory.mktemp("kernels")
+
+
+def kernels(ruleset: Ruleset, height: int, width: int, shared: int = H200) -> list[KernelSource]:
+    found = segments(lower(ruleset))
+    return [cuda_source(one.planes, height, width, shared) for one in found if one.planes is not None]
+
+
+def random_ruleset(seed: int) -> Ruleset:
+    return load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
+
+
+@pytest.mark.parametrize("name", RULESETS)
+def test_emulated_kernels_give_the_same_worlds(name: str, folder: Path) -> None:
+    """Whichever thread comes first: what lies between two barriers does not depend on it."""
+    ruleset = load(name)
+    simulators = [
+        compile_ruleset(ruleset, backend="reference"),
+        *(emulated_simulator(ruleset, folder, order) for order in (0, 1)),
+    ]
+    for seed, shape in enumerate(SIZES):
+        start = random_start(ruleset, Choices.seeded(seed), shape)
+        assert_same(ruleset, start, steps=3, simulators=simulators)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_random_rulesets(seed: int, folder: Path) -> None:
+    """On the chip, with fields outside, and with everything outside."""
+    ruleset = random_ruleset(seed)
+    shape = (3, 2, 37)
+    source = kernels(ruleset, *shape[1:])[0]
+    assert source.scratch == 0
+    limits = (H200, source.shared - 4, 300)
+    simulators = [
+        compile_ruleset(ruleset, backend="reference"),
+        *(emulated_simulator(ruleset, folder, n % 2, limit) for n, limit in enumerate(limits)),
+    ]
+    assert_same(ruleset, random_start(ruleset, Choices.seeded(seed), shape), steps=2, simulators=simulators)
+
+
+def test_many_steps_a_launch(folder: Path, torch) -> None:  # type: ignore[no-untyped-def]
+    """Twenty steps in one launch are twenty launches, and the state stays packed in between."""
+    simulator = emulated_simulator(load("core+sand+water"), folder)
+    ids = torch.randint(4, (3, 9, 40), generator=torch.Generator().manual_seed(1))
+    world = simulator.world(ids)
+    one_by_one = world
+    for _ in range(20):
+        one_by_one = simulator.step(one_by_one)
+    at_once = simulator.step(world, 20)
+    assert (at_once.ids == one_by_one.ids).all()
+    assert (at_once.ids != world.ids).any()
+
+
+def test_a_missing_barrier_would_be_seen(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import powderdsl.backends.torch_cuda as torch_cuda
+
+    def careless(*arguments: object) -> KernelSource:
+        source = cuda_source(*arguments)  # type: ignore[arg-type]
+        before, passes = source.text.split("void pass_0", 1)
+        passes, after = passes.split("void reset_slots", 1)
+        text = f"{before}void pass_0{passes.replace('SYNC();', '')}void reset_slots{after}"
+        return KernelSource(text, source.layout, source.group, source.threads, source.shared, source.scratch)
+
+    ruleset = load("core+sand+water")
+    oracle = compile_ruleset(ruleset, backend="reference")
+    start = random_start(ruleset, Choices.seeded(2), (2, 9, 40))
+    assert_same(ruleset, start, steps=3, simulators=[oracle, emulated_simulator(ruleset, folder)])
+    monkeypatch.setattr(torch_cuda, "cuda_source", careless)
+    with pytest.raises(AssertionError, match="differ in step"):
+        assert_same(ruleset, start, steps=3, simulators=[oracle, emulated_simulator(ruleset, folder)])
+
+
+def test_what_does_not_fit_leaves_the_chip() -> None:
+    """Fields first, then planes; a block never takes more shared memory than it may."""
+    ruleset = load(LARGE)
+    for shared, side in ((H200, 64), (H200, 256), (48 << 10, 64), (1 << 10, 64)):
+        (source,) = kernels(ruleset, side, side, shared)
+        assert source.shared <= shared
+        assert (source.scratch == 0) == ((shared, side) == (H200, 64))
+    assert kernels(load("life"), 8, 8)[0].group == 8
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_without_a_gpu_it_is_refused(device: str, torch) -> None:  # type: ignore[no-untyped-def]
+    if device == "cuda" and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(CompileError) as found:
+        powderdsl.compile("life", backend="cuda", device=device)
+    assert found.value.diagnostics[0].code == "PD701"
+    assert found.value.diagnostics[0].helps
+
+
+@pytest.mark.slow
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", ["margolus", LARGE])
+def test_kernels_compile_for_a_gpu(name: str, tmp_path: Path) -> None:
+    compiler = shutil.which("nvcc")
+    if compiler is None:
+        pytest.skip("nvcc not found")
+    for source in kernels(load(name), 64, 64):
+        unit = tmp_path / "kernel.cu"
+        unit.write_text(source.text, encoding="utf-8")
+        command = [
+            compiler,
+            "-arch=sm_90",
+            "-std=c++17",
+            "-fmad=false",
+            "-w",
+            "-cubin",
+            "-o",
+            f"{unit}.cubin",
+        ]
+        run = subprocess.run([*command, str(unit)], capture_output=True, text=True, timeout=600)
+        assert run.returncode == 0, run.stderr[:2000]
+
+
+# On a GPU
+
+
+@pytest.fixture
+def gpu(torch) -> str:  # type: ignore[no-untyped-def]
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return "cuda"
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", [name for name in shipped_rules() if name not in PACKS_ALONE])
+def test_same_worlds_on_a_gpu(name: str, gpu: str) -> None:
+    ruleset = load(name)
+    simulators = [
+        compile_ruleset(ruleset, backend="reference"),
+        *(compile_ruleset(ruleset, backend=backend, device=gpu) for backend in ("cuda", "planes")),
+    ]
+    for seed, shape in enumerate([*SIZES, (5, 64, 64), (1, 130, 200)]):
+        start = random_start(ruleset, Choices.seeded(seed), shape)
+        assert_same(ruleset, start, steps=4, simulators=simulators)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("seed", range(0, 200, 8))
+def test_random_rulesets_on_a_gpu(seed: int, gpu: str) -> None:
+    try:
+        ruleset = random_ruleset(seed)
+    except CompileError:
+        return
+    simulators = [
+        compile_ruleset(ruleset, backend="reference"),
+        compile_ruleset(ruleset, backend="cuda", device=gpu),
+    ]
+    for part, shape in enumerate([(3, 2, 5), (2, 3, 65)]):
+        start = random_start(ruleset, Choices.seeded(2 * seed + part), shape)
+        assert_same(ruleset, start, steps=2, simulators=simulators)
+
+
+@pytest.mark.cuda
+def test_thousands_of_worlds_and_steps_on_a_gpu(gpu: str, torch) -> None:  # type: ignore[no-untyped-def]
+    """A thousand steps in one launch, on every multiprocessor; `planes` on the same device is the other side."""
+    ruleset = load(LARGE)
+    ids = torch.tensor([element.id for element in ruleset.elements])
+    start = ids[torch.randint(len(ids), (600, 64, 64), generator=torch.Generator().manual_seed(3))]
+    kernel = compile_ruleset(ruleset, backend="cuda", device=gpu)
+    planes = compile_ruleset(ruleset, backend="planes", device=gpu)
+    after = kernel.step(kernel.world(start, seed=4), 1000)
+    expected = planes.step(planes.world(start, seed=4), 1000)
+    for slot in kernel.slots:
+        assert torch.equal(after.state[slot.name], expected.state[slot.name]), slot.name
+    assert torch.equal(after.ids, kernel.step(kernel.step(kernel.world(start, seed=4), 300), 700).ids)

@@ -1,0 +1,112 @@
+"""Which rule wrote each cell: the same on every backend, and what an independent account of the step says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from powderdsl.compiler import load
+from powderdsl.model.types import Ruleset
+from powderdsl.provenance import SLOT, Provenance, Recorder, writers
+from powderdsl.simulator import compile
+from powderdsl.testing.cases import Start, random_start
+from powderdsl.testing.choices import Choices
+from powderdsl.tracing.scenes import record_step
+from powderdsl.tracing.writes import writes_of
+from tests.semantics.test_differential import compositions, seeded_ruleset
+
+SHAPES = ((2, 5, 33), (1, 2, 2))
+BACKENDS = ("reference", "dense", "planes")
+
+
+def recorded(ruleset: Ruleset, start: Start, backend: str, steps: int) -> Provenance:
+    """Provenance on a backend, which must not change what becomes of the worlds."""
+    sim = compile(ruleset, backend=backend)
+    world = start.world(sim)
+    found = Recorder(sim).step(world, steps, params=start.params or None)
+    plain = sim.step(world, steps, params=start.params or None)
+    assert found.world.state.keys() == plain.state.keys()
+    assert all(bool((found.world.state[name] == plain.state[name]).all()) for name in plain.state)
+    assert SLOT not in found.world.state
+    assert str(found.numbers.dtype) == "torch.int16"
+    return found
+
+
+def assert_alike(
+    ruleset: Ruleset,
+    shapes: tuple[tuple[int, int, int], ...],
+    seed: int,
+    backends: tuple[str, ...] = BACKENDS,
+) -> int:
+    """The same numbers on all backends; how many cells were written."""
+    written = 0
+    for shape in shapes:
+        start = random_start(ruleset, Choices.seeded(seed), shape)
+        oracle, *others = (recorded(ruleset, start, one, 2) for one in backends)
+        for other in others:
+            assert bool((other.numbers == oracle.numbers).all())
+        written += int((oracle.numbers > 0).sum())
+    return written
+
+
+@pytest.mark.parametrize("name", compositions())
+def test_shipped_rules_on_all_backends(name):
+    ruleset = load(name)
+    # Of empty space and walls alone nothing moves.
+    assert (assert_alike(ruleset, SHAPES, 1) == 0) == (name == "core")
+
+
+@pytest.mark.parametrize("first", [0, 8])
+def test_random_rules_on_all_backends(first):
+    rulesets = [one for seed in range(first, first + 8) if (one := seeded_ruleset(seed)) is not None]
+    assert (
+        sum(assert_alike(one, ((2, 3, 33), (1, 1, 2)), first, ("reference", "dense")) for one in rulesets)
+        > 100
+    )
+
+
+@pytest.mark.parametrize("name", ["powderworld", "langtons_ant", *range(30, 45)])
+def test_the_writers_are_those_of_the_trace(name):
+    ruleset = load(name) if isinstance(name, str) else seeded_ruleset(name)
+    if ruleset is None:
+        return  # the checks refuse the rules of this seed
+    for shape in ((2, 4, 5), (1, 1, 2)):
+        world = replace(random_start(ruleset, Choices.seeded(7), shape), params={}).world(
+            compile(ruleset, backend="dense")
+        )
+        found = writers(world)
+        changed = found.world.ids != world.ids
+        assert bool((found.numbers[changed] > 0).all()), "a change without a writer"
+        for number in range(len(world)):
+            step = record_step(world, number)
+            for cell in np.ndindex(*shape[1:]):
+                rules = [one.rule for one in writes_of(step, cell) if one.slot.name == "element"]
+                assert found.rule_at(*cell, world=number) == (rules[-1] if rules else None)
+
+
+def test_only_the_last_step_counts_and_no_step_writes_nothing():
+    sim = compile(load("life"), backend="dense")
+    ids = np.zeros((1, 5, 5), np.int64)
+    ids[0, 2, 1:4] = 1
+    world = sim.world(ids)
+    recorder = Recorder(sim)
+    written = [
+        set(zip(*np.nonzero(recorder.step(world, steps).numbers[0].numpy()), strict=True))
+        for steps in range(3)
+    ]
+    ends = {(1, 2), (3, 2), (2, 1), (2, 3)}
+    assert written == [set(), ends, ends]
+    born, died = (recorder.step(world).rule_at(*cell) for cell in ((1, 2), (2, 1)))
+    assert born is not None
+    assert died is not None
+    assert "dead_cell -> live_cell" in born.span.text
+    assert "live_cell -> dead_cell" in died.span.text
+    assert born.place.startswith("rules/life.yaml:")
+
+
+def test_worlds_of_other_rules_are_refused():
+    one, other = (compile(load(name), backend="dense") for name in ("life", "cyclic"))
+    with pytest.raises(ValueError, match="this world belongs to cyclic"):
+        Recorder(one).step(other.world(np.zeros((2, 2), np.int64)))

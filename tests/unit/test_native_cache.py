@@ -1,0 +1,366 @@
+"""The cache of compiled code: damage, eviction, writers at the same time, writers that are killed. No C++ is compiled.
+
+Compilers here are shell scripts that copy their source to where the library should be.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from powderdsl.backends import cuda_build, native_cache
+from powderdsl.backends.native_build import Building, build, building, run_guarded
+from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for
+from tests.cli.commands import environment_with
+from tests.processes import alive, waited
+
+ABOUT = {"ruleset": "yard", "backend": "native", "compiler": "g++ 1", "created": 1.0, "seconds": 2.0}
+
+
+def put(folder: Path, key: str, data: bytes, used: float | None = None) -> Path:
+    """A library in the cache, used that many seconds ago."""
+    built = folder / f"{native_cache.BUILDING}{key}"
+    built.mkdir()
+    (built / native_cache.LIBRARY).write_bytes(data)
+    library = native_cache.add(folder, key, built, ABOUT)
+    if used is not None:
+        os.utime(folder / key / native_cache.ABOUT, (time.time() - used,) * 2)
+    return library
+
+
+def names(folder: Path) -> set[str]:
+    return {place.name for place in folder.iterdir()}
+
+
+# --- what is stored
+
+
+def test_a_library_is_found_with_what_is_known_of_it(tmp_path: Path) -> None:
+    library = put(tmp_path, "a", b"code", used=100)
+    put(tmp_path, "b", b"more code")
+    assert [entry.key for entry in native_cache.entries(tmp_path)] == ["b", "a"]
+    assert native_cache.find(tmp_path, "a") == library
+    first, second = native_cache.entries(tmp_path)  # a has just been used
+    assert {first.key, second.key} == {"a", "b"}
+    assert first.age < 50
+    assert (first.about.ruleset, second.about.ruleset) == ("yard", "yard")
+    assert native_cache.find(tmp_path, "c") is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda place: (place / "program").write_bytes(b"cod"),
+        lambda place: (place / "program").write_bytes(b"code" + bytes(1)),
+        lambda place: (place / "program").write_bytes(b"COde"),
+        lambda place: (place / "program").unlink(),
+        lambda place: (place / "about.json").unlink(),
+        lambda place: (place / "about.json").write_text("{"),
+        lambda place: (place / "about.json").write_text("[]"),
+        lambda place: (place / "about.json").write_text('{"size": 4}'),
+        lambda place: (place / "about.json").write_bytes(b"\xff\xfe"),
+    ],
+    ids=["short", "long", "changed", "gone", "unknown", "half", "list", "keys", "bytes"],
+)
+def test_a_damaged_library_counts_as_absent_and_is_replaced(tmp_path: Path, damage: object) -> None:
+    put(tmp_path, "a", b"code")
+    damage(tmp_path / "a")  # type: ignore[operator]
+    assert native_cache.find(tmp_path, "a") is None
+    native_cache.entries(tmp_path)
+    library = put(tmp_path, "a", b"code")
+    assert native_cache.find(tmp_path, "a") == library
+
+
+def test_beyond_the_limit_the_least_recently_used_go(tmp_path: Path) -> None:
+    for i, key in enumerate("abcd"):
+        put(tmp_path, key, bytes(100), used=1000 - i)
+    native_cache.find(tmp_path, "a")
+    native_cache.tidy(tmp_path, limit=200)
+    assert names(tmp_path) == {"a", "d"}
+    native_cache.tidy(tmp_path, limit=50, keep="d")  # what was just made stays, even if it is too much
+    assert names(tmp_path) == {"d"}
+
+
+def test_only_old_remains_of_killed_processes_go(tmp_path: Path) -> None:
+    put(tmp_path, "a", b"code")
+    native_cache.write_json(tmp_path / "needed.json", {"library": "a"})
+    native_cache.write_json(tmp_path / "orphan.json", {"library": "z"})
+    (tmp_path / ".build-old").mkdir()
+    (tmp_path / ".gone-old").mkdir()
+    (tmp_path / "a.lock").touch()
+    for place in tmp_path.iterdir():
+        os.utime(place, (time.time() - 2 * native_cache.LEFT_BEHIND,) * 2)
+    (tmp_path / ".build-new").mkdir()
+    native_cache.tidy(tmp_path)
+    assert names(tmp_path) == {"a", "needed.json", ".build-new"}
+
+
+def test_clear(tmp_path: Path) -> None:
+    for key, used in (("a", 10.0), ("b", 1000.0)):
+        put(tmp_path, key, b"code", used)
+        native_cache.write_json(tmp_path / f"start-{key}.json", {"library": key})
+    assert [entry.key for entry in native_cache.clear(tmp_path, older_than=100)] == ["b"]
+    assert native_cache.find(tmp_path, "a") is not None
+    (tmp_path / ".build-of-somebody").mkdir()
+    (tmp_path / "damaged").mkdir()
+    assert [entry.key for entry in native_cache.clear(tmp_path)] == ["a"]
+    assert names(tmp_path) == {".build-of-somebody"}
+
+
+def test_a_cache_that_cannot_be_written_still_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = put(tmp_path, "a", b"code")
+
+    def refuse(*args: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "utime", refuse)
+    assert native_cache.find(tmp_path, "a") == library
+
+
+# --- compilers
+
+
+def fake(folder: Path, name: str, version: str, body: str = 'cp "${@: -1}" "$out"') -> Path:
+    """A compiler: answers --version, notes down its arguments, then runs the body with the library's path in $out."""
+    path = folder / name
+    path.write_text(
+        "#!/bin/bash\n"
+        f'if [ "${{@: -1}}" = --version ]; then echo "{version}"; exit; fi\n'
+        f'echo "$$ $@" >> {folder}/calls\n'
+        'while [ "$1" != -o ]; do shift; done; out=$2\n'
+        f"{body}\n"
+    )
+    path.chmod(0o755)
+    return path
+
+
+def calls(folder: Path) -> list[str]:
+    path = folder / "calls"
+    return path.read_text().splitlines() if path.exists() else []
+
+
+@pytest.mark.parametrize(
+    ("version", "family", "has", "lacks"),
+    [
+        ("g++ (Debian 12.2.0-14) 12.2.0", "gcc", {"-fno-gcse", "-fno-tree-pre"}, {"-fno-slp-vectorize"}),
+        ("Ubuntu clang version 18.1.3", "clang", {"-fno-slp-vectorize"}, {"-fno-gcse", "-fno-tree-pre"}),
+        ("Apple clang version 15.0.0", "clang", {"-ffp-contract=off"}, {"-fno-gcse", "-fno-tree-pre"}),
+    ],
+)
+def test_each_compiler_gets_flags_that_it_takes(
+    version: str, family: str, has: set[str], lacks: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", version)))
+    compiler = find_compiler()
+    assert (compiler.family, compiler.version) == (family, version)
+    with building(Building("-O1", tmp_path)):
+        library = build("// source\n", "yard")
+    assert library.read_text() == "// source\n"
+    (call,) = calls(tmp_path)
+    flags = set(call.split())
+    assert has | {"-O1", "-ffp-contract=off", "-fno-trapping-math"} <= flags
+    assert not flags & (lacks | {"-O2", "-ffast-math", "-Ofast"})
+
+
+@pytest.mark.parametrize(
+    ("machine", "features", "march", "wide"),
+    [
+        ("x86_64", "flags: sse2 avx512f", "-march=native", True),
+        ("x86_64", "flags: sse2 avx2", "-march=native", False),
+        ("aarch64", "Features: asimd", "-mcpu=native", False),
+        ("arm64", "arm64 arm", "-mcpu=native", False),
+    ],
+)
+def test_flags_follow_the_processor(machine: str, features: str, march: str, wide: bool) -> None:
+    for family in ("gcc", "clang", "zig"):
+        flags = flags_for(Compiler(("x",), family, ""), "-O2", machine, features)
+        assert march in flags
+        assert ("-mprefer-vector-width=512" in flags) == wide
+        assert ("-fno-sanitize=undefined" in flags) == (family == "zig")
+
+
+def test_the_variable_cxx_is_obeyed_or_complained_about(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for wanted in ("no-such-compiler", "'", "false", str(tmp_path)):
+        monkeypatch.setenv("CXX", wanted)
+        with pytest.raises(NoCompiler, match="CXX is"):
+            find_compiler()
+    wrapper = tmp_path / "with spaces"
+    wrapper.mkdir()
+    monkeypatch.setenv("CXX", f"'{fake(wrapper, 'cc', 'g++ 1')}' -pipe")
+    assert find_compiler().command[-1] == "-pipe"
+
+
+def test_without_a_compiler_all_that_were_tried_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("powderdsl.backends.native_compilers.find_spec", lambda name: None)
+    with pytest.raises(NoCompiler, match=r"tried g\+\+, c\+\+, clang\+\+, the package ziglang"):
+        find_compiler()
+    fake(tmp_path, "clang++", "clang version 9")
+    assert find_compiler().command == ("clang++",)  # installed meanwhile
+
+
+def test_another_compiler_source_or_level_is_another_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = set()
+    for version in ("g++ 1", "g++ 2"):
+        monkeypatch.setenv("CXX", str(fake(tmp_path, f"cc{version[-1]}", version)))
+        for level in ("-O1", "-O2"):
+            with building(Building(level, tmp_path)):
+                found |= {build("// a\n"), build("// b\n"), build("// a\n")}
+    assert len(found) == len(calls(tmp_path)) == 8
+
+
+def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = "echo program.cpp:1: bad >&2; exit 3"
+    monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", body)))
+    with building(Building("-O0", tmp_path)), pytest.raises(NoCompiler, match=r"failed:\nprogram.cpp:1: bad"):
+        build("// source\n")
+    assert not [name for name in names(tmp_path) if name.startswith(".build-")]
+
+
+# --- processes
+
+BUILD = """
+import sys
+from pathlib import Path
+from powderdsl.backends.native_build import Building, build, building
+with building(Building("-O0", Path(sys.argv[1]))):
+    print(build("// source\\n", "yard").read_text())
+"""
+
+
+def start(folder: Path, compiler: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", BUILD, str(folder)],
+        env=environment_with(CXX=str(compiler)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+
+
+def test_processes_that_want_the_same_compile_it_once(tmp_path: Path) -> None:
+    compiler = fake(tmp_path, "cc", "g++ 1", 'sleep 1; cp "${@: -1}" "$out"')
+    running = [start(tmp_path, compiler) for _ in range(5)]
+    assert {process.communicate(timeout=120)[0] for process in running} == {"// source\n\n"}
+    assert len(calls(tmp_path)) == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_killed_builder_takes_its_compiler_along_and_harms_nobody(tmp_path: Path, how: int) -> None:
+    # As compilers do, this one starts another process that does the work.
+    slow = fake(tmp_path, "cc", "g++ 1", f"sleep 1000 & echo $! >> {tmp_path}/workers; wait")
+    first = start(tmp_path, slow)
+    assert waited(lambda: (tmp_path / "workers").exists() and (tmp_path / "workers").read_text())
+    second = start(tmp_path, slow)  # waits for the first one's lock
+    worker, compiler = int((tmp_path / "workers").read_text()), int(calls(tmp_path)[0].split()[0])
+    assert alive(worker)
+    assert alive(compiler)
+    fake(tmp_path, "cc", "g++ 1")
+    first.send_signal(how)
+    first.communicate(timeout=60)
+    assert waited(lambda: not alive(worker) and not alive(compiler))
+    assert second.communicate(timeout=60)[0] == "// source\n\n"
+    assert len(calls(tmp_path)) == 2
+
+
+def test_a_fork_that_ends_does_not_end_its_parents_compiler(tmp_path: Path) -> None:
+    program = """
+import os, sys, threading, time
+from pathlib import Path
+from powderdsl.backends.native_build import run_guarded
+scratch = Path(sys.argv[1])
+found = []
+thread = threading.Thread(target=lambda: found.append(run_guarded(["sleep", "2"], scratch)))
+thread.start()
+time.sleep(0.5)
+pid = os.fork()
+if pid == 0:
+    sys.exit(0)
+os.waitpid(pid, 0)
+thread.join()
+print(found)
+"""
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program, str(tmp_path)],
+        env=environment_with(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert run.stdout == "[(0, '')]\n"
+
+
+def test_what_cannot_be_run_says_so(tmp_path: Path) -> None:
+    status, said = run_guarded([str(tmp_path / "nothing")], tmp_path)
+    assert status == 127
+    assert "nothing" in said
+
+
+# --- powderdsl cache
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from powderdsl.user_cache import cache_folder
+    from tests.cli.commands import powderdsl
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = cache_folder("native")
+    assert powderdsl("cache", "path").stdout == f"{folder}\n"
+    assert powderdsl("cache", "list").stdout == ""
+    put(folder, "0123456789abcdef", bytes(1 << 21), used=3 * 86400)
+    put(folder, "fedcba", bytes(10))
+    listed = powderdsl("cache", "list")
+    assert listed.stdout.splitlines()[1].split()[:4] == ["0123456789ab", "yard", "native", "2.1"]
+    assert "used 3 d ago" in listed.stdout
+    assert "2 compiled programs, 2.1 MB" in listed.stderr
+    rows = json.loads(powderdsl("cache", "list", "--json").stdout)
+    assert [(row["key"], row["size"]) for row in rows] == [("fedcba", 10), ("0123456789abcdef", 1 << 21)]
+    assert "removed 1 compiled program, 2.1 MB" in powderdsl("cache", "clear", "--older-than", "2d").stderr
+    assert "removed 1 compiled program" in powderdsl("cache", "clear").stderr
+    assert not names(folder)
+    wrong = powderdsl("cache", "clear", "--older-than", "soon")
+    assert wrong.exit_code == 2
+    assert "no time span" in wrong.stderr
+    folder.chmod(0o777)
+    refused = powderdsl("cache", "list")
+    assert refused.exit_code == 2
+    assert "others may write" in refused.stderr
+
+
+def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Nvrtc:
+        """What asks for the version; compiling is made up as well, so no GPU is needed."""
+
+        def nvrtcVersion(self, major: object, minor: object) -> None:
+            pass
+
+    compiled = []
+
+    def compile_text(compiler: object, text: str, options: object) -> bytes:
+        compiled.append(text)
+        return text.encode()
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cuda_build, "nvrtc", lambda version: Nvrtc())
+    monkeypatch.setattr(cuda_build, "compile_text", compile_text)
+    wanted = [("a", "sm_90"), ("a", "sm_80"), ("a", "sm_90"), ("b", "sm_90")]
+    assert [cuda_build.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
+    assert compiled == ["a", "a", "b"]
+    found = native_cache.entries(tmp_path / "powderdsl" / "native")
+    assert [one.about.backend for one in found] == ["cuda"] * 3
