@@ -102,7 +102,7 @@ def architecture(device: int) -> str:
     return f"sm_{device_attribute(device, _MAJOR)}{device_attribute(device, _MINOR)}"
 
 
-def machine_code(text: str, architecture: str, version: str) -> bytes:
+def machine_code(source: KernelSource, architecture: str, version: str) -> bytes:
     """A kernel's machine code, from the cache or compiled now.
 
     Safe with other processes doing the same: a file appears under its name whole, or not at all.
@@ -114,7 +114,7 @@ def machine_code(text: str, architecture: str, version: str) -> bytes:
     major, minor = ctypes.c_int(), ctypes.c_int()
     compiler.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     options = (f"--gpu-architecture={architecture}", *OPTIONS)
-    key = "\0".join([text, f"{major.value}.{minor.value}", *options])
+    key = "\0".join([source.text, f"{major.value}.{minor.value}", *options])
     try:
         folder = cache_folder("native")
     except OSError as error:
@@ -124,15 +124,15 @@ def machine_code(text: str, architecture: str, version: str) -> bytes:
     if found is not None:
         return found.read_bytes()
     began = time.perf_counter()
-    code = compile_text(compiler, text, options)
+    code = compile_text(compiler, source.text, options)
     with suppress(OSError), tempfile.TemporaryDirectory(dir=folder, prefix=native_cache.BUILDING) as scratch:
         built = Path(scratch) / "built"
         built.mkdir()
         (built / native_cache.LIBRARY).write_bytes(code)
         about = {
-            "ruleset": "",
+            "ruleset": source.name,
             "backend": "cuda",
-            "compiler": f"NVRTC {major.value}.{minor.value}",
+            "compiler": f"NVRTC {major.value}.{minor.value} for {architecture}",
             "created": time.time(),
             "seconds": round(time.perf_counter() - began, 2),
         }

@@ -35,6 +35,8 @@ REGISTERS, ENOUGH = 65_536, 128
 class KernelSource:
     """A translation unit, and what launching it takes."""
 
+    name: str
+    """Of the rules."""
     text: str
     layout: Layout
     group: int
@@ -119,7 +121,7 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
         (folder / "cuda_driver.cuh").read_text(encoding="utf-8"),
     ])  # fmt: skip
     scratch = (0 if planes_fit else planes) + (0 if fields_fit else fields)
-    return KernelSource(text, layout, group, threads, shared, scratch)
+    return KernelSource(program.name, text, layout, group, threads, shared, scratch)
 
 
 def _tables(program: Program, layout: Layout, width: int, row_words: int) -> list[str]:

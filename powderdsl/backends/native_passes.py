@@ -189,16 +189,18 @@ class PassWriter(ValueWriter):
         loop = Loop(self.planes, self.layout)
         outputs = []
         empty = []
+        whole = {}
         for guard, cheap, rest in staged:
             parts = [loop.value(part) for part in cheap]
             known = [found for part in cheap if (found := zero_with(part, self.planes)) is not None]
             empty.append(min(known, key=len, default=None))
             name = candidates[id(guard)] if rest else self.fresh("p")
             if not rest:
-                self.planes[id(guard)] = name
+                whole[id(guard)] = name
             clean = any(is_clean(part, self.have) for part in cheap)
             outputs.append((name, " & ".join(parts) if clean else " & ".join([*parts, "valid"])))
         self.emit_loop(loop, outputs, empty)
+        self.planes.update(whole)  # not before: until the loop has run, their planes hold nothing
         condition = " || ".join(
             f"!{name}->zero"
             for name in (*candidates.values(), *(self.planes[id(g)] for g in guards if self.have(g)))

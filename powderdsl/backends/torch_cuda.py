@@ -57,7 +57,7 @@ def compiler_for(device: torch.device) -> Compile:
             with torch.cuda.device(device):
                 torch.empty(1, device=device)  # the context is there from now on
                 architecture = cuda_build.architecture(torch.cuda.current_device())
-                code = cuda_build.machine_code(source.text, architecture, version)
+                code = cuda_build.machine_code(source, architecture, version)
                 start = cuda_build.load_kernel(code, source)
         except cuda_build.NoCuda as error:
             raise refusal(str(error)) from None

@@ -68,6 +68,10 @@ def _checked(rules: str, stage: str, backend: str, pass_name: str | None, settin
     return _kernels(program, backend, pass_name)
 
 
+SHOWN_SHARED = 227 << 10
+"""Bytes of shared memory of the GPU for which kernels are shown, on a grid of 64 × 64."""
+
+
 def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
     """The generated source of a backend: part by part, where planes cannot carry all passes."""
     from powderdsl.backends.torch_dense import kernel_source
@@ -79,8 +83,8 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
             raise BadInput("the reference backend runs the checked model: it has no kernels")
         case "dense":
             return kernel_source(program, pass_name)
-        case "native" if pass_name is not None:
-            raise BadInput("native source is one text: --pass does not go with it")
+        case "native" | "cuda" if pass_name is not None:
+            raise BadInput(f"{backend} source is one text: --pass does not go with it")
     texts = []
     for part in segments(program):
         if part.planes is None:
@@ -89,6 +93,10 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
             from powderdsl.backends.native_source import native_source
 
             texts.append(native_source(part.planes)[0])
+        elif backend == "cuda":
+            from powderdsl.backends.cuda_source import cuda_source
+
+            texts.append(cuda_source(part.planes, 64, 64, SHOWN_SHARED).text)
         else:
             texts.append(planes_kernel_source(part.planes, pass_name))
     return "\n\n".join(text for text in texts if text)

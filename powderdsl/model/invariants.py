@@ -52,8 +52,12 @@ def check_invariants(composition: Composition, typer: Typer) -> tuple[Invariant,
     for pack, line in written:
         typer.absent.clear()
         typer.start_rule(line.span)
+        scope = Scope(pack, {})
         try:
-            claim = _CLAIMS[line.kind](typer, line, Scope(pack, {}))
+            without = _without(typer, line.children[1], scope) if line.kind == "without" else frozenset()
+            typer.absent.clear()
+            said = line.children[0] if line.kind == "without" else line
+            claim = _CLAIMS[said.kind](typer, said, scope)
         except Poisoned:
             continue
         except Asleep as asleep:
@@ -62,8 +66,16 @@ def check_invariants(composition: Composition, typer: Typer) -> tuple[Invariant,
                 helps=[f"it wakes up with a pack that defines `{asleep.name}`"],
             )  # fmt: skip
             continue
-        found.append(Invariant(claim, pack, line.span))
+        found.append(Invariant(claim, without, pack, line.span))
     return tuple(found)
+
+
+def _without(typer: Typer, what: Syntax, scope: Scope) -> frozenset[int]:
+    """The elements that a world starts without. Those that are absent are not there anyway."""
+    ids = frozenset(typer.set_of(typer.evaluate(what, scope), what.span).ids)
+    if ids == frozenset(typer.symbols.ids):
+        raise typer.fail("PD511", "this invariant cannot hold", what.span, "no world is without all of these")
+    return ids
 
 
 def _words(typer: Typer, words: tuple[Syntax, ...], wanted: tuple[tuple[str, ...], ...]) -> None:

@@ -342,9 +342,13 @@ Claim = Unchanging | Total | Never | Local | Symmetric | Bounded
 
 @dataclass(frozen=True)
 class Invariant:
-    """What a pack says of every world. `pack` is the ruleset's name where the ruleset says it."""
+    """What a pack says of every world that starts without some elements, in cells and fields; mostly there are none.
+
+    `pack` is the ruleset's name where the ruleset says it.
+    """
 
     claim: Claim
+    without: frozenset[int]
     pack: str
     span: Span = field(compare=False, repr=False)
 

@@ -29,6 +29,8 @@ class Property:
     text: str
     owner: str
     span: Span | None
+    without: frozenset[int] = frozenset()
+    """Elements that a world starts without."""
 
     @property
     def place(self) -> str:

@@ -24,8 +24,37 @@ from powderdsl.model.types import (
 )
 
 
-def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
-    """Whether the claim holds in all worlds. `NotProven` says nothing against it."""
+def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int] = frozenset()) -> Verdict:
+    """Whether the claim holds in all worlds, or in those that start without some elements.
+
+    `NotProven` says nothing against it.
+    """
+    verdict = _prove(claim, ruleset, ledger)
+    if verdict or not without or not isinstance(claim, Total) or claim.ids is None:
+        return verdict
+    return _conserved(claim.trend, set(_names(ruleset, claim.ids)), ledger, _names(ruleset, without))
+
+
+def _conserved(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Verdict:
+    """What the ledger says of a count, where rules that need what is not there cannot happen."""
+    cells = set(ledger.reach(name for name in ledger.elements if name not in without))
+    known = cells | set(ledger.named)
+    lines = []
+    for entry in ledger.rules:
+        if not all(known.intersection(names) for names in entry.needs):
+            continue
+        for before, after in entry.changes:
+            if before not in cells or (after in entry.copies and after not in known):
+                continue
+            change = (after in counted) - (before in counted)
+            if {"constant": change != 0, "never rises": change > 0, "never falls": change < 0}[trend]:
+                lines.append(entry.rule)
+    if lines:
+        return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
+    return Proven("no rule that can happen in such worlds changes the number so")
+
+
+def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
     match claim:
         case Unchanging():
             verdicts = [ledger.unchanged(name) for name in _names(ruleset, claim.ids)]

@@ -58,6 +58,19 @@ class Sample:
             {name: values[worlds] for name, values in self.params.items()},
         )
 
+    def without(self, gone: frozenset[int], ruleset: Ruleset) -> Sample:
+        """The same worlds with the first other element where one of these is, in cells and in fields."""
+        if not gone:
+            return self
+        other = min(element.id for element in ruleset.elements if element.id not in gone)
+        names = {slot.name for slot in slots(ruleset) if slot.kind.name == "element"}
+
+        def kept(values: Array) -> Array:
+            return np.where(np.isin(values, sorted(gone)), values.dtype.type(other), values)
+
+        fields = {name: kept(values) if name in names else values for name, values in self.fields.items()}
+        return replace(self, ids=kept(self.ids), fields=fields)
+
     def one(self, world: int) -> Sample:
         return self.select(slice(world, world + 1))
 
@@ -127,19 +140,24 @@ def holders(ruleset: Ruleset, slot: Slot) -> frozenset[int] | None:
 
 def full_state(ruleset: Ruleset, sample: Sample) -> State:
     """All slots of the start worlds in their storage dtypes. Cells that cannot hold a value have their usual one."""
-    state: State = {}
-    for slot in slots(ruleset):
-        if slot.name == "element":
-            state[slot.name] = sample.ids
-            continue
-        values = fresh(ruleset, slot, sample.ids)
+    state: State = {"element": sample.ids}
+    for slot in slots(ruleset)[1:]:
         given = sample.fields.get(slot.name)
-        if given is not None:
-            limited = holders(ruleset, slot)
-            may = np.ones(sample.ids.shape, bool) if limited is None else np.isin(sample.ids, sorted(limited))
-            values = np.where(may[:, None] if slot.planes == 2 else may, given, values).astype(slot.dtype)
-        state[slot.name] = values
-    return state
+        state[slot.name] = fresh(ruleset, slot, sample.ids) if given is None else given
+    return settled(ruleset, state)
+
+
+def settled(ruleset: Ruleset, state: State) -> State:
+    """The state with the usual value of a slot in cells that cannot hold another one."""
+    kept = dict(state)
+    for slot in slots(ruleset)[1:]:
+        limited = holders(ruleset, slot)
+        if limited is not None:
+            may = np.isin(state["element"], sorted(limited))
+            usual = fresh(ruleset, slot, state["element"])
+            values = np.where(may[:, None] if slot.planes == 2 else may, state[slot.name], usual)
+            kept[slot.name] = values.astype(slot.dtype)
+    return kept
 
 
 def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Sample]:

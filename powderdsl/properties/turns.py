@@ -8,14 +8,14 @@ import numpy as np
 
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Ruleset
-from powderdsl.properties.samples import Array, Sample, State, full_state
+from powderdsl.properties.samples import Array, Sample, State, full_state, settled
 
 
 def turned_cells(values: Array, turn: str) -> Array:
     """An array [..., H, W]: left and right exchanged (``mirrored``), or a quarter turn clockwise (``rotated``)."""
     if turn == "mirrored":
-        return np.ascontiguousarray(values[..., ::-1])
-    return np.ascontiguousarray(np.rot90(values, -1, (-2, -1)))
+        return values[..., ::-1].copy()
+    return np.rot90(values, -1, (-2, -1)).copy()
 
 
 def turned_values(slot: Slot, values: Array, turn: str) -> Array:
@@ -33,7 +33,9 @@ def turned_values(slot: Slot, values: Array, turn: str) -> Array:
 
 
 def turned_state(ruleset: Ruleset, state: State, turn: str) -> State:
-    return {slot.name: turned_values(slot, state[slot.name], turn) for slot in slots(ruleset)}
+    """All slots, turned. Cells that cannot hold a value keep the usual one, which does not turn."""
+    found = {slot.name: turned_values(slot, state[slot.name], turn) for slot in slots(ruleset)}
+    return settled(ruleset, found)
 
 
 def turned_sample(ruleset: Ruleset, sample: Sample, turn: str) -> Sample:

@@ -38,7 +38,7 @@ NOT_RUN = {
 }
 """Keys that say nothing about what a step does."""
 
-OF_INVARIANTS = frozenset({"never", "trend", "stays", "reach", "agree", "total", "duration", "word"})
+OF_INVARIANTS = frozenset({"never", "trend", "stays", "reach", "agree", "total", "without", "duration", "word"})
 """Syntax that only invariants have: they say nothing about what a step does either."""
 
 ON_CELLS = ("passes", "on cells")

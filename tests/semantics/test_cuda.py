@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -102,7 +103,7 @@ def test_a_missing_barrier_would_be_seen(folder: Path, monkeypatch: pytest.Monke
         before, passes = source.text.split("void pass_0", 1)
         passes, after = passes.split("void reset_slots", 1)
         text = f"{before}void pass_0{passes.replace('SYNC();', '')}void reset_slots{after}"
-        return KernelSource(text, source.layout, source.group, source.threads, source.shared, source.scratch)
+        return replace(source, text=text)
 
     ruleset = load("core+sand+water")
     oracle = compile_ruleset(ruleset, backend="reference")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -15,6 +16,8 @@ from powderdsl.testing.cases import load_text, random_start
 from powderdsl.testing.choices import Choices
 from powderdsl.tracing.scenes import pick, record_step
 from powderdsl.tracing.trace import Miss, Trace, trace
+from powderdsl.tracing.trace_data import trace_data
+from powderdsl.tracing.trace_text import trace_text
 from powderdsl.tracing.writes import writes_of
 from tests.semantics.test_differential import seeded_ruleset
 
@@ -229,6 +232,27 @@ def test_random_rules_are_explained(first):
     """Writes follow on each other, end in what the step left, and every change has one; so does every shape."""
     rulesets = [one for seed in range(first, first + 10) if (one := seeded_ruleset(seed)) is not None]
     assert sum(explained(one, shape, first) for one in rulesets for shape in ((2, 3, 4), (1, 1, 2))) > 100
+
+
+@pytest.mark.parametrize("first", [50, 60])
+def test_whatever_happens_can_be_printed(first):
+    """Text and JSON of random cells under random rules; a failed part never holds, a happening has none."""
+    printed = 0
+    for seed in range(first, first + 10):
+        ruleset = seeded_ruleset(seed)
+        if ruleset is None:
+            continue
+        sim = compile(ruleset, backend="reference")
+        world = replace(random_start(ruleset, Choices.seeded(seed), (1, 3, 4)), params={}).world(sim)
+        found = trace(world, seed % 3, seed % 4, 2, every_rule=True)
+        data = json.loads(json.dumps(trace_data(found), allow_nan=False))
+        assert len(data["writes"]) == len(found.causes)
+        assert all(part.holds for cause in found.causes for part in cause.parts)
+        text = trace_text(found, every_rule=True)
+        assert text.startswith(f"cell {seed % 3},{seed % 4} in step")
+        assert text.count("but for") == len(found.misses)
+        printed += len(found.misses)
+    assert printed > 20
 
 
 def explained(ruleset: Ruleset, shape: tuple[int, int, int], seed: int) -> int:
