@@ -17,7 +17,7 @@ from powderdsl.testing.cases import load_text, random_start
 from powderdsl.testing.choices import Choices
 
 BACKENDS = ["reference", "dense", "planes", "native"]
-SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130)]
+SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
 
 KINDS = """\
 pack: kinds
@@ -103,8 +103,9 @@ def test_the_same_on_every_backend(name: str, backend: str, torch) -> None:  # t
 def test_worlds_may_lie_apart(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     """One step's column of a buffer [worlds, steps, …]."""
     sim = simulator_or_skip("kinds", backend)
-    world = sim.step(random_start(sim.ruleset, Choices.seeded(3), (3, 4, 70)).world(sim))
-    for way, look in ways_out(world).items():
+    batches = [random_start(sim.ruleset, Choices.seeded(3), (3, height, 70)) for height in (4, 8)]
+    looks = [pair for start in batches for pair in ways_out(sim.step(start.world(sim))).items()]
+    for way, look in looks:
         wanted = look()  # type: ignore[operator]
         steps = torch.zeros((3, 4, *wanted.shape[1:]), dtype=wanted.dtype)
         look(steps[:, 2])  # type: ignore[operator]

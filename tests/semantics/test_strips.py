@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,8 @@ from powderdsl.testing.rulemaker import random_ruleset_text
 STRIPS = [(1, 8, 8), (2, 16, 70), (1, 64, 64), (3, 128, 65), (1, 256, 256), (9, 520, 20), (2, 8, 1)]
 """Strips of one row, of more rows than one list of active rows has, of words that are not full; large and many."""
 
-FIRST, LAST = (int(seed) for seed in os.environ.get("POWDERDSL_SEEDS", "60..66").split(".."))
+SEEDS = range(60, 66)
+"""Few, since each takes seconds to compile."""
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +43,7 @@ def test_shipped_rulesets_in_strips(name: str) -> None:
 
 def test_random_rulesets_in_strips(tmp_path: Path) -> None:
     compared = 0
-    for seed in range(FIRST, LAST):
+    for seed in SEEDS:
         try:
             ruleset = load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
         except CompileError:
@@ -55,4 +55,4 @@ def test_random_rulesets_in_strips(tmp_path: Path) -> None:
             shape = (choices.whole(1, 4), height, choices.pick((1, 5, 33, 64, 70, 130)))
             assert_same(ruleset, random_start(ruleset, choices, shape), steps=3, simulators=simulators)
         compared += 1
-    assert compared >= (LAST - FIRST) / 2
+    assert compared >= 4
