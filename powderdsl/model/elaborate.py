@@ -45,6 +45,8 @@ from powderdsl.syntax.ast import Syntax
 
 MAX_MOMENTS = 1000
 MAX_RULES = 5000
+MAX_TRIED = 4 * MAX_RULES
+"""Rules with all their copies, before those go that are broken, asleep or the same."""
 MAX_BLOCKS = 5000
 
 _MIRROR: Matrix = ((1, 0), (0, -1))
@@ -85,7 +87,7 @@ class Elaborator:
     def __init__(self, typer: Typer):
         self.typer = typer
         self.result = Elaborated()
-        self._rules = 0
+        self._rules = self._tried = 0
         self._blocks = 0
 
     def run(self, passes: tuple[Named[PassDecl], ...]) -> Elaborated:
@@ -242,6 +244,9 @@ class Elaborator:
     ) -> None:
         found: list[Rule] = []
         self._label = label
+        self._tried += len(rules) * len(ORIENTATIONS[symmetry])
+        if self._tried > MAX_TRIED:
+            raise self._too_many(rules)
         for syntax in rules:
             copies: list[Rule] = []
             for matrix in ORIENTATIONS[symmetry]:
@@ -253,15 +258,18 @@ class Elaborator:
             found.extend(copies)
         self._rules += len(found)
         if self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
-            raise self.typer.fail(
-                "PD508",
-                f"loops unroll to more than {MAX_MOMENTS} moments or {MAX_RULES} rules",
-                rules[0].span,
-                "here",
-                ("loop over fewer things",),
-            )
+            raise self._too_many(rules)
         self._moments.append(Moment(tuple(self._pending), tuple(found), policy or "prove", label))
         self._pending = []
+
+    def _too_many(self, rules: tuple[Syntax, ...]) -> Poisoned:
+        return self.typer.fail(
+            "PD508",
+            f"loops unroll to more than {MAX_MOMENTS} moments or {MAX_RULES} rules",
+            rules[0].span,
+            "here",
+            ("loop over fewer things",),
+        )
 
     # Rules
 

@@ -45,7 +45,7 @@ MAX_ROUNDS = 4096
 MAX_RULE_WORK = 5_000
 """Parts of expressions that one rule may come to, quantifiers written out."""
 
-MAX_WORK = 100_000
+MAX_WORK = 60_000
 """Parts of expressions that all rules may come to: a second or two."""
 
 MAX_SET_DEPTH = 24
@@ -72,6 +72,8 @@ class Typer(Coercer):
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """What the syntax stands for. Raises Poisoned after reporting, Asleep if it hangs on an absent name."""
         self._work += 1
+        if self._work > MAX_WORK + 1:
+            raise Poisoned  # that has been said, and is true of all that follows
         if self._work - self._rule_start > MAX_RULE_WORK or self._work > MAX_WORK:
             self._rule_start = self._work  # once for a rule is enough
             raise self.fail(

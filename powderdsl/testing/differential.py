@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -167,9 +168,12 @@ def _compiled(ruleset: Ruleset, backend: str, how: Building, threads: int) -> Si
 
 
 def _forget(folder: Path) -> None:
-    """Remove libraries that this process has loaded: no other ruleset has the same."""
-    for library in folder.glob("*.so"):
-        library.unlink(missing_ok=True)
+    """Remove the libraries that this process has just loaded: no other ruleset has the same, and they pile up."""
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink(missing_ok=True)
 
 
 def _states(simulator: Simulator, start: Start, steps: int) -> list[State]:

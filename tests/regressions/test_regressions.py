@@ -14,11 +14,7 @@ from powderdsl.testing.differential import check_case
 FOLDER = Path(__file__).parent
 FILES = sorted(FOLDER.glob("*.yaml"))
 OPEN: dict[tuple[str, str], str] = {
-    ("border-in-a-guard", "native"): "layout_of does not walk the guards of moments",
-    ("choice-in-a-sweep", "native"): "Sweep.select with an empty chain",
     ("draw-where-a-shift-is-recomputed", "native"): "is_clean of a shift that is no plane",
-    ("mask-beyond-the-width", "native"): "guards(): is_clean is asked after the guard has become a plane",
-    ("moves-of-a-real-field", "native"): "masks of a sweep that are not declared",
 }
 """(file, backend): what is not mended yet. A case that has been mended fails here until its row goes."""
 
