@@ -31,7 +31,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_EVERYTHING = (*_TESTING, "properties", "bench", "envs", "web", "experiments", "cli")
+_EVERYTHING = (*_TESTING, "properties", "pytest_plugin", "bench", "envs", "web", "experiments", "cli")
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
@@ -61,6 +61,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "pack_tests": _SCREEN,
     "testing": (*_SCREEN, "ledgers", "pack_tests"),
     "properties": (*_TESTING, "user_cache"),
+    "pytest_plugin": (*_TESTING, "properties"),
     "bench": _SCREEN,
     "envs": _SCREEN,
     "web": _SCREEN,

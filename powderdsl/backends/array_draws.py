@@ -11,6 +11,9 @@ from powderdsl.backends.array_words import Array, pack, unpack
 
 START = (0x243F6A88, 0x85A308D3)
 
+FEW, SPARSE = 512, 8
+"""Draws are made word by word where one in `SPARSE` is asked for at most, of `FEW` or more; else all, once a step."""
+
 
 def mix(x: Array) -> Array:
     """A 32-bit finaliser of uint32, as in `torch_random.mix`."""
@@ -130,9 +133,10 @@ class Draws:
         """Draw below a constant; `where` nothing is asked, anything may come out."""
         lowest = (limit & -limit).bit_length() - 1
         count = bits - lowest
-        if where is not None and stream not in self.given and len(self._planes.get(stream, ())) < count:
+        known = self._planes.get(stream, ())
+        if where is not None and stream not in self.given and len(known) < count and where.size >= FEW:
             words = np.flatnonzero(where)
-            if 2 * len(words) < where.size:
+            if SPARSE * len(words) <= where.size:
                 result = np.zeros_like(self.valid)
                 some = _below(self._few(stream, count, words), limit >> lowest)
                 result.reshape(-1)[words] = some & self.valid.reshape(-1)[words]

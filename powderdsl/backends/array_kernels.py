@@ -16,6 +16,12 @@ from powderdsl.backends.array_words import WORD, Array, columns, pack, rows, shi
 
 SNAP = 2.0**-20
 
+PIECE = 1 << 14
+"""Reals that stay in the first-level cache from one operation to the next."""
+
+FEW, SPARSE = 512, 2
+"""Movements are carried out word by word where the movers' words are one in `SPARSE` at most, among `FEW` or more."""
+
 _CHANGES: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply}
 
 
@@ -52,7 +58,7 @@ class ArrayKernels:
     @staticmethod
     def some(*flags: Array) -> bool:
         """Whether one of some flags holds anywhere."""
-        return any(flag.any() for flag in flags)
+        return any(map(np.count_nonzero, flags))
 
     # Words
 
@@ -63,13 +69,69 @@ class ArrayKernels:
 
     stack = staticmethod(np.stack)
 
-    def swap(self, block: Array, movers: Array, dy: int, dx: int) -> Array:
-        """Movers and targets exchanged, in all planes: by the xor of the two."""
-        difference = block ^ self.shift(block, dy, dx, True)
-        difference &= movers
-        result = block ^ difference
-        result ^= self.shift(difference, -dy, -dx, True)
-        return result
+    def swap(self, block: Array, movers: Array, over: bool, dy: int, dx: int) -> Array:
+        """Movers and targets exchanged, in all planes: by the xor of the two. `over`: in the block itself."""
+        block = block if over else block.copy()
+        few = self._few_words(movers, dy, dx)
+        if few is None:
+            difference = block ^ self.shift(block, dy, dx, True)
+            difference &= movers
+            block ^= difference
+            block ^= self.shift(difference, -dy, -dx, True)
+            return block
+        words, targets = few
+        flat = block.reshape(len(block), -1)
+        difference = flat.take(words, 1) ^ self._turned(flat.take(targets, 1), dx)
+        difference &= movers.reshape(-1)[words]
+        flat[:, words] ^= difference
+        flat[:, targets] ^= self._turned(difference, -dx)
+        return block
+
+    def leave(
+        self, block: Array, movers: Array, over: bool, dy: int, dx: int, left: tuple[int, ...]
+    ) -> Array:
+        """Targets get what the movers held; where those were, the planes `left` hold and the others do not."""
+        block = block if over else block.copy()
+        few = self._few_words(movers, dy, dx)
+        if few is None:
+            carried = block & movers
+            block ^= carried
+            for plane in left:
+                block[plane] |= movers
+            block &= self.shift(movers, -dy, -dx, True) ^ self.valid
+            block |= self.shift(carried, -dy, -dx, True)
+            return block
+        words, targets = few
+        flat, leaving = block.reshape(len(block), -1), movers.reshape(-1)[words]
+        held = flat.take(words, 1)
+        carried = held & leaving
+        held ^= carried
+        for plane in left:
+            held[plane] |= leaving
+        flat[:, words] = held
+        found = flat.take(targets, 1)
+        found &= ~self._turned(leaving[None], -dx)
+        found |= self._turned(carried, -dx)
+        flat[:, targets] = found
+        return block
+
+    def _few_words(self, movers: Array, dy: int, dx: int) -> tuple[Array, Array] | None:
+        """The words that hold movers, and those that hold their targets; None if all had better be done."""
+        rows, worlds, count = self.valid.shape
+        if movers.size < FEW or (dx and count > 1):
+            return None
+        words = np.flatnonzero(movers)
+        if SPARSE * len(words) > movers.size:
+            return None
+        targets = words + dy % rows * (worlds * count)
+        np.subtract(targets, movers.size, out=targets, where=targets >= movers.size)
+        return words, targets
+
+    def _turned(self, words: Array, dx: int) -> Array:
+        """Rows of one word [P, n] as seen `dx` columns to the left of them."""
+        if not dx:
+            return words
+        return columns(words[..., None], dx, self.width, self.valid[0, 0], True)[..., 0]
 
     def swap_onto(self, block: Array, movers: Array, rest: Array, dy: int, dx: int) -> Array:
         """The same where something else has changed as well: `rest` has the cells that do not move."""
@@ -243,9 +305,13 @@ class ArrayKernels:
     def settle(self, x: Array, over: bool, low: float, high: float) -> Array:
         """No NaN, within bounds, nothing smaller than SNAP."""
         result = x if over else self.copy(x)
-        size = np.abs(result)
-        if not size.max() <= min(-low, high):  # NaN counts as large
-            np.clip(result, np.float32(low), np.float32(high), out=result)
-            np.copyto(result, np.float32(0), where=result != result)
-        np.copyto(result, np.float32(0), where=size < np.float32(SNAP))
+        flat = result.reshape(-1)
+        for start in range(0, len(flat), PIECE):
+            piece = flat[start : start + PIECE]
+            size = np.abs(piece)
+            if not size.max() <= min(-low, high):  # NaN counts as large
+                np.clip(piece, np.float32(low), np.float32(high), out=piece)
+                np.copyto(piece, np.float32(0), where=piece != piece)
+                size = np.abs(piece)
+            np.copyto(piece, np.float32(0), where=size < np.float32(SNAP))
         return result

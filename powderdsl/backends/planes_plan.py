@@ -2,8 +2,8 @@
 
 The plan of a pass is a graph of the same nodes with a few operations more, which array kernels have and the IR lacks:
 
-``stack`` planes → block; ``swap`` (block, movers) and ``arrive``, ``swap_onto`` (block, movers, rest) → block;
-``masked`` (block, flag, plane…) → the block where the flag holds, but for some planes; ``member`` (block) → a plane;
+``stack`` planes → block; ``member`` (block) → a plane; ``swap`` (block, movers) → block; ``arrive`` and ``swap_onto``
+(block, movers, rest) → block; ``leave`` (block, movers) → the block with the movers gone and arrived;
 ``cells`` (flag) → bool cells; ``choose`` (cells, yes, no) → reals; ``places`` (flag) → where it holds, ``moved``
 (places) → their neighbours; ``update`` (places, no, other) → the real `no`, and there `other` added to it, taken off or
 multiplied; ``carry`` (places, moved, no, other) → the same at neighbours with what `other` has at the places.
@@ -14,14 +14,17 @@ A draw has one argument more, or none: where its result is asked for. ``below_pa
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, Type, nodes_of
 
 BLOCK, CELLS, PLACES = Type("block"), Type("cells"), Type("places")
-FEW = 2
+FEW_BITS = 2
+"""So many random bits are drawn without asking whether they matter."""
+MAX_ASKED = 8
+"""So many flags, without which a draw does not matter, are kept in mind."""
 _UPDATES = ("add", "sub", "mul")
 _POINTWISE = ("and", "or", "xor", "not", "select")
 _DRAWS = ("chance", "below_planes")
@@ -86,17 +89,12 @@ class _Planner:
             self.olds.append(dict(current))
             current.update(step.writes)
         self.written = {id(node): (i, slot) for i, (_, ws) in enumerate(self.steps) for slot, node in ws}
-        guards = [guard for step, _ in self.steps for guard in step.guards]
-        nodes = below([*(node for _, node in self.pass_.outputs), *guards])
-        self.users = Counter(id(arg) for node in nodes for arg in node.args)
-        self.users.update(id(node) for _, node in self.pass_.outputs)
-        user = {id(arg): node for node in nodes for arg in node.args}
-        self.asked = {
-            id(draw): self._asked(draw, user) for draw in nodes if _draws(draw) and draw.op in _DRAWS
-        }
-        for group in grouped(
-            below([*(node for _, node in self.pass_.outputs), *guards], args=self.needs), self.needs
-        ):
+        roots = [node for _, node in self.pass_.outputs]
+        roots += [guard for step, _ in self.steps for guard in step.guards]
+        nodes = below(roots)
+        self.users = Counter(id(node) for node in (*roots, *(arg for node in nodes for arg in node.args)))
+        self.asked = self._asked(nodes, {id(node) for node in roots} | set(self.written))
+        for group in grouped(below(roots, args=self.needs), self.needs):
             if group[0].op in ("swap", "arrive"):
                 self._movement(group)
             else:
@@ -109,19 +107,22 @@ class _Planner:
         """What must be there before a node: for some draws also where they are asked for."""
         return (*node.args, *self.asked.get(id(node), ()))
 
-    def _asked(self, draw: Node, user: Mapping[int, Node]) -> tuple[Node, ...]:
-        """Flags without which a draw does not matter: what it is joined to, as far as only this depends on it."""
-        found: list[Node] = []
-        node = draw
-        while self.users[id(node)] == 1 and id(node) in user:
-            above = user[id(node)]
-            if above.op == "and":
-                other = above.args[1] if above.args[0] is node else above.args[0]
-                found += [other] if not self._is_random(other) else []
-            elif above.op not in _POINTWISE:
-                break
-            node = above
-        return tuple(found)
+    def _asked(self, nodes: list[Node], roots: set[int]) -> dict[int, tuple[Node, ...]]:
+        """Flags without which a draw does not matter: those that all it comes to is joined to."""
+        where: dict[int, dict[int, Node]] = {}
+        for node in reversed(nodes):
+            own = {} if id(node) in roots else where.get(id(node), {})
+            for arg in node.args:
+                if not self._is_random(arg):
+                    continue
+                flags = dict(own) if node.op in _POINTWISE else {}
+                for other in node.args:
+                    if node.op == "and" and not self._is_random(other) and len(flags) < MAX_ASKED:
+                        flags[id(other)] = other
+                known = where.get(id(arg), flags)
+                where[id(arg)] = {key: flag for key, flag in known.items() if key in flags}
+        draws = [node for node in nodes if node.op in _DRAWS and _draws(node)]
+        return {id(draw): tuple(where.get(id(draw), {}).values()) for draw in draws}
 
     def make(self, op: str, type: Type, *args: Node, attr: Any = None, like: Node | None = None) -> Node:
         key = (op, type.name, tuple(id(arg) for arg in args), repr(attr))
@@ -159,6 +160,8 @@ class _Planner:
                 other = right
             elif right is no and left is not no and yes.op != "sub":
                 other = left
+        if other is not None and other.op == "const" and other.attr == 0.0 and yes.op != "mul":
+            return args[2]
         if other is None:
             return self.make("choose", REAL, self.make("cells", CELLS, args[0]), args[1], args[2], like=node)
         if flag.op == other.op == "shift" and flag.attr == other.attr and flag.attr[2]:
@@ -178,19 +181,17 @@ class _Planner:
         first = group[0]
         movers = self.of(first.args[1])
         block, places = self._block([self.of(node.args[0]) for node in group])
-        count = self.size[id(block)]
-        in_place = all(node.args[0] is node.args[2] for node in group)
-        rest = block if in_place else self._rest(group, block, places)
-        if rest is None:
-            contents = [self.of(node.args[0]) for node in group]
-            block, places, count = self._stack(contents), list(range(len(group))), len(group)
-            rest = self._stack([self.of(node.args[2]) for node in group])
-        if first.op == "swap" and in_place:
+        left = self._left(group, places)
+        if first.op == "swap" and all(node.args[0] is node.args[2] for node in group):
             moved = self.make("swap", BLOCK, block, movers, attr=first.attr, like=first)
+        elif first.op == "arrive" and left is not None:
+            moved = self.make("leave", BLOCK, block, movers, attr=(*first.attr, left), like=first)
         else:
             op = "arrive" if first.op == "arrive" else "swap_onto"
+            block, places = self._stack([self.of(node.args[0]) for node in group]), [*range(len(group))]
+            rest = self._stack([self.of(node.args[2]) for node in group])
             moved = self.make(op, BLOCK, block, movers, rest, attr=first.attr, like=first)
-        self.size[id(moved)] = count
+        self.size[id(moved)] = self.size[id(block)]
         if self._lasts(group):
             self.lasting[id(moved)] = block
         for node, place in zip(group, places, strict=True):
@@ -210,27 +211,20 @@ class _Planner:
         self.size[id(stack)] = len(planes)
         return stack
 
-    def _rest(self, group: list[Node], block: Node, places: list[int]) -> Node | None:
-        """What movements find where they leave, as a block: mostly the block where some flag holds."""
-        kept: Counter[int] = Counter()
-        flags: dict[int, Node] = {}
-        for node in group:
-            content, _, rest = node.args
-            if rest.op == "and" and content in rest.args:
-                other = rest.args[1] if rest.args[0] is content else rest.args[0]
-                kept[id(other)] += 1
-                flags[id(other)] = other
-        if not kept or 2 * max(kept.values()) <= len(group):
-            return None
-        flag = flags[kept.most_common(1)[0][0]]
-        others = [
-            (place, self.of(node.args[2]))
-            for node, place in zip(group, places, strict=True)
-            if not (node.args[2].op == "and" and {*node.args[2].args} == {node.args[0], flag})
-        ]
-        planes = [plane for _, plane in others]
-        places_of = tuple(place for place, _ in others)
-        return self.make("masked", BLOCK, block, self.of(flag), *planes, attr=places_of)
+    @staticmethod
+    def _left(group: list[Node], places: list[int]) -> tuple[int, ...] | None:
+        """The planes that hold where something left, if all others do not hold there; None if it is not as simple."""
+        found = []
+        for node, place in zip(group, places, strict=True):
+            content, movers, rest = node.args
+            flag = rest.args[1] if rest.args and rest.args[0] is content else next(iter(rest.args), rest)
+            if rest.op == "or" and content in rest.args and flag is movers:
+                found.append(place)
+            elif not (
+                rest.op == "and" and content in rest.args and flag.op == "not" and flag.args[0] is movers
+            ):
+                return None
+        return tuple(found)
 
     def _lasts(self, group: list[Node]) -> bool:
         """Whether one moment writes all planes of the group, each from what its slot had before."""
@@ -266,8 +260,8 @@ class _Planner:
             found[id(new)] = Write(new, before)
         guards = tuple(guard for guard in step.guards if guard.op != "const")
         always = not guards or any(guard.op == "const" and guard.attr for guard in step.guards)
-        conditions = () if always else tuple(self._condition(guard) for guard in guards)
-        return Moment(step.place, conditions, tuple(found.values()))
+        conditions = {} if always else {id(node): node for node in map(self._condition, guards)}
+        return Moment(step.place, tuple(conditions.values()), tuple(found.values()))
 
     def _input(self, slot: str, like: Node) -> Node | None:
         """What a slot had when the pass began; nothing for scratch fields, which the pass has made itself."""
@@ -289,9 +283,11 @@ class _Planner:
         return joined
 
     def _is_random(self, node: Node) -> bool:
+        """Whether a node takes random bits. What moments wrote is there already."""
         if id(node) not in self.random:
-            for part in below([node]):
-                self.random[id(part)] = _draws(part) or any(self.random[id(arg)] for arg in part.args)
+            for part in below([node], self.random):
+                taken = _draws(part) or any(self.random[id(arg)] for arg in part.args)
+                self.random[id(part)] = taken and id(part) not in self.written
         return self.random[id(node)]
 
 
@@ -299,19 +295,20 @@ def _draws(node: Node) -> bool:
     """Whether a node takes more than a few random bits."""
     if node.op == "chance":
         _, bits, limit = node.attr
-        return bits - ((limit & -limit).bit_length() - 1) > FEW
+        return bits - ((limit & -limit).bit_length() - 1) > FEW_BITS
     return node.op in ("below_planes", "draw")
 
 
 def _conjuncts(node: Node) -> list[Node]:
-    parts, stack = [], [node]
+    """What must hold for a flag to hold, apart."""
+    seen: dict[int, Node] = {}
+    stack = [node]
     while stack:
         top = stack.pop()
-        if top.op == "and":
-            stack.extend(reversed(top.args))
-        else:
-            parts.append(top)
-    return list({id(part): part for part in parts}.values())
+        if id(top) not in seen:
+            seen[id(top)] = top
+            stack.extend(reversed(top.args) if top.op == "and" else ())
+    return [part for part in seen.values() if part.op != "and"]
 
 
 def _arguments(node: Node) -> tuple[Node, ...]:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 from powderdsl.backends.dense_source import comment
-from powderdsl.backends.planes_plan import Moment, Plan, below, plan_pass
+from powderdsl.backends.planes_plan import BLOCK, Moment, Plan, below, plan_pass
 from powderdsl.ir.ops import REAL, Node, PassGraph
 
 _WORDS = {"and": "&", "or": "|", "xor": "^"}
@@ -35,7 +35,9 @@ class _Writer:
         self.gone: list[str] = []
         """Those of them that were deleted in it."""
         self.own: set[int] = set()
-        """Reals with a number for each cell in an array that nothing else refers to."""
+        """Blocks, and reals with a number for each cell, in an array that nothing else refers to."""
+        self.members: dict[int, list[Node]] = {}
+        """Planes of each block that have names."""
         self.full: set[int] = set()
         """Reals with a number for each cell."""
         self.slots = {slot for slot, _ in plan.outputs}
@@ -73,7 +75,8 @@ class _Writer:
 
     def last(self, node: Node, user: Node) -> bool:
         """Whether an array may be overwritten by the result of its only user left."""
-        return id(node) in self.own and self.uses[id(node)] == sum(arg is node for arg in user.args)
+        seen = any(self.uses[id(member)] for member in self.members.get(id(node), ()))
+        return id(node) in self.own and self.uses[id(node)] == user.args.count(node) and not seen
 
     # Moments
 
@@ -94,6 +97,8 @@ class _Writer:
         self.ensure(node for node in inner if id(node) in self.plan.shared and id(node) not in made)
         pairs = [(write.node, write.old) for write in moment.writes if write.old is not None]
         self.ensure(old for _, old in pairs)
+        # Blocks last: by then what else is made of their planes is made.
+        pairs.sort(key=lambda pair: pair[0].type == BLOCK)
         pending = [(node, old) for node, old in pairs if id(node) not in self.names]
         if pending:
             self.branch(moment.conditions, pending)
@@ -142,12 +147,13 @@ class _Writer:
         if node.type == REAL:
             self.real(node, args)
         else:
-            expression = f"{args[0]} & {args[1]}" if node.op == "masked" else self.words(node, args)
-            self.line(f"{self.fresh(node)} = {expression}")
-            if node.op == "masked":
-                for place, plane in zip(node.attr, args[2:], strict=True):
-                    self.line(f"{self.name(node)}[{place}] = {plane}")
-            self.spend(node.args)
+            expression = self.words(node, args)
+            over = node.args[0] if node.op in ("swap", "leave") and self.last(node.args[0], node) else None
+            if node.op == "member":
+                self.members.setdefault(id(node.args[0]), []).append(node)
+            elif node.type == BLOCK:
+                self.own.add(id(node))
+            self.assign(node, expression, over)
 
     def constant(self, node: Node) -> None:
         if node.type != REAL:
@@ -190,8 +196,10 @@ class _Writer:
                 return f"{args[0]}[{attr}]"
             case "stack":
                 return f"k.stack(({listed},))"
-            case "swap" | "arrive" | "swap_onto":
+            case "arrive" | "swap_onto":
                 return f"k.{node.op}({listed}, {attr[0]}, {attr[1]})"
+            case "swap" | "leave":
+                return f"k.{node.op}({listed}, {self.last(node.args[0], node)}, {', '.join(map(str, attr))})"
         raise AssertionError(f"no plane kernel for {node.op}")
 
     def real(self, node: Node, args: list[str]) -> None:
@@ -243,12 +251,22 @@ class _Writer:
         shared = node.op in ("param", "draw") or (node.op == "input" and attr not in self.slots)
         if id(node) in self.full and not shared:
             self.own.add(id(node))
+        if over is not None and sign:
+            self.names[id(node)] = self.name(over)
+            self.line(expression)
+            self.uses[id(over)] = 0
+            self.spend(arg for arg in node.args if arg is not over)
+        else:
+            self.assign(node, expression, over)
+
+    def assign(self, node: Node, expression: str, over: Node | None) -> None:
+        """A name for an operation's result: that of the argument that it overwrites, if it does."""
         if over is None:
             self.line(f"{self.fresh(node)} = {expression}")
             self.spend(node.args)
             return
         self.names[id(node)] = self.name(over)
-        self.line(expression if sign else f"{self.name(over)} = {expression}")
+        self.line(f"{self.name(over)} = {expression}")
         self.uses[id(over)] = 0
         self.spend(arg for arg in node.args if arg is not over)
 

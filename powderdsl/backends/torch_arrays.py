@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,16 +12,48 @@ from powderdsl.backends.array_draws import Draws, base_keys
 from powderdsl.backends.array_kernels import ArrayKernels
 from powderdsl.backends.array_words import Array, pack, unpack
 from powderdsl.backends.dense_source import load_source
+from powderdsl.backends.planes_quiet import quiet_pass, real_inputs
 from powderdsl.backends.planes_source import planes_pass_source
 from powderdsl.backends.torch_job import Job
 from powderdsl.backends.torch_laps import Laps, unwatched
 from powderdsl.ir.gates import width as planes_of
-from powderdsl.ir.ops import Program
+from powderdsl.ir.ops import PassGraph, Program
+
+GLANCE = 61
+"""One in so many reals is looked at before all are."""
 
 State = dict[str, Array]
 
-CHUNK = 1 << 16
+CHUNK = 1 << 17
 """Cells worked on at a time: a float32 for each fits the second-level cache twice or more."""
+
+
+PassFunction = Callable[[ArrayKernels, State], State]
+
+
+def _function(pass_: PassGraph, number: int) -> PassFunction:
+    """A pass as a function; where its reals are all zero, a shorter one if there is one."""
+    full, quiet = _loaded(pass_, number), quiet_pass(pass_)
+    if quiet is None:
+        return full
+    short, slots = _loaded(quiet, number), real_inputs(pass_)
+
+    def either(kernels: ArrayKernels, state: State) -> State:
+        silent = all(_is_zero(state[slot]) for slot in slots)
+        return short(kernels, state) if silent else full(kernels, state)
+
+    return either
+
+
+def _loaded(pass_: PassGraph, number: int) -> PassFunction:
+    source, name, constants = planes_pass_source(pass_, number)
+    function: PassFunction = load_source(source, name, {k: np.float32(v) for k, v in constants.items()})
+    return function
+
+
+def _is_zero(reals: Array) -> bool:
+    bits = reals.reshape(-1).view(np.int32)
+    return not np.count_nonzero(bits[::GLANCE]) and not np.count_nonzero(bits)
 
 
 class ArrayProgram:
@@ -41,11 +72,7 @@ class ArrayProgram:
         self._resets = [slot for slot in planes.slots if slot.resets]
         self._kept: tuple[tuple[int, int, int], dict[object, Array]] = ((0, 0, 0), {})
         """The last shape of worlds, and what hangs on it only."""
-        self._functions: list[tuple[str, Callable[[Any, State], State]]] = []
-        for i, pass_ in enumerate(planes.passes):
-            source, name, constants = planes_pass_source(pass_, i)
-            known = {key: np.float32(value) for key, value in constants.items()}
-            self._functions.append((pass_.name, load_source(source, name, known)))
+        self._functions = [(pass_.name, _function(pass_, i)) for i, pass_ in enumerate(planes.passes)]
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes."""

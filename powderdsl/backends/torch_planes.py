@@ -66,10 +66,19 @@ class PlaneKernels:
     def stack(self, planes: tuple[Tensor, ...]) -> Tensor:
         return torch.stack([self.full(plane) for plane in planes])
 
-    def swap(self, block: Tensor, movers: Tensor, dy: int, dx: int) -> Tensor:
-        """Movers and targets exchanged, in all planes: by the xor of the two."""
+    def swap(self, block: Tensor, movers: Tensor, over: bool, dy: int, dx: int) -> Tensor:
+        """Movers and targets exchanged, in all planes: by the xor of the two. `over`: the block is not needed any more."""
         difference = (block ^ self.shift(block, dy, dx, True)) & movers
         return block ^ difference ^ self.shift(difference, -dy, -dx, True)
+
+    def leave(
+        self, block: Tensor, movers: Tensor, over: bool, dy: int, dx: int, left: tuple[int, ...]
+    ) -> Tensor:
+        """Targets get what the movers held; where those were, the planes `left` hold and the others do not."""
+        rest = block & (movers ^ self.valid)
+        for plane in left:
+            rest[plane] |= movers
+        return self.arrive(block, movers, rest, dy, dx)
 
     def swap_onto(self, block: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
         """The same where something else has changed as well: `rest` has the cells that do not move."""

@@ -24,7 +24,7 @@ MARK = "happened "
 class Runner:
     """Runs a ruleset on one backend. `happened` collects the lines of rules that changed or claimed some cell."""
 
-    def __init__(self, ruleset: Ruleset, backend: str = "torch"):
+    def __init__(self, ruleset: Ruleset, backend: str = "planes"):
         self.ruleset = ruleset
         self.backend = backend
         self.lines = rule_spans(ruleset)

@@ -93,6 +93,11 @@ class Search:
                 search.trials.append(_Trial(one, ""))
         return search
 
+    def only(self, text: str) -> Search:
+        """The same search for one property alone; for none if it is proven."""
+        trials = [replace(trial) for trial in self.trials if trial.prop.text == text]
+        return Search(self.runner, self.plan, self.ledger, {}, trials)
+
     def try_random(self) -> None:
         """Random worlds, until there are enough of them, or time is over."""
         until = monotonic() + self.plan.seconds

@@ -5,7 +5,10 @@ from __future__ import annotations
 import pytest
 
 import powderdsl
-from powderdsl.compiler import shipped_rules
+from powderdsl.backends import array_draws, array_kernels, torch_arrays
+from powderdsl.backends.torch_mixed import packed_program
+from powderdsl.backends.torch_planes import PlanesProgram
+from powderdsl.compiler import lower, shipped_rules
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 
@@ -15,6 +18,8 @@ RULESETS = [name for name in shipped_rules() if name not in PACKS_ALONE]
 
 
 def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:
+    if backend == "tensors":  # what `planes` is on a device: here on the CPU, to be compared
+        return on_tensors(rules)
     try:
         return powderdsl.compile(rules, backend=backend)
     except CompileError as error:
@@ -23,7 +28,15 @@ def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:
         raise
 
 
-@pytest.mark.parametrize("backend", ["dense", "planes", "native"])
+def on_tensors(rules: Ruleset) -> powderdsl.Simulator:
+    sim = powderdsl.compile(rules, backend="planes")
+    sim._program = packed_program(
+        lower(rules), sim.device, lambda cells, planes: PlanesProgram(cells, planes, sim.device)
+    )
+    return sim
+
+
+@pytest.mark.parametrize("backend", ["dense", "planes", "tensors", "native"])
 @pytest.mark.parametrize("name", RULESETS)
 def test_same_worlds(name: str, backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     rules = powderdsl.load(name)
@@ -56,7 +69,7 @@ def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyp
     rates = torch.tensor([0.0, 0.3, 1.0], dtype=torch.float64)
     ids = torch.randint(14, (3, 8, 40), generator=torch.Generator().manual_seed(1))
     oracle = powderdsl.compile(rules, backend="reference")
-    for backend in ("dense", "planes", "native"):
+    for backend in ("dense", "planes", "tensors", "native"):
         sim = compiled(rules, backend)
         together = sim.step(sim.world(ids, seed=4), 3, params={"water.melt": rates, "fire.spread": rates})
         for i, rate in enumerate(rates.tolist()):
@@ -67,6 +80,30 @@ def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyp
                     backend,
                     slot.name,
                 )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_skipped_changes_nothing(seed: int, torch, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """Word by word or all at once, in large or small batches and pieces, with wind or without: the same worlds."""
+    few = seed % 2
+    for module in (array_draws, array_kernels):
+        monkeypatch.setattr(module, "FEW", 0 if few else 1 << 20)
+        monkeypatch.setattr(module, "SPARSE", 1)
+    monkeypatch.setattr(array_kernels, "PIECE", 100)
+    monkeypatch.setattr(torch_arrays, "CHUNK", 64 * 30 * 2)
+    rules = powderdsl.load("powderworld")
+    oracle, other = powderdsl.compile(rules, backend="dense"), powderdsl.compile(rules, backend="planes")
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.randint(14, (5, 30, 64), generator=generator)
+    ids[torch.rand(ids.shape, generator=generator) < (0.2, 0.2, 0.9, 0.9)[seed]] = 0
+    velocity = torch.randn((5, 2, 30, 64), generator=generator) * 5
+    velocity[:, :, :, 40:] = 0
+    for wind in (velocity, 0 * velocity):
+        worlds = [sim.replace(sim.world(ids, seed=seed), velocity=wind) for sim in (oracle, other)]
+        for _ in range(6):
+            worlds = [world.sim.step(world, 2) for world in worlds]
+            for slot in oracle.slots:
+                assert torch.equal(worlds[0].state[slot.name], worlds[1].state[slot.name]), slot.name
 
 
 def test_native_state_is_unpacked_when_read(torch) -> None:  # type: ignore[no-untyped-def]

@@ -1,0 +1,106 @@
+"""A pass on planes as it is where all reals that it reads are zero: much less, or nothing at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from powderdsl.ir.build import Builder
+from powderdsl.ir.gates import Gates
+from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, nodes_of, walk
+
+SNAP = np.float32(2.0**-20)
+WORTH = 0.75
+"""A quiet form must have this share of the pass's nodes at most."""
+
+_REALS: dict[str, Callable[..., Any]] = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt,
+    "min": np.minimum, "max": np.maximum, "div": lambda a, b: a / b if b else np.float32(0),
+}  # fmt: skip
+_COMPARE: dict[str, Callable[..., Any]] = {"eq": np.equal, "lt": np.less, "le": np.less_equal}
+
+
+def real_inputs(pass_: PassGraph) -> tuple[str, ...]:
+    """The slots of reals that a pass reads."""
+    nodes = nodes_of(pass_, moments=False)
+    return tuple(dict.fromkeys(str(n.attr) for n in nodes if n.op == "input" and n.type == REAL))
+
+
+def quiet_pass(pass_: PassGraph) -> PassGraph | None:
+    """The pass where its real inputs are zero everywhere; None if that is not much less."""
+    slots = set(real_inputs(pass_))
+    if not slots:
+        return None
+    build = Builder()
+    gates = Gates(build)
+    new: dict[int, Node] = {}
+    roots = [
+        *nodes_of(pass_),
+        *(n for step in pass_.moments for guard in step.guards for n in _ordered(guard)),
+    ]
+    for node in roots:
+        if id(node) not in new:
+            build.place = node.places[0] if node.places else ""
+            new[id(node)] = _quiet(node, [new[id(arg)] for arg in node.args], gates)
+    moments = []
+    for step in pass_.moments:
+        guards = tuple(guard for guard in (new[id(g)] for g in step.guards) if guard is not gates.no)
+        writes = tuple((slot, new[id(node)]) for slot, node in step.writes)
+        if guards or not step.guards:
+            moments.append(Step(step.label, step.place, writes, guards))
+    outputs = []
+    for slot, old in pass_.outputs:
+        node = new[id(old)]
+        unchanged = node.op == "input" and node.attr == slot
+        if not unchanged and not (slot in slots and node.op == "const" and not node.attr):
+            outputs.append((slot, node))
+    quiet = PassGraph(pass_.name, pass_.pack, tuple(moments), tuple(outputs))
+    size, before = (len(nodes_of(graph, moments=False)) for graph in (quiet, pass_))
+    return quiet if size <= WORTH * before else None
+
+
+def _ordered(root: Node) -> list[Node]:
+    return sorted(walk(root), key=lambda node: node.index)
+
+
+def _quiet(node: Node, args: list[Node], gates: Gates) -> Node:
+    """A node on quiet arguments, folded."""
+    build, op = gates.build, node.op
+    known = bool(args) and all(arg.op == "const" for arg in args)
+    if op == "input" and node.type == REAL:
+        return build.real(0.0)
+    if known and args[0].type == REAL:
+        values = [np.float32(arg.attr) for arg in args]
+        with np.errstate(all="ignore"):
+            if op in _COMPARE:
+                return build.flag(bool(_COMPARE[op](*values)))
+            if op in _REALS:
+                return build.real(float(_REALS[op](*values)))
+            if op == "settle":
+                cut = np.clip(values[0], np.float32(node.attr[0]), np.float32(node.attr[1]))
+                return build.real(float(cut) if abs(cut) >= SNAP else 0.0)
+        if op == "shift" and (node.attr[2] or not args[0].attr):
+            return args[0]
+    if op == "select" and args[0].op == "const":
+        return args[1] if args[0].attr else args[2]
+    if op == "select" and args[1] is args[2]:
+        return args[1]
+    if node.type == FLAG:
+        match op:
+            case "not":
+                return gates.not_(args[0])
+            case "and":
+                return gates.and_(*args)
+            case "or":
+                return gates.or_(*args)
+            case "xor":
+                return gates.xor(*args)
+            case "select":
+                return gates.mux(*args)
+            case "shift":
+                return gates.shift(args[0], node.attr[:2], node.attr[2])
+            case "swap" | "arrive" if args[1] is gates.no or (args[0] is args[2] and args[0].op == "const"):
+                return args[2]
+    return build.make(op, node.type, *args, attr=node.attr)
