@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 BACKENDS = {
     "auto": "`torch` at once, and `native` once that is compiled; work of seconds starts no compiler",
-    "torch": "any device: one tensor element a cell for little work, packed bit planes for more",
+    "torch": "packed bit planes on any device; few cells on a device other than the CPU: one tensor element a cell",
     "dense": "torch, always one tensor element a cell: the readable one",
     "planes": "torch, always packed bit planes",
     "native": "generated C++ for the CPU; compiled once, then kept",
