@@ -203,9 +203,9 @@ class Search:
             return [0, 1] if kind.name == "flag" else list(range(int(kind.lo), int(kind.hi) + 1))
         if what == "draw":
             cuts = [0.0, *self.thresholds.get(name, []), 1.0]
-            between = [(a + b) / 2 for a, b in itertools.pairwise(cuts) if a < b]
+            between = ((a + b) / 2 for a, b in itertools.pairwise(cuts) if a < b)
             # A draw of 16 or 32 bits may be a threshold itself: neither above nor below it.
-            return between + [c for c in cuts if (c * 2**17) % 2 == 1 or (c * 2**33) % 2 == 1]
+            return [*between, *(c for c in cuts if (c * 2**17) % 2 == 1 or (c * 2**33) % 2 == 1)]
         assert isinstance(name, Expr)
         if name.kind.name in ("element", "direction"):
             return list(self.facts.ids) if name.kind.name == "element" else list(range(8))
