@@ -50,7 +50,8 @@ class PassSchedule:
         self.leaders = {
             id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))
         }
-        for node in nodes_of(pass_):
+        asked = [node for step in pass_.moments for guard in step.guards for node in walk(guard)]
+        for node in [*nodes_of(pass_), *asked]:
             if node.op == "input":
                 real = node.type == REAL
                 (self.fields if real else self.planes)[id(node)] = self.slot(str(node.attr), real)
@@ -106,7 +107,7 @@ class PassSchedule:
         outer, self.statements = self.statements, []
         scope = (dict(self.planes), dict(self.fields))
         stages = self.stages(guards)
-        kept = [(g, "") for g in guards if id(g) not in scope[0]]
+        kept = [(g, "") for g in guards if id(g) not in scope[0] and id(g) not in olds]
         for node in nodes:
             if not self.have(node):
                 self.named[id(node)] = self.fresh("p")
