@@ -166,7 +166,19 @@ def commands() -> str:
     return table(("command", "what it does"), rows)
 
 
+def mutations() -> str:
+    import yaml
+
+    text = (DOCS.parent / "tests" / "mutations.yaml").read_text(encoding="utf-8")
+    rows = []
+    for row in yaml.load(text, yaml.CBaseLoader):
+        by = f"`check`: `{row['check']}`" if "check" in row else f"`test`: {row['test']}"
+        rows.append((f"`{row['pack']}`", row["mistake"], by))
+    return table(("pack", "mistake", "noticed by"), rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "mutations": mutations,
     "directions": directions,
     "direction sets": direction_sets,
     "kernels": kernels,

@@ -15,7 +15,7 @@ import numpy as np
 from powderdsl.properties.breaks import Agreement, Alike, Runs, Tested, breaks, is_paired, steps_for
 from powderdsl.properties.samples import Sample
 
-SEEDS = 8
+SEEDS = 24
 """How many seeds each smaller world is tried with, its own first."""
 
 MAX_BATCH = 1024

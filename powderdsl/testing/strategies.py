@@ -8,6 +8,7 @@ from typing import TypeVar
 from hypothesis import reject
 from hypothesis import strategies as st
 
+from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.cases import Start, load_text, random_start
@@ -19,14 +20,16 @@ T = TypeVar("T")
 
 
 def worlds(
-    ruleset: Ruleset, max_batch: int = 3, max_side: int = 65, shape: tuple[int, int, int] | None = None
+    rules: Ruleset | str, max_batch: int = 3, max_side: int = 65, shape: tuple[int, int, int] | None = None
 ) -> st.SearchStrategy[Start]:
     """Start worlds of a ruleset: any ids, fields and parameters it allows, in odd shapes.
 
     Args:
+        rules: a checked model, or a name as `powderdsl.load` takes it.
         max_batch, max_side: bounds of worlds, rows and columns.
         shape: (worlds, rows, columns), if it must be this one.
     """
+    ruleset = load(rules) if isinstance(rules, str) else rules
     return chosen(lambda choices: random_start(ruleset, choices, shape, max_batch, max_side))
 
 
