@@ -82,6 +82,17 @@ def test_random_rulesets(seed: int, folder: Path) -> None:
     assert_same(ruleset, random_start(ruleset, Choices.seeded(seed), shape), steps=2, simulators=simulators)
 
 
+def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then nothing is held back in registers: planes that neighbours read are never written in place."""
+    monkeypatch.setattr("powderdsl.backends.cuda_source.HELD", 0)
+    ruleset = load("core+sand+water")
+    simulators = [compile_ruleset(ruleset, backend="reference"), emulated_simulator(ruleset, folder)]
+    start = random_start(ruleset, Choices.seeded(2), (2, 9, 40))
+    assert_same(ruleset, start, steps=3, simulators=simulators)
+    assert " o_p" in (text := kernels(ruleset, 9, 40)[0].text)
+    assert "[ROUNDS]" not in text
+
+
 def test_many_steps_a_launch(folder: Path, torch) -> None:  # type: ignore[no-untyped-def]
     """Twenty steps in one launch are twenty launches, and the state stays packed in between."""
     simulator = emulated_simulator(load("core+sand+water"), folder)
