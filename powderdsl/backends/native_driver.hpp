@@ -21,7 +21,8 @@ constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES w
 static Grid make_grid(int worlds, int height, int width) {
   const int words = (width + 63) / 64, stride = (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO);
   const bool large = sizeof(V) * height * words >= LARGE_PLANE;
-  const bool strips = height % LANES == 0 && (worlds <= LANES / 2 || large);
+  const bool reachable = height / LANES >= std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
+  const bool strips = height % LANES == 0 && reachable && (worlds <= LANES / 2 || large);
   return Grid{strips ? height / LANES : height, width, words, stride, strips};
 }
 static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int x) {

@@ -23,6 +23,9 @@ class Layout:
     moving: int = 0
     """Planes that most movements carry along."""
     reach: int = 1
+    """Columns beyond a row of reals that are read."""
+    halo: int = 16
+    """Rows and columns beyond the grid that tables and rows of reals have room for."""
     around: int = 0
     """Rows away that planes are read at, at most, around the edges."""
     beyond: int = 0
@@ -57,12 +60,15 @@ def _place(node: Node, layout: Layout) -> None:
             number(layout.fixed, (0 if attr[0] == "row" else 1, attr[1], attr[2]))
         case "inside":
             number(layout.fixed, (2, attr[0], attr[1]))
-        case "shift" | "swap" | "arrive" if node.type.name == "real":
-            layout.reach = max(layout.reach, abs(attr[1]))
-        case "shift" if not attr[2]:
-            layout.beyond = max(layout.beyond, abs(attr[0]))
         case "shift" | "swap" | "arrive":
-            layout.around = max(layout.around, abs(attr[0]))
+            # What is computed again at a neighbour reads neighbours of its own, a few times over.
+            layout.halo = max(layout.halo, -(-4 * max(abs(attr[0]), abs(attr[1])) // 16) * 16)
+            if node.type.name == "real":
+                layout.reach = max(layout.reach, 3 * abs(attr[1]))
+            elif node.op == "shift" and not attr[2]:
+                layout.beyond = max(layout.beyond, abs(attr[0]))
+            else:
+                layout.around = max(layout.around, abs(attr[0]))
 
 
 def number(table: dict, key: object) -> int:

@@ -18,7 +18,7 @@
 
 typedef uint64_t u64;
 typedef uint32_t u32;
-constexpr int LANES = 8, CHUNK = 16, HALO = 16;
+constexpr int LANES = 8, CHUNK = 16;
 typedef u64 V __attribute__((vector_size(64), may_alias));
 typedef u32 U __attribute__((vector_size(64), may_alias));
 typedef float F __attribute__((vector_size(64), may_alias));
