@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from time import monotonic
 
@@ -79,12 +79,14 @@ class Search:
     trials: list[_Trial] = field(default_factory=list)
 
     @classmethod
-    def of(cls, runner: Runner, plan: Plan, properties: Iterable[Property] | None = None) -> Search:
-        """Everything that can be proven is; the rest is to be tried."""
+    def of(cls, runner: Runner, plan: Plan, declared_only: bool = False) -> Search:
+        """Everything that can be proven is; the rest is to be tried. `declared_only`: nothing that no pack says."""
         ledger = make_ledger(runner.ruleset)
         search = cls(runner, plan, ledger)
-        for one in properties_of(runner.ruleset, ledger) if properties is None else properties:
+        for one in properties_of(runner.ruleset, ledger):
             declared = one.owner != AUTOMATIC
+            if declared_only and not declared:
+                continue
             verdict = prove(one.claim, runner.ruleset, ledger, one.without) if declared else NotProven("")  # type: ignore[arg-type]
             if isinstance(verdict, Proven):
                 given = f", given {verdict.given}" if verdict.given else ""

@@ -32,13 +32,22 @@ SECTIONS = {
 """Sections of a pack whose entries have keys of their own."""
 
 NOT_RUN = {
-    "pack": {"about", "needs", "conflicts", "also", "tests", "invariants"},  # how packs meet is decided before the IR
+    "pack": {
+        "about",
+        "needs",
+        "conflicts",
+        "also",
+        "tests",
+        "invariants",
+    },  # how packs meet is decided before the IR
     "element": {"glyph", "about", "override"},
     **{context: {"about"} for context in ("property", "field", "stream", "param", "pass")},
 }
 """Keys that say nothing about what a step does."""
 
-OF_INVARIANTS = frozenset({"never", "trend", "stays", "reach", "agree", "total", "without", "duration", "word"})
+OF_INVARIANTS = frozenset(
+    {"never", "trend", "stays", "reach", "agree", "total", "without", "duration", "word"}
+)
 """Syntax that only invariants have: they say nothing about what a step does either."""
 
 ON_CELLS = ("passes", "on cells")
