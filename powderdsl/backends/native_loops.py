@@ -187,8 +187,11 @@ def is_clean(node: Node, have: Callable[[Node], bool], known: dict[int, bool] | 
     """Whether bits beyond the width are surely zero. Graphs share nodes, so answers are kept in `known`."""
     known = {} if known is None else known
     if id(node) not in known:
-        if have(node) or node.op in ("const", "inside", "coordinate", "shift", *DRAWS, *ANCHORS):
+        if have(node) or node.op in ("const", "inside", "coordinate", *DRAWS, *ANCHORS):
             known[id(node)] = not (node.op == "coordinate" and node.attr[0] == "step")
+        elif node.op == "shift":
+            # Read from a plane, it is clean; computed for another row, it holds what its source holds.
+            known[id(node)] = is_clean(node.args[0], have, known)
         elif node.op == "and":
             known[id(node)] = any(is_clean(arg, have, known) for arg in node.args)
         elif node.op in ("or", "xor"):

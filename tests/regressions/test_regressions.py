@@ -13,19 +13,13 @@ from powderdsl.testing.differential import check_case
 
 FOLDER = Path(__file__).parent
 FILES = sorted(FOLDER.glob("*.yaml"))
-OPEN: dict[tuple[str, str], str] = {
-    ("draw-where-a-shift-is-recomputed", "native"): "is_clean of a shift that is no plane",
-}
-"""(file, backend): what is not mended yet. A case that has been mended fails here until its row goes."""
 
 
 def cases() -> list:
     found = []
     for path in FILES:
         for backend in ("dense", "planes", "native"):
-            why = OPEN.get((path.stem, backend))
-            marks = [pytest.mark.xfail(reason=why, raises=AssertionError)] if why else []
-            found.append(pytest.param(path, backend, id=f"{path.stem}-{backend}", marks=marks))
+            found.append(pytest.param(path, backend, id=f"{path.stem}-{backend}"))
     return found
 
 
@@ -42,4 +36,3 @@ def test_backends_agree(path: Path, backend: str, tmp_path: Path) -> None:
 
 def test_there_are_some() -> None:
     assert FILES
-    assert {file for file, _ in OPEN} <= {path.stem for path in FILES}

@@ -6,6 +6,7 @@ Random rulesets come from seeds, as in test_differential.py; `Manner` leaves out
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -75,10 +76,12 @@ def test_a_world_is_the_same_alone_and_in_a_batch(backend: str, seeds: range) ->
         after = simulator.step(together, 3)
         for i in range(3):
             assert_equal(simulator.step(together.select([i]), 3), after.select(i))
-            alone = simulator.world(start.ids[i : i + 1].astype(np.int64), seed=start.seed, index=[i])
-            alone = simulator.replace(
-                alone, **{name: values[i : i + 1] for name, values in start.fields.items()}
+            one = replace(
+                start,
+                ids=start.ids[i : i + 1],
+                fields={name: values[i : i + 1] for name, values in start.fields.items()},
             )
+            alone = replace(one.world(simulator), index=together.index[i : i + 1])
             assert_equal(simulator.step(alone, 3), after.select(i))
         assert_equal(simulator.step(together.select([2, 0]), 3), after.select([2, 0]))
 

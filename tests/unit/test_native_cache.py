@@ -16,8 +16,10 @@ from pathlib import Path
 import pytest
 
 from powderdsl.backends import cuda_build, native_cache
+from powderdsl.backends.cuda_source import KernelSource
 from powderdsl.backends.native_build import Building, build, building, run_guarded
 from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for
+from powderdsl.backends.native_layout import Layout
 from tests.cli.commands import environment_with
 from tests.processes import alive, waited
 
@@ -343,6 +345,10 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "others may write" in refused.stderr
 
 
+def cuda_kernel(text: str) -> KernelSource:
+    return KernelSource("rules", text, Layout(), group=1, threads=32, shared=0, scratch=0)
+
+
 def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Nvrtc:
         """What asks for the version; compiling is made up as well, so no GPU is needed."""
@@ -359,7 +365,8 @@ def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(cuda_build, "nvrtc", lambda version: Nvrtc())
     monkeypatch.setattr(cuda_build, "compile_text", compile_text)
-    wanted = [("a", "sm_90"), ("a", "sm_80"), ("a", "sm_90"), ("b", "sm_90")]
+    a, b = cuda_kernel("a"), cuda_kernel("b")
+    wanted = [(a, "sm_90"), (a, "sm_80"), (a, "sm_90"), (b, "sm_90")]
     assert [cuda_build.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
     assert compiled == ["a", "a", "b"]
     found = native_cache.entries(tmp_path / "powderdsl" / "native")
