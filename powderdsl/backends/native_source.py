@@ -11,6 +11,11 @@ from powderdsl.ir.ops import Program
 GENERATOR_VERSION = 2
 """Part of every cache key: raise it when generated code changes meaning."""
 
+LIBRARY = ("vectors", "runtime", "planes", "fields")
+"""What stands before the generated passes, in this order: native_*.hpp."""
+DRIVER = ("driver", "views")
+"""What stands behind them."""
+
 SNAP = 2.0**-20
 
 
@@ -60,9 +65,10 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"static const std::vector<u32> STREAM_IDENT = {{{', '.join(idents)}}};",
     ])  # fmt: skip
     folder = files("powderdsl.backends")
-    runtime = (folder / "native_runtime.hpp").read_text(encoding="utf-8")
-    driver = (folder / "native_driver.hpp").read_text(encoding="utf-8")
-    views = (folder / "native_views.hpp").read_text(encoding="utf-8")
+    before, after = (
+        "\n".join((folder / f"native_{part}.hpp").read_text(encoding="utf-8") for part in parts)
+        for parts in (LIBRARY, DRIVER)
+    )
     body = "\n\n".join(passes)
     step = f"static void run_passes(Context& c) {{\n  START;\n{calls}\n}}"
-    return "\n".join([head, runtime, tables, body, step, driver, views]), layout
+    return "\n".join([head, before, tables, body, step, after]), layout
