@@ -1,30 +1,36 @@
 // Work on planes: columns and rows of neighbours, draws, movements. Comes after native_runtime.hpp.
 
 // Columns: the value at the column dx to the right, wrapping or with nothing beyond the edge.
-OUTLINE V columns_far(const Context& c, const V* row, int w, int dx, bool wraps) {
-  int n = c.g.words, rest = c.g.width - 64 * (n - 1);
+OUTLINE V columns_far(const Context& c, const V* row, int w, int dx) {  // farther than the last word of a row is wide
+  const int n = c.g.words, rest = c.rest;
   auto word = [&](int i) -> V {  // words of the endless row: the last is continued by the first
-    if (i < 0) {
-      if (!wraps) return splat(0);
-      return rest == 64 ? row[n - 1] : (row[n - 1] << (64 - rest)) | (row[n - 2] >> rest);
-    }
+    if (i < 0) return (row[n - 1] << (64 - rest)) | (row[n - 2] >> rest);
     if (i < n - 1) return row[i];
-    if (!wraps) return i == n - 1 ? row[i] : splat(0);
-    if (rest == 64) return i == n - 1 ? row[i] : row[0];
     return i == n - 1 ? row[i] | (row[0] << rest) : (row[0] >> (64 - rest)) | (row[1] << rest);
   };
   V r = dx > 0 ? (word(w) >> dx) | (word(w + 1) << (64 - dx)) : (row[w] << -dx) | (word(w - 1) >> (64 + dx));
   return r & c.valid(w);
 }
+ALWAYS int next_word(const Context& c, int w, int dx) {  // on the side that dx points to, around
+  return dx > 0 ? (w + 1 == c.g.words ? 0 : w + 1) : (w == 0 ? c.g.words - 1 : w - 1);
+}
+ALWAYS int columns_in(const Context& c, int w) { return w == c.g.words - 1 ? c.rest : 64; }
 ALWAYS V columns(const Context& c, const V* row, int w, int dx) {
-  if (__builtin_expect(c.g.words != 1, 0)) return columns_far(c, row, w, dx, true);
+  if (__builtin_expect(c.g.words != 1, 0)) {
+    if (abs(dx) > c.rest) return columns_far(c, row, w, dx);
+    const int next = next_word(c, w, dx);
+    if (dx > 0) return ((row[w] >> dx) | (row[next] << (columns_in(c, w) - dx))) & c.valid(w);
+    return ((row[w] << -dx) | (row[next] >> (columns_in(c, next) + dx))) & c.valid(w);
+  }
   int by = c.turn[dx + HALO];
   V x = row[0];
   return by ? ((x >> by) | (x << (c.g.width - by))) & c.valid_last : x;
 }
 ALWAYS V columns_zero(const Context& c, const V* row, int w, int dx) {
-  if (__builtin_expect(c.g.words != 1, 0)) return columns_far(c, row, w, dx, false);
-  return dx > 0 ? row[0] >> dx : (row[0] << -dx) & c.valid_last;
+  V x = dx > 0 ? row[w] >> dx : row[w] << -dx;
+  if (dx > 0 && w + 1 < c.g.words) x |= row[w + 1] << (64 - dx);
+  if (dx < 0 && w > 0) x |= row[w - 1] >> (64 + dx);
+  return x & c.valid(w);
 }
 ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
   if (__builtin_expect(y >= 0 && y < c.g.height, 1)) return p->data + y * c.g.words;
@@ -212,6 +218,21 @@ OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here
     for (int w = 0; w < words; w++) there[w] ^= turned(dx ? columns(c, c.change, w, -dx) : c.change[w], -by);
   }
 }
+// A row of several words that exchanges with one some columns on. No two movers have a cell in common, so words may
+// take turns.
+OUTLINE void swap_words(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int dx) {
+  for (int w = 0; w < c.g.words; w++) {
+    if (!any(m[w])) continue;
+    const int next = next_word(c, w, dx);
+    for (int k = 0; k < n; k++) {
+      V *here = data[k] + here_row, *there = data[k] + there_row;
+      const V d = (here[w] ^ columns(c, there, w, dx)) & m[w];
+      here[w] ^= d;
+      there[w] ^= (dx > 0 ? d << dx : d >> -dx) & c.valid(w);
+      there[next] ^= (dx > 0 ? d >> (columns_in(c, w) - dx) : d << (columns_in(c, next) + dx)) & c.valid(next);
+    }
+  }
+}
 // Movers exchange what they hold with their targets. No cell is both.
 OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
   if (movers->zero) return;
@@ -232,6 +253,10 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
       continue;
     }
     if (words > 1 && dx) {
+      if (abs(dx) <= c.rest) {
+        swap_words(c, m, data, n, y * words, c.row(y + dy), dx);
+        continue;
+      }
       if (!any_word(m, words)) continue;
       for (int k = 0; k < n; k++) {
         V *here = data[k] + y * words, *there = data[k] + c.row(y + dy);
@@ -272,13 +297,18 @@ ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, in
   }
   V* moving = c.change + words;
   for (int k = 0; k < count; k++) {
-    for (int w = 0; w < words; w++) moving[w] = data[k][here + w] & m[w];
-    if (LEAVES == NOTHING) for (int w = 0; w < words; w++) data[k][here + w] &= ~m[w];
-    if (LEAVES == EVERYTHING) for (int w = 0; w < words; w++) data[k][here + w] |= m[w];
+    V *from = data[k] + here, *to = AROUND ? c.late + k * words : data[k] + there;
     for (int w = 0; w < words; w++) {
+      moving[w] = splat(0);
+      if (!any(m[w])) continue;
+      moving[w] = from[w] & m[w];
+      if (LEAVES == NOTHING) from[w] &= ~m[w];
+      if (LEAVES == EVERYTHING) from[w] |= m[w];
+    }
+    for (int w = 0; w < words; w++) {
+      if (!AROUND && !any(targets[w])) continue;
       const V arriving = dx ? columns(c, moving, w, -dx) : moving[w];
-      if (AROUND) c.late[k * words + w] = arriving;
-      else data[k][there + w] = (data[k][there + w] & ~targets[w]) | arriving;
+      to[w] = AROUND ? arriving : (to[w] & ~targets[w]) | arriving;
     }
   }
 }

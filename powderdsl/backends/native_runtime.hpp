@@ -28,6 +28,7 @@ struct Grid {
 // Everything one thread needs to run groups: buffers, row tables, keys.
 struct Context {
   Grid g;
+  int rest;  // columns in the last word of a row
   V valid_last;
   std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
   std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus
