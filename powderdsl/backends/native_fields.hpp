@@ -65,9 +65,17 @@ static void active_together(Context& c, int first, int count) {  // into the lis
 ALWAYS bool is_active(const Context& c, int list, int lane, int y) {
   return c.active[((size_t)list * LANES + lane) * c.active_words() + y / 64] >> (y & 63) & 1;
 }
-#define EACH_ACTIVE(list) /* of the sixteen rows that begin at `from` */ \
-  for (u32 rest = c.active[((size_t)(list) * LANES + l) * c.active_words() + from / 64] >> (from & 63) & 0xffff; rest; rest &= rest - 1) \
+#define EACH_ACTIVE(list) /* of the near rows that begin at `from` */ \
+  for (u32 rest = c.active[((size_t)(list) * LANES + l) * c.active_words() + from / 64] >> (from & 63) & c.near_bits; rest; rest &= rest - 1) \
     if (const int y = from + __builtin_ctz(rest); true)
+// Sweeps over the rows of lanes, one after the other. In strips, a sweep follows the one before it two blocks later: a
+// block is computed from blocks of the sweep before that are next to it, around the edge of the strips, and so finds them
+// in a near cache. Each begins a block further on, and comes around to its first blocks at the end.
+#define EACH_BLOCK(last_part) \
+  for (int blocks = std::max(1, height / c.block), round = 0; round < blocks + (2 * (last_part) & strips); round++) \
+    for (int part = 0; part <= ((last_part) & strips); part++) \
+      if (const int done = round - 2 * part, block = (done + part) % blocks; done >= 0 && done < blocks) \
+        if (const int first = block * c.block, last = block == blocks - 1 ? height : first + c.block; true)
 // Sixteen flags of one world's word, which is kept little end first.
 ALWAYS void put_bits(u64* word, int x, u32 bits) {
 #if __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__

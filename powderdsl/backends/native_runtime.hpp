@@ -28,7 +28,10 @@ struct Grid {
 // Everything one thread needs to run groups: buffers, row tables, keys.
 struct Context {
   Grid g;
-  int rest;  // columns in the last word of a row
+  int rest;       // columns in the last word of a row
+  int near_rows;  // of reals, that a near cache holds while several loops pass over them
+  u32 near_bits;  // as many ones
+  int block;      // rows that one sweep takes before the next
   V valid_last;
   std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
   std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus

@@ -47,6 +47,7 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"#define MOVING {layout.moving}",
         f"#define ACTIVE {layout.active}",
         f"#define REACH {layout.reach}",
+        f"#define REAL_ROWS {layout.rows}",
         f"#define HALO {layout.halo}",
         f"#define AROUND_ROWS {layout.around}",
         f"#define BEYOND_ROWS {layout.beyond}",
