@@ -19,6 +19,8 @@ class Lanes:
     after: str
     asked: tuple[str, ...] | None
     """Conditions under which all outputs are quiet, besides outputs of sweeps in the same loop; None: never."""
+    reads: frozenset[tuple[str, int, int]]
+    """Fields, and the rows and columns away that they are read at."""
     by_row: bool = True
     """Whether `rows` is the body of a loop over rows `y`; else it has loops of its own."""
 
@@ -79,25 +81,30 @@ def _all_text(statement: str | Lanes) -> str:
 def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
     """One loop over lanes, which are worlds. Fields that nothing else reads are written over by each: they need one lane.
 
-    Lanes that are strips read each other: sweeps follow each other through them block by block, see EACH_BLOCK.
+    Lanes that are strips read each other: a sweep that reads other rows of an earlier one follows it block by block,
+    see EACH_BLOCK.
     """
     written = {name for sweep in run for name in sweep.fields}
     used = sorted({name for sweep in run for name in _VARIABLE.findall(sweep.rows) if name.startswith("f")})
+    over = _written_over(run, written - seen_outside)
+    lasting = {_first(name, over) for name in used if name not in written or name in seen_outside}
     places = " ".join(
-        f"const int l{name} = {'l & strips' if name in written - seen_outside else 'l'};" for name in used
+        f"const int l{name} = {'l' if _first(name, over) in lasting else 'l & strips'};" for name in used
     )
     before = "\n".join(sweep.before for sweep in run)
-    several = len(run) > 1
+    for name, old in over.items():
+        before = before.replace(f"{name} = take_field(c);", f"{name} = keep({old});")
+    parts = _parts(run)
     rows = "\n".join(
-        (f"if (!strips || part == {number}) " if several else "")
+        (f"if (!strips || part == {part}) " if parts[-1] else "")
         + (
             f"for (int y = first; y < last; y++) {{\n{sweep.rows}\n}}"
             if sweep.by_row
             else f"{{\n{sweep.rows}\n}}"
         )
-        for number, sweep in enumerate(run)
+        for part, sweep in zip(parts, run, strict=True)
     )
-    blocks = f"EACH_BLOCK({len(run) - 1})"
+    blocks = f"EACH_BLOCK({parts[-1]})"
     after = "\n".join(sweep.after for sweep in run)
     loop = f"{before}\n{blocks} for (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
     outputs = [output for sweep in run for output in sweep.outputs]
@@ -112,3 +119,36 @@ def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
         for name, value in outputs
     )
     return f"{declared}\nif ({' && '.join(asked) or 'true'}) {{ {quiet_values} }} else {{\n{loop}\n}}"
+
+
+def _parts(run: list[Lanes]) -> list[int]:
+    """Which sweeps may go together, row by row: those that read other rows of an earlier one come in a later part."""
+    parts: list[int] = []
+    made: dict[str, int] = {}
+    for sweep in run:
+        far = [made[name] + 1 for name, dy, _ in sweep.reads if dy and name in made]
+        parts.append(max([*far, *parts[-1:]], default=0))
+        made |= dict.fromkeys(sweep.fields, parts[-1])
+    return parts
+
+
+def _written_over(run: list[Lanes], passing: set[str]) -> dict[str, str]:
+    """Outputs that take the place of a field which only the run needs, and which is read for the last time: it by it."""
+    over: dict[str, str] = {}
+    earlier: set[str] = set()
+    for number, sweep in enumerate(run):
+        others = [read for other in (*run[:number], *run[number + 1 :]) for read in other.reads]
+        later = {name for other in run[number + 1 :] for name, _, _ in other.reads}
+        far = {name for name, dy, _ in others if dy} | {name for name, dy, dx in sweep.reads if dy or dx}
+        free = sorted({name for name, _, _ in sweep.reads} & earlier & passing - later - far)
+        if sweep.by_row:
+            over |= dict(zip((name for name, _ in sweep.outputs if name.startswith("f")), free, strict=False))
+        earlier |= sweep.fields
+    return over
+
+
+def _first(name: str, over: dict[str, str]) -> str:
+    """Whose place a field has taken in the end."""
+    while name in over:
+        name = over[name]
+    return name

@@ -37,7 +37,7 @@ static Context* new_context(const Grid& g) {
   Context* c = new (std::align_val_t(64)) Context();
   c->g = g;
   c->rest = g.width - 64 * (g.words - 1);
-  c->near_rows = g.stride > 1024 ? 4 : g.stride > 512 ? 8 : 16;
+  c->near_rows = g.stride > 512 ? 8 : 16;
   c->near_bits = (1u << c->near_rows) - 1;
   c->block = g.strips && REAL_ROWS <= c->near_rows ? c->near_rows : g.height;
   c->valid_last = splat(c->rest == 64 ? ~0ull : (1ull << c->rest) - 1);

@@ -63,6 +63,7 @@ def sweep_lanes(
     asked: tuple[str, ...] | None = None
     if values is not None:
         read = rows_read([node for node, _, _ in outputs], sweep.have)
+        sweep.reads.update((sweep.fields[id(node)], dy, 0) for node, dy, _ in read)
         busy = [_busy(sweep, node, dy, wraps) for node, dy, wraps in read]
         planes = tuple(dict.fromkeys(sweep.planes[id(m)] for m in masks if m.op != "param"))
         scan = " ".join(f"some |= row_bits({plane}, y * words, words, l);" for plane in planes)
@@ -79,7 +80,7 @@ def sweep_lanes(
         *sweep.lines, *stores, "} }", " ".join(row_end),
     ])  # fmt: skip
     written = tuple((name, bool(values[i]) if values else False) for i, (_, name, _) in enumerate(outputs))
-    return Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, asked)
+    return Lanes(written, f"{' '.join(takes)}\n{pads}", body, ends, asked, frozenset(sweep.reads))
 
 
 def _busy(sweep: Sweep, node: Node, dy: int, wraps: bool) -> str:

@@ -76,6 +76,7 @@ def layer_lanes(
         "for (int from = first; from < last; from += c.near_rows) {",
         f"for (int y = from; y < from + c.near_rows && y < last; y++) {{ const bool any = is_active(c, {first + count}, l, y); {copies} }}",
     ]
+    reads = {(base, 0, 0) for base in bases}
     for level in range(count):
         at = count - 1 - level
         layer = Sweep(planes, fields, layout)
@@ -87,6 +88,7 @@ def layer_lanes(
             f"*(F*)(o{name} + x) = blend(bits, {value}, {old});"
             for name, value, old in zip(names, values, olds, strict=True)
         ]
+        reads |= layer.reads
         rows = [f"float* o{name} = row_of(c, {name}, l{name}, y);" for name in names]
         rows += [f"const float* {name} = {call};" for call, name in layer.rows.items()]
         body.append(
@@ -100,4 +102,5 @@ def layer_lanes(
     ends = " ".join(f"{name}->still = !some{name};" for name in names)
     asked = (*(f"{base}->still" for base in bases), *(f"{mask}->zero" for mask in masks))
     outputs = tuple((name, False) for name in names)
-    return Lanes(outputs, f"{takes}\n{pads}\n{lists}", "\n".join(body), ends, asked, by_row=False)
+    before = f"{takes}\n{pads}\n{lists}"
+    return Lanes(outputs, before, "\n".join(body), ends, asked, frozenset(reads), by_row=False)

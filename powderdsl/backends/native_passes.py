@@ -48,10 +48,16 @@ class PassWriter(ValueWriter):
         return f"// pass {self.number}\nOUTLINE void pass_{self.number}(Context& c) {{\nconst int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0; (void)words; (void)height; (void)width; (void)strips;\n{body}\n}}"
 
     def borrow(self) -> None:
-        """Slots that the pass both reads and writes: nobody else holds their planes while it runs."""
+        """Slots that the pass both reads and writes: nobody else holds them while it runs."""
         written = {slot for slot, _ in self.pass_.outputs}
         for key, node in self.input_nodes.items():
-            if node.type != REAL and self.slot_of[key] in written:
+            if self.slot_of[key] not in written:
+                continue
+            if node.type == REAL:
+                self.fields[key] = name = self.fresh("f")
+                place = f"c.real[{self.layout.reals[self.slot_of[key]]}]"
+                self.block.statements.append(f"Field* {name} = {place}; {place} = nullptr;")
+            else:
                 self.planes[key] = name = self.fresh("p")
                 place = f"c.slot[{self.layout.planes[self.slot_of[key]]}]"
                 self.block.statements.append(f"Plane* {name} = {place}; {place} = nullptr;")

@@ -218,6 +218,11 @@ OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here
     for (int w = 0; w < words; w++) there[w] ^= turned(dx ? columns(c, c.change, w, -dx) : c.change[w], -by);
   }
 }
+// A word's columns, moved by dx: those that stay in the word, and those that come into the next.
+ALWAYS V moved_within(const Context& c, V d, int w, int dx) { return (dx > 0 ? d << dx : d >> -dx) & c.valid(w); }
+ALWAYS V moved_over(const Context& c, V d, int w, int next, int dx) {
+  return (dx > 0 ? d >> (columns_in(c, w) - dx) : d << (columns_in(c, next) + dx)) & c.valid(next);
+}
 // A row of several words that exchanges with one some columns on. No two movers have a cell in common, so words may
 // take turns.
 OUTLINE void swap_words(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int dx) {
@@ -228,8 +233,8 @@ OUTLINE void swap_words(Context& c, const V* m, V* const* data, int n, int here_
       V *here = data[k] + here_row, *there = data[k] + there_row;
       const V d = (here[w] ^ columns(c, there, w, dx)) & m[w];
       here[w] ^= d;
-      there[w] ^= (dx > 0 ? d << dx : d >> -dx) & c.valid(w);
-      there[next] ^= (dx > 0 ? d >> (columns_in(c, w) - dx) : d << (columns_in(c, next) + dx)) & c.valid(next);
+      there[w] ^= moved_within(c, d, w, dx);
+      there[next] ^= moved_over(c, d, w, next, dx);
     }
   }
 }
@@ -292,6 +297,26 @@ ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, in
       if (LEAVES == EVERYTHING) data[k][here] = a | gone;
       if (AROUND) c.late[k] = arriving;
       else data[k][there] = (data[k][there] & keeps) | arriving;
+    }
+    return;
+  }
+  if (here != there && abs(dx) <= c.rest) {
+    if (AROUND) memset(c.late, 0, sizeof(V) * count * words);
+    for (int w = 0; w < words && !AROUND; w++) {
+      if (!any(targets[w])) continue;
+      for (int k = 0; k < count; k++) data[k][there + w] &= ~targets[w];
+    }
+    for (int w = 0; w < words; w++) {
+      if (!any(m[w])) continue;
+      const int next = next_word(c, w, dx);
+      for (int k = 0; k < count; k++) {
+        V *from = data[k] + here + w, *to = AROUND ? c.late + k * words : data[k] + there;
+        const V moving = *from & m[w];
+        if (LEAVES == NOTHING) *from &= ~m[w];
+        if (LEAVES == EVERYTHING) *from |= m[w];
+        to[w] |= moved_within(c, moving, w, dx);
+        if (dx) to[next] |= moved_over(c, moving, w, next, dx);
+      }
     }
     return;
   }

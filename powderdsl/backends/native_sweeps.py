@@ -82,6 +82,8 @@ class Sweep:
         self.wanted: list[Node] = []
         """Choices that this sweep will compute anyway."""
         self.used: set[str] = set()
+        self.reads: set[tuple[str, int, int]] = set()
+        """Fields, and the rows and columns away that they are read at."""
         self.counter = [0]
         self.led: dict[str, tuple[Sweep, list[str]]] = {}
         """What is computed only where a comparison holds somewhere in the chunk, by its flag."""
@@ -93,6 +95,7 @@ class Sweep:
         nested = Sweep(self.planes, self.fields, self.layout)
         nested.memo, nested.counter = dict(self.memo), self.counter
         nested.rows, nested.words, nested.used = self.rows, self.words, self.used
+        nested.reads = self.reads
         return nested
 
     def row(self, field: str, dy: int, wraps: bool = True) -> str:
@@ -137,6 +140,7 @@ class Sweep:
 
     def compute(self, node: Node, dy: int, dx: int) -> str:
         if id(node) in self.fields:
+            self.reads.add((self.fields[id(node)], dy, dx))
             return self.temporary(f"load({self.row(self.fields[id(node)], dy)}, x + {dx})")
         args = node.args
         if node.op == "select":
@@ -157,6 +161,7 @@ class Sweep:
                 if wraps:
                     return self.value(args[0], dy + sy, dx + sx)
                 assert dy == dx == 0
+                self.reads.add((self.fields[id(args[0])], sy, sx))
                 row = self.row(self.fields[id(args[0])], sy, wraps=False)
                 loaded = f"load({row}, x + {sx})"
                 return self.temporary(f"inside_columns({loaded}, x, {sx}, width)" if sx else loaded)
