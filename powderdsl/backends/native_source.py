@@ -8,7 +8,7 @@ from powderdsl.backends.native_layout import Layout, layout_of, literal
 from powderdsl.backends.native_passes import PassWriter
 from powderdsl.ir.ops import Program
 
-GENERATOR_VERSION = 2
+GENERATOR_VERSION = 3
 """Part of every cache key: raise it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "fields")
