@@ -17,7 +17,16 @@ from powderdsl.backends.native_loops import (
     zero_with,
 )
 from powderdsl.backends.native_moves import Movement, depends, move_calls, movements
-from powderdsl.backends.native_presence import asked_ids, element_planes, only_moves, there
+from powderdsl.backends.native_presence import (
+    Asked,
+    asked_ids,
+    asked_now,
+    asked_word,
+    element_nodes,
+    element_planes,
+    only_moves,
+    there,
+)
 from powderdsl.backends.native_sweeps import unchanged
 from powderdsl.backends.native_values import ValueWriter
 from powderdsl.ir.ops import REAL, Node, PassGraph, Step, walk
@@ -30,6 +39,8 @@ class PassWriter(ValueWriter):
         super().__init__(pass_, layout)
         self.number = number
         self.asked_ids = asked_ids(pass_, element_planes(layout))
+        self.asked = asked_word(self.asked_ids)
+        """All ids that the pass asks for."""
         asked = Counter(
             key
             for step in pass_.moments
@@ -78,14 +89,17 @@ class PassWriter(ValueWriter):
         condition = ""
         if guarded:
             self.inputs(guards)
-            condition = self.guards(guards)
+            now = {slot: self.before(slot, current) for slot in self.layout.planes}
+            asked = asked_now(guards, element_planes(self.layout), element_nodes(now))
+            self.asked |= asked_word(asked)
+            condition = self.guards(guards, asked)
         if not moves_only:
             self.anything(f"if ({condition}) " if guarded else "")
         unknown = [node for slot, node in writes if slot not in current and slot not in self.layout.planes]
         if unknown or not guarded:  # a scratch field's first write: what it held is not in a plane
-            now = unknown if guarded else [node for _, node in writes]
-            self.inputs(now)
-            self.ensure(now)
+            wanted = unknown if guarded else [node for _, node in writes]
+            self.inputs(wanted)
+            self.ensure(wanted)
         writes = [(slot, node) for slot, node in writes if not self.have(node)]
         if not writes:
             return
@@ -187,7 +201,7 @@ class PassWriter(ValueWriter):
         self.block.statements.append(f"Plane* {name} = keep(c.slot[{self.layout.planes[slot]}]);")
         return name
 
-    def guards(self, guards: list[Node]) -> str:
+    def guards(self, guards: list[Node], asked: Asked | None = None) -> str:
         """Masks of a moment in planes: first what is cheap, and the rest only where that leaves something."""
         guards = list({id(g): g for g in guards}.values())
         open_guards = [g for g in guards if not self.have(g)]
@@ -212,7 +226,7 @@ class PassWriter(ValueWriter):
                 whole[id(guard)] = name
             clean = any(is_clean(part, self.have) for part in cheap)
             outputs.append((name, " & ".join(parts) if clean else " & ".join([*parts, "valid"])))
-        self.emit_loop(loop, outputs, empty)
+        self.emit_loop(loop, outputs, empty, f"!({there(asked)})" if asked is not None else "")
         self.planes.update(whole)  # not before: until the loop has run, their planes hold nothing
         condition = " || ".join(
             f"!{name}->zero"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import reduce
+from operator import or_
 
 from powderdsl.backends.native_layout import Layout
 from powderdsl.backends.native_moves import movement_of
 from powderdsl.backends.native_sweeps import unchanged
-from powderdsl.ir.ops import REAL, Node, PassGraph, Step, walk
+from powderdsl.ir.ops import REAL, Node, PassGraph, Step, nodes_of, walk
 
 MAX_PLANES = 6
 """A set of ids is a word of 64 bits."""
@@ -36,12 +38,15 @@ def asked_ids(pass_: PassGraph, planes: int) -> Asked | None:
     """
     if not planes or not all(step.guards for step in pass_.moments):
         return None
-    first = {
+    bits = {
         id(node): int(slot.removeprefix(_ELEMENT))
-        for step in pass_.moments
-        for slot, node in step.writes
-        if slot.startswith(_ELEMENT)
+        for node in nodes_of(pass_)
+        if node.op == "input" and (slot := str(node.attr)).startswith(_ELEMENT)
     }
+    for step in pass_.moments:
+        for slot, node in step.writes:
+            if slot.startswith(_ELEMENT):
+                bits[id(node)] = int(slot.removeprefix(_ELEMENT))
     masks = [guard for step in pass_.moments for guard in step.guards]
     for slot, node in pass_.outputs:
         if node.type == REAL:
@@ -49,24 +54,37 @@ def asked_ids(pass_: PassGraph, planes: int) -> Asked | None:
             if kept is None or kept[0].attr != slot:
                 return None
             masks += kept[1]
-    found = _Needs(planes, first)
+    return _asked(masks, planes, bits)
+
+
+def asked_now(guards: list[Node], planes: int, elements: dict[int, int]) -> Asked | None:
+    """The same for one moment; `elements` are the bits of the element as it is now, by node."""
+    return _asked(guards, planes, elements) if planes else None
+
+
+def _asked(masks: list[Node], planes: int, elements: dict[int, int]) -> Asked | None:
+    found = _Needs(planes, elements)
     asked = {found.asked(mask) for mask in masks}
     return None if frozenset() in asked else tuple(sorted(asked, key=sorted))
 
 
+def asked_word(asked: Asked | None) -> int:
+    """All ids in it."""
+    return reduce(or_, (ids for sets in asked or () for ids in sets), 0)
+
+
 def there(asked: Asked) -> str:
     """C++ that asks whether enough is there."""
-    return " || ".join(
-        "(" + " && ".join(f"(c.present & {ids:#x}ull)" for ids in sorted(sets)) + ")" for sets in asked
-    )
+    ways = (" && ".join(f"(c.present & {ids:#x}ull)" for ids in sorted(sets)) for sets in asked)
+    return " || ".join(f"({way})" for way in ways) or "false"
 
 
 class _Needs:
     """Of each flag: the ids it holds for, if it hangs on the cell's element alone; ids that the cell has where it holds;
     and sets of ids of which one each must be somewhere."""
 
-    def __init__(self, planes: int, first: dict[int, int]):
-        self.first = first
+    def __init__(self, planes: int, elements: dict[int, int]):
+        self.elements = elements
         self.everything = (1 << (1 << planes)) - 1
         self.columns = [
             sum(1 << code for code in range(1 << planes) if code >> bit & 1) for bit in range(planes)
@@ -89,10 +107,8 @@ class _Needs:
         return _least(self.sets[id(node)] | ({cell} if cell != self.everything else set()))
 
     def _exact(self, node: Node) -> int | None:
-        if id(node) in self.first:
-            return self.columns[self.first[id(node)]]
-        if node.op == "input" and str(node.attr).startswith(_ELEMENT):
-            return self.columns[int(str(node.attr).removeprefix(_ELEMENT))]
+        if id(node) in self.elements:
+            return self.columns[self.elements[id(node)]]
         if node.op == "const" and node.type != REAL:
             return self.everything if node.attr else 0
         if node.op not in ("and", "or", "xor", "not", "select"):
@@ -146,6 +162,15 @@ def _least(sets: Iterable[int]) -> frozenset[int]:
         if not any(one & ids == one for one in kept):
             kept.append(ids)
     return frozenset(kept[:MAX_SETS])
+
+
+def element_nodes(planes_now: dict[str, Node | None]) -> dict[int, int]:
+    """The bit of the element that each node holds, if slots hold these."""
+    return {
+        id(node): int(slot.removeprefix(_ELEMENT))
+        for slot, node in planes_now.items()
+        if slot.startswith(_ELEMENT) and node is not None
+    }
 
 
 def only_moves(step: Step, planes_before: dict[str, Node | None]) -> bool:

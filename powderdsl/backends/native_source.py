@@ -22,7 +22,7 @@ def native_source(program: Program) -> tuple[str, Layout]:
     layout = layout_of(program)
     writers = [PassWriter(p, i, layout) for i, p in enumerate(program.passes)]
     passes = [writer.source() for writer in writers]
-    asked = reduce(or_, (ids for writer in writers for sets in writer.asked_ids or () for ids in sets), 0)
+    asked = reduce(or_, (writer.asked for writer in writers), 0)
     calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
     resets = [
         (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
