@@ -397,8 +397,10 @@ def test_module_names_can_fail() -> None:
     assert list(module_name_faults(["cli.draw", "draw"], {"draw": "reason"})) == []
 
 
-def test_tests_stay_short() -> None:
-    for path in (ROOT / "tests").rglob("*.py"):
+def test_tests_and_native_code_stay_short() -> None:
+    native = [path for path in PACKAGE.rglob("*") if path.suffix in (".hpp", ".cuh")]
+    assert native
+    for path in (*native, *(ROOT / "tests").rglob("*.py")):
         expect_none(size_faults(path.name, path.read_text(encoding="utf-8")))
 
 

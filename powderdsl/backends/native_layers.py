@@ -71,10 +71,10 @@ def layer_lanes(
         f"some{name} |= lay_row(c, {name}, l{name}, {base}, l{base}, y, any);"
         for name, base in zip(names, bases, strict=True)
     )
-    # Sixteen rows at a time: what they read and write stays in the nearest cache while the choices pass over it.
+    # A few rows at a time: what they read and write stays in the nearest cache while the choices pass over it.
     body = [
-        "for (int from = 0; from < height; from += 16) {",
-        f"for (int y = from; y < from + 16 && y < height; y++) {{ const bool any = is_active(c, {first + count}, l, y); {copies} }}",
+        "for (int from = first; from < last; from += c.near_rows) {",
+        f"for (int y = from; y < from + c.near_rows && y < last; y++) {{ const bool any = is_active(c, {first + count}, l, y); {copies} }}",
     ]
     for level in range(count):
         at = count - 1 - level

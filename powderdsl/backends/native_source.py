@@ -11,8 +11,13 @@ from powderdsl.backends.native_passes import PassWriter
 from powderdsl.backends.native_presence import look
 from powderdsl.ir.ops import Program
 
-GENERATOR_VERSION = 3
+GENERATOR_VERSION = 4
 """Part of every cache key: raise it when generated code changes meaning."""
+
+LIBRARY = ("vectors", "runtime", "planes", "fields")
+"""What stands before the generated passes, in this order: native_*.hpp."""
+DRIVER = ("driver", "views")
+"""What stands behind them."""
 
 SNAP = 2.0**-20
 
@@ -47,6 +52,7 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"#define MOVING {layout.moving}",
         f"#define ACTIVE {layout.active}",
         f"#define REACH {layout.reach}",
+        f"#define REAL_ROWS {layout.rows}",
         f"#define HALO {layout.halo}",
         f"#define AROUND_ROWS {layout.around}",
         f"#define BEYOND_ROWS {layout.beyond}",
@@ -65,10 +71,11 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"static const std::vector<u32> STREAM_IDENT = {{{', '.join(idents)}}};",
     ])  # fmt: skip
     folder = files("powderdsl.backends")
-    runtime = (folder / "native_runtime.hpp").read_text(encoding="utf-8")
-    driver = (folder / "native_driver.hpp").read_text(encoding="utf-8")
-    views = (folder / "native_views.hpp").read_text(encoding="utf-8")
+    before, after = (
+        "\n".join((folder / f"native_{part}.hpp").read_text(encoding="utf-8") for part in parts)
+        for parts in (LIBRARY, DRIVER)
+    )
     body = "\n\n".join(passes)
     known = "  if (c.present == ~0ull) look(c);\n" if asked else ""
     step = f"{look(layout, asked)}\nstatic void run_passes(Context& c) {{\n  START;\n{known}{calls}\n}}"
-    return "\n".join([head, runtime, tables, body, step, driver, views]), layout
+    return "\n".join([head, before, tables, body, step, after]), layout
