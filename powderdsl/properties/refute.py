@@ -6,22 +6,31 @@ breaks an invariant refutes it. That none does says nothing; `powderdsl test` tr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
+
+import numpy as np
 
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
 from powderdsl.ledgers.book import Ledger
+from powderdsl.ledgers.changes import RuleLine
 from powderdsl.model.types import Ruleset
 from powderdsl.properties.blame import Oracle
 from powderdsl.properties.breaks import Alike
 from powderdsl.properties.outcomes import Counterexample, Property, counterexample_lines
-from powderdsl.properties.samples import random_samples
+from powderdsl.properties.samples import Sample, random_samples
 from powderdsl.properties.search import Plan, Search, counterexample
 
 WORLDS = 192
 """Small worlds that are tried, and a few larger ones: enough for mistakes that happen often."""
 
 STEPS = 2
+
+FOCUSED = 2
+"""Batches that are tried once more with few elements."""
+
+FEW = 4
+"""More elements than these say nothing about what a line is about."""
 
 SECONDS = 4.0
 """How long all the worlds that were found may be made smaller."""
@@ -57,10 +66,12 @@ def broken_invariants(ruleset: Ruleset, ledger: Ledger, seconds: float = SECONDS
     """The invariants that a few worlds break, each with a world that was made small for some time."""
     oracle = Oracle(ruleset, ruleset.passes)
     search = Search.of(oracle, Plan(), declared_only=True, ledger=ledger)
-    for sample in random_samples(ruleset, 0, WORLDS):
+    for number, sample in enumerate(random_samples(ruleset, 0, WORLDS)):
         # Where mirrored numbers are used in another way only frequencies can tell: thousands of worlds.
         search.trials = [trial for trial in search.trials if not isinstance(trial.claim, Alike)]
         search.try_sample(sample, STEPS)
+        if number < FOCUSED:
+            _try_focused(search, sample)
     found = []
     until = monotonic() + seconds
     for trial in search.trials:
@@ -69,3 +80,23 @@ def broken_invariants(ruleset: Ruleset, ledger: Ledger, seconds: float = SECONDS
             small = counterexample(trial.claim, oracle, trial.sample, trial.steps, left)
             found.append(Broken(trial.prop, small))
     return found
+
+
+def _try_focused(search: Search, sample: Sample) -> None:
+    """Try the same worlds with only those elements that the lines in the way of a proof are about."""
+    for trial in search.trials:
+        kinds = _concerned(search, trial.doubts)
+        if kinds and trial.sample is None:
+            ids = np.array(kinds, np.uint8)[sample.ids % len(kinds)]
+            few = replace(sample, ids=ids, fields={})
+            Search(search.runner, search.plan, search.ledger, {}, [trial]).try_sample(few, STEPS)
+
+
+def _concerned(search: Search, lines: tuple[RuleLine, ...]) -> list[int]:
+    """Ids of the elements that some lines need, change or move."""
+    names: set[str] = set()
+    for entry in search.ledger.rules:
+        if entry.rule in lines:
+            names |= {name for some in entry.needs if len(some) < FEW for name in some}
+            names |= {name for pair in entry.changes[:FEW] for name in pair}
+    return sorted(one.id for one in search.runner.ruleset.elements if one.name in names)

@@ -10,6 +10,7 @@ import numpy as np
 
 from powderdsl.ledgers.book import Ledger, NotProven, Proven
 from powderdsl.ledgers.book import ledger as make_ledger
+from powderdsl.ledgers.changes import RuleLine
 from powderdsl.model.operands import ELEMENT_HERE, member
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
@@ -58,6 +59,8 @@ class _Trial:
 
     prop: Property
     note: str
+    doubts: tuple[RuleLine, ...] = ()
+    """The lines that stand in the way of a proof."""
     worlds: int = 0
     batches: int = 0
     sample: Sample | None = None
@@ -97,7 +100,7 @@ class Search:
                 given = f", given {verdict.given}" if verdict.given else ""
                 search.results[one.text] = Result(one, "proven", 0, verdict.reason + given)
             else:
-                search.trials.append(_Trial(one, ""))
+                search.trials.append(_Trial(one, "", verdict.rules))
         return search
 
     def only(self, text: str) -> Search:
