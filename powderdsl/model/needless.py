@@ -20,6 +20,9 @@ HERE: Offset = (0, 0)
 BUDGET = 100_000
 """Nodes evaluated for these warnings: a quarter of a second. After that nothing more is found."""
 
+MAX_RULES = 100
+"""Rules of a moment, up to which each is compared with the others."""
+
 SILENT = ("PD503", "PD506", "PD509")
 """Who reads that a rule never happens does not want to read why twice."""
 
@@ -105,6 +108,8 @@ def _report_overruled(
     found: dict[Span, Rule | None] = {}
     for pass_ in passes:
         for moment in pass_.moments:
+            if len(moment.rules) > MAX_RULES:
+                continue
             lets = {let.name: let.value for let in moment.lets}
             for place, rule in enumerate(moment.rules):
                 if found.get(rule.span, rule) is None:
