@@ -169,6 +169,7 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
     }
   }
   for (int i = 0; i < REALS; i++) c.real[i] = group.real[i];
+  c.present = ~0ull;
   for (long s = 0; s < steps; s++) {
     begin_step(c, k, number, s);
     reset_slots(c);

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from powderdsl.backends.native_blocks import Lanes
 from powderdsl.backends.native_layout import Layout
+from powderdsl.backends.native_loops import is_uniform
 from powderdsl.backends.native_sweeps import Sweep
 from powderdsl.ir.ops import REAL, Node, walk
 
@@ -21,7 +22,7 @@ def choices(node: Node, have: Callable[[Node], bool]) -> list[Node]:
             return []
         chain.append(node)
         node = node.args[2]
-    if len(chain) < FEWEST:
+    if len(chain) < FEWEST or is_uniform(node):  # what is the same everywhere stands in no field
         return []
     for (
         choice

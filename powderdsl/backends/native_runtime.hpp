@@ -52,6 +52,7 @@ struct Context {
   Field* real[REALS + 1];
   std::vector<V*> fixed;  // planes of coordinates and insides, made once
   int lanes;
+  u64 present;  // the ids that are there, of those that passes ask for; all bits: not known
 
   V valid(int w) const { return w == g.words - 1 ? valid_last : splat(~0ull); }
   int row(int y) const { return wrapped[y + HALO]; }

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from importlib.resources import files
+from operator import or_
 
 from powderdsl.backends.native_layout import Layout, layout_of, literal
 from powderdsl.backends.native_passes import PassWriter
+from powderdsl.backends.native_presence import look
 from powderdsl.ir.ops import Program
 
-GENERATOR_VERSION = 3
+GENERATOR_VERSION = 5
 """Part of every cache key: raise it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "fields")
@@ -22,7 +25,9 @@ SNAP = 2.0**-20
 def native_source(program: Program) -> tuple[str, Layout]:
     """The whole translation unit, and its layout."""
     layout = layout_of(program)
-    passes = [PassWriter(p, i, layout).source() for i, p in enumerate(program.passes)]
+    writers = [PassWriter(p, i, layout) for i, p in enumerate(program.passes)]
+    passes = [writer.source() for writer in writers]
+    asked = reduce(or_, (writer.asked for writer in writers), 0)
     calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
     resets = [
         (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
@@ -71,5 +76,6 @@ def native_source(program: Program) -> tuple[str, Layout]:
         for parts in (LIBRARY, DRIVER)
     )
     body = "\n\n".join(passes)
-    step = f"static void run_passes(Context& c) {{\n  START;\n{calls}\n}}"
+    known = "  if (c.present == ~0ull) look(c);\n" if asked else ""
+    step = f"{look(layout, asked)}\nstatic void run_passes(Context& c) {{\n  START;\n{known}{calls}\n}}"
     return "\n".join([head, before, tables, body, step, after]), layout

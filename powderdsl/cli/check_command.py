@@ -1,4 +1,4 @@
-"""`powderdsl check`: every mistake in rule files, without running anything."""
+"""`powderdsl check`: every mistake in rule files, and every invariant that is easily broken."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 def command(
     rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool, cost: bool, ledger: bool
 ) -> int:
-    """Find the mistakes in rule files, all at once.
+    """Find the mistakes in rule files, all at once, and invariants that do not hold.
 
     Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml.
 
@@ -56,7 +56,7 @@ def command(
     ledgers: dict[str, Ledger] = {}
     errors = warnings = 0
     for name in rules:
-        ruleset, diagnostics = _check(name)
+        ruleset, diagnostics, book = _check(name)
         counts = Counter(one.severity for one in diagnostics)
         errors += counts[Severity.ERROR]
         warnings += counts[Severity.WARNING]
@@ -66,7 +66,7 @@ def command(
             expenses[name] = _costs(ruleset)
             lines += ["", *_cost_lines(expenses[name])]
         if ledger and ruleset is not None:
-            ledgers[name] = make_ledger(ruleset)
+            ledgers[name] = book or make_ledger(ruleset)
             lines += ["", ledger_text(ledgers[name])]
     if layout == "json" and (cost or ledger):
         data: dict[str, Any] = {"diagnostics": [*map(diagnostic_data, found)]}
@@ -89,11 +89,18 @@ def command(
     return FAILED if warnings and warnings_as_errors else OK
 
 
-def _check(name: str) -> tuple[Ruleset | None, tuple[Diagnostic, ...]]:
+def _check(name: str) -> tuple[Ruleset | None, tuple[Diagnostic, ...], Ledger | None]:
+    """The rules if they can be loaded, all that is wrong with them, and their ledger if their invariants needed it."""
     try:
-        return load_with_diagnostics(name)
+        ruleset, remarks = load_with_diagnostics(name)
     except CompileError as error:
-        return None, error.diagnostics
+        return None, error.diagnostics, None
+    if not ruleset.invariants:
+        return ruleset, remarks, None
+    from powderdsl.properties.refute import refuted  # brings numpy
+
+    book = make_ledger(ruleset)
+    return ruleset, (*remarks, *refuted(ruleset, book)), book
 
 
 def _costs(ruleset: Ruleset) -> tuple[PassCost, ...]:
