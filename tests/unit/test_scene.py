@@ -11,7 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
-from powderdsl.worlds.raster import MAX_COORDINATE, Box, Disk, Frame, Line, mask, paint
+from powderdsl.worlds.raster import (
+    MAX_COORDINATE,
+    Arch,
+    Box,
+    Container,
+    Disk,
+    Frame,
+    Line,
+    Ramp,
+    Square,
+    Wave,
+    mask,
+    paint,
+)
 from powderdsl.worlds.scene import (
     STATEMENTS,
     find_scene,
@@ -177,7 +190,18 @@ def test_every_statement_is_written_as_its_help_says():
     for name, usage in STATEMENTS.items():
         for word, value in values.items():
             usage = usage.replace(word, value)
-        assert type(statement(usage).shape).__name__.lower() == name
+        assert type(statement(usage).shape).__name__.lower() == {"fill": "box"}.get(name, name)
+
+
+def test_the_shapes_of_generators():
+    ramp = ["......", "...x..", "..xx..", ".xxx..", "......"]
+    assert picture(mask(Ramp((3, 1), (1, 3)), (5, 6))) == ramp
+    assert picture(mask(Ramp((1, 3), (3, 1)), (5, 6))) == ramp
+    assert picture(mask(Ramp((1, 1), (3, 1)), (5, 3))) == ["...", ".x.", ".x.", ".x.", "..."]
+    assert picture(mask(Square((2, 2), 1), (4, 4))) == ["....", ".xx.", ".xx.", "...."]
+    assert picture(mask(Arch((1, 4), (0, 4), 1), (4, 5))) == [".....", "xxxx.", "x..x.", "x..x."]
+    assert picture(mask(Container((0, None), (1, None), 1), (3, 5))) == [".x..x", ".x..x", ".xxxx"]
+    assert picture(mask(Wave(1, 2, 4, 0), (4, 8))) == ["........", "x...x...", "xx.xxx.x", "xxxxxxxx"]
 
 
 # Files
@@ -317,7 +341,14 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("box water rows 1:2 rows 1:2", "PD605", "rows"),
         ("frame", "PD605", "\n"),
         ("frame wall wall", "PD605", "wall"),
-        ("fill wall", "PD605", "fill"),
+        ("heap wall", "PD605", "heap"),
+        ("scatter sand density 5%", "PD605", "scatter sand density 5%"),
+        ("part rocks", "PD605", "part rocks"),
+        ("disk (any but sand) at (1, 1) radius 2", "PD605", "(any but sand)"),
+        ("disk sand at (1..3, 1) radius 2", "PD605", "1..3"),
+        ("disk sand at (1, 1) radius 3..2", "PD606", "3..2"),
+        ("fill sand in slot", "PD605", "slot"),
+        ("fill sand over water", "PD605", "water"),
         ("frame a.b.c", "PD605", "."),
         ("frame wåll", "PD605", "å"),
         ('"frame \\"wall\\""', "PD605", '"frame \\"wall\\""'),
@@ -380,7 +411,7 @@ def test_help_says_what_to_write():
         return errors(f"{HEAD}  - {line}\n")[0].helps
 
     assert helps("disc sand at (1, 1) radius 2") == ("did you mean `disk`?",)
-    assert helps("heap sand") == ("statements: `box`, `disk`, `frame`, `line`",)
+    assert helps("rump sand") == ("did you mean `ramp`?",)
     assert helps("disk sand at (1, 1) raduis 2") == helps("disk sand") == (STATEMENTS["disk"],)
     assert "48:end" in helps("box water rows 2:")[0]
 
