@@ -33,7 +33,10 @@ class Episodes:
 
 
 def load_task(
-    name_or_path: str | Path, *, knobs: Mapping[str, int] | None = None, params: Mapping[str, Any] | None = None
+    name_or_path: str | Path,
+    *,
+    knobs: Mapping[str, int] | None = None,
+    params: Mapping[str, Any] | None = None,
 ) -> Task:
     """A shipped task by name, or a file. Raises CompileError with everything that is wrong."""
     raise NotImplementedError
@@ -57,7 +60,12 @@ class TaskProgram:
         raise NotImplementedError
 
     def act(
-        self, episodes: Episodes, actions: Tensor, *, reuse: bool = False, params: Mapping[str, Any] | None = None
+        self,
+        episodes: Episodes,
+        actions: Tensor,
+        *,
+        reuse: bool = False,
+        params: Mapping[str, Any] | None = None,
     ) -> tuple[Episodes, Tensor, Tensor, Tensor]:
         """One action of each episode, int64 [B, 5], and the steps after it.
 
@@ -68,7 +76,12 @@ class TaskProgram:
 
 
 def compile_task(
-    task: Task | str, *, split: str = "train", backend: str = "auto", device: str | torch.device = "cpu", threads: int = 1
+    task: Task | str,
+    *,
+    split: str = "train",
+    backend: str = "auto",
+    device: str | torch.device = "cpu",
+    threads: int = 1,
 ) -> TaskProgram:
     """A program for one split of a task. Raises CompileError: PD701 for backends, an unknown split."""
     raise NotImplementedError
