@@ -24,7 +24,7 @@ from powderdsl.worlds.scene.fixed import shape_of
 NOTHING = 255
 """In targets and stamps: no element."""
 
-CHUNK_CELLS = 1 << 19
+CHUNK_CELLS = 1 << 20
 """Cells of the worlds that are made together on the CPU: their words fit its cache."""
 
 DENSITY_BITS = 16
