@@ -10,7 +10,7 @@ from torch import Tensor
 
 from powderdsl.model.state import Slot
 from powderdsl.simulator import Simulator, World
-from powderdsl.tasks.task import WIND, Agent
+from powderdsl.tasks.task import BLOW, Agent
 from powderdsl.worlds.raster import Size
 
 
@@ -31,7 +31,7 @@ class Hands:
         self.agent, self.size, self.device = agent, size, sim.device
         self.choices = torch.tensor(agent.choices, device=self.device)
         self._places = [self._lines(axis) for axis in (0, 1)]
-        self.places_elements = any(choice != WIND for choice in agent.choices)
+        self.places_elements = any(choice >= 0 for choice in agent.choices)
         known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=self.device)
         fresh = sim.world(known[None]).state
         self._fresh: dict[str, Tensor] = {}
@@ -85,7 +85,7 @@ class Hands:
     def act(self, world: World, actions: Tensor, *, reuse: bool) -> Done:
         """The worlds after actions, int64 [B, 5], within their bounds. `reuse` writes into the world's own tensors."""
         choice = self.choices[actions[:, 2]]
-        blown = choice == WIND
+        blown, placed = choice == BLOW, choice >= 0
         rows, columns = (self._places[axis][0][actions[:, 1 - axis]] for axis in (0, 1))
         cells = (rows[:, :, None] * self.size[1] + columns[:, None]).flatten(1)
         state = dict(world.state)
@@ -95,26 +95,26 @@ class Hands:
             old = state["element"].flatten(1).gather(1, cells)
             new = choice.clamp(min=0).to(torch.uint8)[:, None]
             differs = (old != new) & (inside[0][:, :, None] & inside[1][:, None]).flatten(1)
-            painted = (differs & ~blown[:, None]).sum(1)
-            self._place(state, cells, choice, blown, reuse)
-        if self.agent.wind_field is not None:
+            painted = (differs & placed[:, None]).sum(1)
+            self._place(state, cells, choice, ~placed, reuse)
+        if self.agent.speed_field is not None:
             self._blow(state, cells, actions, blown, reuse)
-        return Done(replace(world, state=state), painted, (~blown).long(), blown.long())
+        return Done(replace(world, state=state), painted, placed.long(), blown.long())
 
     def _place(
-        self, state: dict[str, Tensor], cells: Tensor, choice: Tensor, blown: Tensor, reuse: bool
+        self, state: dict[str, Tensor], cells: Tensor, choice: Tensor, unchanged: Tensor, reuse: bool
     ) -> None:
         """Fresh cells of the chosen elements in everything that travels with elements."""
         ids = choice.clamp(min=0)
         for name, table in self._fresh.items():
-            self._write(state, name, cells, table[ids], blown, reuse)
+            self._write(state, name, cells, table[ids], unchanged, reuse)
 
     def _blow(
         self, state: dict[str, Tensor], cells: Tensor, actions: Tensor, blown: Tensor, reuse: bool
     ) -> None:
-        name = str(self.agent.wind_field)
-        wind = self.agent.wind_speed * (actions[:, [4, 3]] - 1).to(state[name].dtype)
-        self._write(state, name, cells, wind, ~blown, reuse)
+        name = str(self.agent.speed_field)
+        speed = self.agent.speed * (actions[:, [4, 3]] - 1).to(state[name].dtype)
+        self._write(state, name, cells, speed, ~blown, reuse)
 
     def _write(
         self,

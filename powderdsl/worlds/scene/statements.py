@@ -38,7 +38,7 @@ STATEMENTS = {
 
 GENERATOR_STATEMENTS = {
     **STATEMENTS,
-    "scatter": "scatter ELEMENT density NUMBER%",
+    "scatter": "scatter ELEMENT chance NUMBER%",
     "stamp": "stamp NAME at (ROW, COLUMN)",
     "part": "part NAME",
 }
@@ -57,7 +57,7 @@ NUMBERS: dict[str, tuple[tuple[str, int], ...]] = {
     "wave": (("a row", -MAX_COORDINATE), ("a height", 0), ("a length", 2), ("a phase", -MAX_COORDINATE)),
     "frame": (),
     "fill": (),
-    "scatter": (("a density", 0),),
+    "scatter": (("a chance", 0),),
     "stamp": _POINT,
     "part": (),
 }
