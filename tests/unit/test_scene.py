@@ -318,7 +318,7 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("frame", "PD605", "\n"),
         ("frame wall wall", "PD605", "wall"),
         ("heap wall", "PD605", "heap"),
-        ("scatter sand chance 5%", "PD605", "scatter sand density 5%"),
+        ("scatter sand chance 5%", "PD605", "scatter sand chance 5%"),
         ("part rocks", "PD605", "part rocks"),
         ("disk (any but sand) at (1, 1) radius 2", "PD605", "(any but sand)"),
         ("disk sand at (1..3, 1) radius 2", "PD605", "1..3"),
