@@ -10,7 +10,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.tasks.drawings import choice_ids
 from powderdsl.tasks.statement_lists import text_span
-from powderdsl.tasks.task import NO_CHANGE, BLOW, Agent
+from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene.statements import read_choice
 
@@ -111,7 +111,9 @@ def _speed_field(
             else "blowing could set several fields"
         )
         helps = (
-            [f"`speed_field`: one of {', '.join(vectors)}"] if vectors else ["load a pack with a vector field"]
+            [f"`speed_field`: one of {', '.join(vectors)}"]
+            if vectors
+            else ["load a pack with a vector field"]
         )
         reader.reporter.error("PD804", message, span, "which one?" if vectors else "no vector", helps=helps)
         return None

@@ -45,7 +45,11 @@ regions:
     - box columns edge:edge+4
   left_half: box columns :32
 stamps:
-  hut: {art: "?^?\\n^.^", legend: {"^": wood}}
+  hut:
+    art: |
+      ?^?
+      ^.^
+    legend: {"^": wood}
 parts:
   ground:
     - wave water at 50 height 6 length 16 phase 0..15
