@@ -27,12 +27,13 @@ def task_of(text: str):
 
 @pytest.fixture(scope="module")
 def program_of():
-    from powderdsl.tasks.episodes import compile_task
+    """Programs of tasks on one simulator: they all have the same rules."""
+    from powderdsl.compiler import load
+    from powderdsl.simulator import compile as compile_rules
+    from powderdsl.tasks.episodes import TaskProgram
 
-    def compiled(text: str, **options):
-        return compile_task(task_of(text), backend="torch", **options)
-
-    return compiled
+    simulator = compile_rules(load("powderworld"), "torch")
+    return lambda text: TaskProgram(task_of(text), "train", simulator)
 
 
 # What actions do
@@ -158,10 +159,11 @@ EXPRESSIONS = {
     "count(empty)": lambda v: v.count(v.ids == 0),
     "count((sand, water) in moving)": lambda v: v.count((v.ids == 2) | (v.ids == 3), "moving"),
     "share(sand or gas)": lambda v: v.count((v.ids == 2) | (v.ids == 4)) / 4096,
-    "share(fluid in two)": lambda v: v.count(np.isin(v.ids, [3, 4, 10, 11]), "two") / v.regions["two"].sum(),
+    "share((water, gas, lava) in two)": lambda v: v.count(np.isin(v.ids, [3, 4, 10]), "two") / v.regions["two"].sum(),
     "sum(momentum in moving)": lambda v: (v.state["momentum"].astype(int) * v.regions["moving"]).sum(),
     "mean(velocity.row in slot)": lambda v: v.state["velocity"][0][v.regions["slot"]].astype(float).mean(),
-    "count(sand and not (density > 3) in moving)": lambda v: 0.0,
+    "count((density >= 3 and not sand) in moving)": lambda v: v.count((v.density >= 3) & (v.ids != 2), "moving"),
+    "mean(density)": lambda v: v.density.mean(),
     "count(sand not in slot)": lambda v: ((v.ids == 2) & ~v.regions["slot"]).sum(),
     "count(sand and slot) + count(water and (moving or slot))": lambda v: v.count(v.ids == 2, "slot")
     + ((v.ids == 3) & (v.regions["moving"] | v.regions["slot"])).sum(),
@@ -186,6 +188,8 @@ class View:
         self.state = {name: value[number].numpy() for name, value in episodes.world.state.items()}
         self.ids = self.state["element"]
         self.regions = {name: value[number % len(value)].numpy() for name, value in episodes.regions.items()}
+        values = episodes.world.sim.ruleset.property("density").values
+        self.density = np.array([int(value) for value in values])[self.ids]
         self.target = episodes.targets["wanted"][number].numpy()
         self.start, self.before, self.taken = start[number], before[number], int(episodes.acted[number])
 

@@ -101,7 +101,8 @@ def test_what_regions_targets_and_stamps_hold(torch):
     target, spot = made.targets["wanted"], made.regions["spot"]
     assert ((target == 9) <= spot).all()
     assert set(target.unique().tolist()) == {2, 9, 255}
-    text = 'stamps: {hut: {art: "?^?\\n^.^", legend: {\'^\': wood}}}\ngenerate: [fill water, "stamp hut at (-1, 62)"]\n'
+    text = "stamps:\n  hut:\n    art: |\n      ?^?\n      ^.^\n    legend: {'^': wood}\n"
+    text += "generate: [fill water, 'stamp hut at (-1, 62)']\n"
     corner = worlds(torch, text, 1)[0]
     assert corner[0, 60:].tolist() == [3, 3, 5, 0]
     assert (corner[1:] == 3).all()
