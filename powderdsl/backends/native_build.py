@@ -218,6 +218,8 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_load": (None, [pointer, integer, integer, integer, pointer]),
         "pd_store": (None, [pointer, integer, integer, integer, integer, pointer, long]),
         "pd_load_real": (None, [pointer, integer, pointer, long]),
+        "pd_put": (None, [pointer, integer, integer, integer, integer, pointer, pointer]),
+        "pd_put_real": (None, [pointer, integer, integer, pointer, pointer]),
         "pd_fill": (None, [pointer, integer, integer, pointer, pointer]),
         "pd_fill_real": (None, [pointer, integer, pointer, pointer]),
         "pd_store_real": (None, [pointer, integer, pointer, long]),

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.backends.torch_native import PackedState
 from powderdsl.simulator import Simulator, World
 from powderdsl.simulator import compile as compile_rules
 from powderdsl.tasks.shipped_tasks import check_split, load_task
@@ -131,7 +132,11 @@ class TaskProgram:
             }
 
         world, other = episodes.world, new.world
-        state = {name: placed(value, other.state[name]) for name, value in world.state.items()}
+        state: Mapping[str, Tensor]
+        if isinstance(world.state, PackedState):
+            state = world.state.put(places, other.state, reuse=reuse)
+        else:
+            state = {name: placed(value, other.state[name]) for name, value in world.state.items()}
         clock = [placed(getattr(world, name), getattr(other, name)) for name in ("seed", "index", "step")]
         return Episodes(
             World(self.simulator, state, *clock),
