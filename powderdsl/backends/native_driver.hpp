@@ -327,6 +327,106 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
   }
   put_back(c);
 }
+// Some worlds of a batch anew, from arrays of these worlds alone: the lanes of world places[k] from the k-th world.
+template <class Visit> static void in_places(Batch& b, int count, const int64_t* places, Visit visit) {
+  for (int k = 0; k < count; k++)
+    for (int strip = 0; strip < (b.g.strips ? LANES : 1); strip++) {
+      const int lane = b.g.strips ? (int)places[k] * LANES + strip : (int)places[k];
+      visit(b.groups[lane / LANES], lane % LANES, ((int64_t)k * b.g.world_height() + strip * b.g.height) * b.g.width);
+    }
+}
+template <class T> static void put_values(Batch& b, int slot, int bits, int count, const int64_t* places, const T* data) {
+  in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
+    for (int i = 0; i < bits; i++) {
+      Plane* p = group.slot[slot + i];
+      if (p->zero) memset(p->data, 0, sizeof(V) * b.g.cells());
+      p->zero = false;
+      p->around = p->beyond = 0;
+      const T* cell = data + begin;
+      for (int y = 0; y < b.g.height; y++)
+        for (int w = 0; w < b.g.words; w++) {
+          const int many = std::min(64, b.g.width - 64 * w);
+          u64 word = 0;
+          for (int x = 0; x < many; x++) word |= (u64)((u64)cell[x] >> i & 1) << x;
+          cell += many;
+          ((u64*)p->data)[((size_t)y * b.g.words + w) * LANES + lane] = word;
+        }
+    }
+  });
+}
+API void pd_put(void* batch, int slot, int bits, int item, int count, const int64_t* places, const void* data) {
+  Batch& b = *(Batch*)batch;
+  if (item == 1) put_values(b, slot, bits, count, places, (const uint8_t*)data);
+  else if (item == 2) put_values(b, slot, bits, count, places, (const int16_t*)data);
+  else put_values(b, slot, bits, count, places, (const int32_t*)data);
+}
+API void pd_put_real(void* batch, int slot, int count, const int64_t* places, const float* data) {
+  Batch& b = *(Batch*)batch;
+  Context* c = borrow(b.g);
+  in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
+    Field* f = group.real[slot];
+    for (int y = 0; y < b.g.height; y++) {
+      const size_t r = (size_t)lane * b.g.height + y;
+      float* row = f->data + r * b.g.stride + HALO;
+      memcpy(row, data + begin + (int64_t)y * b.g.width, sizeof(float) * b.g.width);
+      f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
+      if (f->live[r]) f->still = false;
+      finish_row(*c, row);
+    }
+  });
+  put_back(c);
+}
+
+// One box of cells in each world: int64 [worlds][4], first row, the one after the last, first column, the one after the
+// last; empty where nothing changes. Visits the rows of each lane that lie in it.
+template <class Visit> static void in_boxes(Batch& b, const int64_t* boxes, Visit visit) {
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    const int64_t* box = boxes + 4 * (b.g.strips ? lane / LANES : lane);
+    const int64_t top = b.g.strips ? lane % LANES * b.g.height : 0;
+    const int first = (int)std::max<int64_t>(box[0] - top, 0), last = (int)std::min<int64_t>(box[1] - top, b.g.height);
+    if (first < last && box[2] < box[3]) visit(b.groups[lane / LANES], lane % LANES, b.g.strips ? lane / LANES : lane, first, last, box);
+  }
+}
+API void pd_fill(void* batch, int slot, int bits, const int64_t* boxes, const int64_t* values) {
+  Batch& b = *(Batch*)batch;
+  in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
+    for (int i = 0; i < bits; i++) {
+      Plane* p = group.slot[slot + i];
+      const bool set = values[world] >> i & 1;
+      if (p->zero && !set) continue;
+      if (p->zero) memset(p->data, 0, sizeof(V) * b.g.cells());
+      p->zero = false;
+      p->around = p->beyond = 0;
+      for (int w = 0; w < b.g.words; w++) {
+        const int from = (int)std::max<int64_t>(box[2] - 64 * w, 0), to = (int)std::min<int64_t>(box[3] - 64 * w, 64);
+        if (from >= to) continue;
+        const u64 mask = (to - from == 64 ? ~0ull : (1ull << (to - from)) - 1) << from;
+        for (int y = first; y < last; y++) {
+          u64& word = ((u64*)p->data)[((size_t)y * b.g.words + w) * LANES + lane];
+          word = set ? word | mask : word & ~mask;
+        }
+      }
+    }
+  });
+}
+API void pd_fill_real(void* batch, int slot, const int64_t* boxes, const float* values) {
+  Batch& b = *(Batch*)batch;
+  Context* c = borrow(b.g);
+  in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
+    Field* f = group.real[slot];
+    for (int y = first; y < last; y++) {
+      const size_t r = (size_t)lane * b.g.height + y;
+      float* row = f->data + r * b.g.stride + HALO;
+      if (!f->live[r] && values[world] == 0) continue;
+      if (!f->live[r]) std::fill_n(row, b.g.width, 0.f);
+      std::fill(row + box[2], row + box[3], values[world]);
+      f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
+      if (f->live[r]) f->still = false;
+      finish_row(*c, row);
+    }
+  });
+  put_back(c);
+}
 API void pd_run(void* batch, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, const uint8_t* planes, const float* reals) {
   Batch& b = *(Batch*)batch;
   Clocks k{seed, index, step};

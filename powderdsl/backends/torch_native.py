@@ -53,6 +53,59 @@ class PackedState(Mapping[str, Tensor]):
             )
         return out
 
+    def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
+        """The state with one box of cells in each world filled, without unpacking the rest.
+
+        Args:
+            boxes: int64 [B, 4]: first row, the one after the last, first column, the one after the last, all within
+                the grid; empty where nothing changes.
+            values: by slot: int64 [B], float32 [B] for reals, float32 [B, 2] for vectors.
+            reuse: write to this state itself, and return it.
+        """
+        program = self.program
+        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        boxes = boxes.contiguous()
+        for name, value in values.items():
+            changed._tensors.pop(name, None)
+            if value.is_floating_point():
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 2 else (name,)
+                for part, numbers in zip(parts, value.T if value.ndim == 2 else value[None], strict=True):
+                    numbers = numbers.contiguous()
+                    slot = program.layout.reals[part]
+                    program.library.pd_fill_real(changed.handle, slot, address(boxes), address(numbers))
+            else:
+                value = value.contiguous()
+                slot, bits, _ = program.planes_of(name)
+                program.library.pd_fill(changed.handle, slot, bits, address(boxes), address(value))
+        return changed
+
+    def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
+        """The state with the worlds `places`, int64 [n], replaced by those of another state of n worlds.
+
+        `reuse`: write to this state itself, and return it.
+        """
+        program = self.program
+        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        changed._tensors.clear()
+        places, count = places.contiguous(), len(places)
+        for name, value in state.items():
+            if value.dtype == torch.float32:
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
+                for i, part in enumerate(parts):
+                    plane = (value[:, i] if value.ndim == 4 else value).contiguous()
+                    number = program.layout.reals[part]
+                    program.library.pd_put_real(
+                        changed.handle, number, count, address(places), address(plane)
+                    )
+            else:
+                plane = value.contiguous()
+                slot, bits, _ = program.planes_of(name)
+                item = plane.element_size()
+                program.library.pd_put(
+                    changed.handle, slot, bits, item, count, address(places), address(plane)
+                )
+        return changed
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.like)
 

@@ -33,8 +33,13 @@ from powderdsl.model.unused import report_unused
 from powderdsl.syntax.ast import Syntax
 
 
-def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Ruleset:
-    """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter."""
+def resolve_names(
+    packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter
+) -> tuple[Typer, list[tuple[str, int, Span]]]:
+    """What checks expressions against all names of some packs, and where elements' own values stand.
+
+    Raises CompileError where names clash.
+    """
     composition = compose(packs, ruleset, reporter)
     reporter.raise_if_errors()  # with names that clash or packs that lack, rules would only be misread
     symbols = base_symbols(composition)
@@ -46,6 +51,13 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     _fields(symbols, typer)
     given = _property_values(symbols, typer)
     _sets(typer)
+    return typer, given
+
+
+def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Ruleset:
+    """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter."""
+    typer, given = resolve_names(packs, ruleset, reporter)
+    symbols, composition = typer.symbols, typer.symbols.composition
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
     invariants = check_invariants(composition, typer)

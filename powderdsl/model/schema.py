@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from collections.abc import Mapping as Mapping_
 from dataclasses import dataclass
 from difflib import get_close_matches
 
@@ -121,6 +122,9 @@ VALUES = ("word", "number", "flag", "line")
 PREFIXES = {"pass": ("for ", "repeat "), "block": ("for ", "repeat ")}
 """Keys that are read as lines: `for side in (left, right)`, `repeat 2`."""
 
+HOMES = ("pack", "pass", "element", "task", "agent", "reward", "split")
+"""Mappings to which a key may belong that stands in another one."""
+
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 MAX_NAME = 40
 
@@ -133,10 +137,11 @@ def first_line(node: Node) -> Span:
 
 
 class Reader:
-    """Reads located YAML by the table of keys, reporting what does not fit."""
+    """Reads located YAML by a table of keys, reporting what does not fit."""
 
-    def __init__(self, reporter: Reporter):
+    def __init__(self, reporter: Reporter, keys: Mapping_[str, dict[str, Key]] = KEYS):
         self.reporter = reporter
+        self.keys = keys
 
     def shape(self, node: Node, wanted: str, help_text: str = "") -> None:
         """Report a node of the wrong shape."""
@@ -152,12 +157,12 @@ class Reader:
     def mapping(self, node: Node, context: str, what: str) -> dict[str, tuple[Scalar, Node]]:
         """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""
         if not isinstance(node, Mapping):
-            cure = "known keys: " + ", ".join(KEYS[context])
+            cure = "known keys: " + ", ".join(self.keys[context])
             if isinstance(node, Scalar) and node.text:
                 cure = "a key ends with `:`" if node.text.startswith(PREFIXES.get(context, ("\0",))) else cure
             self.shape(node, f"a mapping with the keys of {what}", cure)
             return {}
-        known = KEYS[context]
+        known = self.keys[context]
         missing = {name for name, row in known.items() if row.required and node.get(name) is None}
         entries: dict[str, tuple[Scalar, Node]] = {}
         for key, value in node.entries:
@@ -215,14 +220,14 @@ class Reader:
         """The cure for an unknown key: what it should be called, where it belongs, or that it is a rule."""
         if any(sign in word for sign in ("->", ":=", " swaps ", " moves ", "swap ")):
             return ("YAML takes text before `: ` for a key: quote the rule",)
-        close = suggest(word, KEYS[context], f"keys of {what}")
+        close = suggest(word, self.keys[context], f"keys of {what}")
         if close and close[0].startswith("did"):
             return close
-        homes = [home for home in ("pack", "pass", "element") if home != context and word in KEYS[home]]
+        homes = [home for home in HOMES if home != context and word in self.keys.get(home, {})]
         if homes:
-            article = "an" if homes[0] == "element" else "a"
+            article = "an" if homes[0] in ("element", "agent") else "a"
             return (f"`{word}` is a key of {article} {homes[0]}: check the indentation",)
-        return close or ("known keys: " + ", ".join(KEYS[context]),)
+        return close or ("known keys: " + ", ".join(self.keys[context]),)
 
     def _check_shape(self, row: Key, key: Scalar, value: Node) -> None:
         wants_scalar = row.shape in ("text", "word", "number", "flag", "line")

@@ -65,7 +65,53 @@ class Frame:
     """The outermost cells of the grid, whatever its size."""
 
 
-Shape = Line | Disk | Box | Frame
+@dataclass(frozen=True)
+class Square:
+    """Rows and columns from `half` before the centre up to, and without, `half` behind it: a side of 2·half."""
+
+    center: Point
+    half: int
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Between the columns of two points, both included: what lies on or below the straight line from one to the
+    other, down to the lower one's row. Points in one column make a bar."""
+
+    start: Point
+    end: Point
+
+
+@dataclass(frozen=True)
+class Arch:
+    """The cells of a box that are fewer than `width` from its upper edge or its sides: open below."""
+
+    rows: Slice
+    columns: Slice
+    width: int
+
+
+@dataclass(frozen=True)
+class Container:
+    """The cells of a box that are fewer than `width` from its lower edge or its sides: open above."""
+
+    rows: Slice
+    columns: Slice
+    width: int
+
+
+@dataclass(frozen=True)
+class Wave:
+    """What lies on or below a zigzag: at column c it is in row ``row + height·u // length``, where t is c + phase
+    modulo `length` and u is the smaller of 2·t and 2·(length − t)."""
+
+    row: int
+    height: int
+    length: int
+    phase: int
+
+
+Shape = Line | Disk | Square | Box | Ramp | Arch | Container | Wave | Frame
 
 
 @dataclass(frozen=True)
@@ -115,6 +161,17 @@ def window(shape: Shape, size: Size) -> tuple[slice, slice]:
             )
         case Box(rows, columns):
             return _clip(rows[0], rows[1], height), _clip(columns[0], columns[1], width)
+        case Square((row, column), half):
+            return _clip(row - half, row + half, height), _clip(column - half, column + half, width)
+        case Ramp(start, end):
+            return (
+                _clip(min(start[0], end[0]), max(start[0], end[0]) + 1, height),
+                _clip(min(start[1], end[1]), max(start[1], end[1]) + 1, width),
+            )
+        case Arch(rows, columns) | Container(rows, columns):
+            return _clip(rows[0], rows[1], height), _clip(columns[0], columns[1], width)
+        case Wave(row):
+            return _clip(row, None, height), slice(0, width)
         case Frame():
             return slice(0, height), slice(0, width)
 
@@ -133,8 +190,24 @@ def _covered(shape: Shape, rows: slice, columns: slice, size: Size) -> NDArray[n
             return _line(shape, row, column)
         case Disk(center, radius):
             return (row - center[0]) ** 2 + (column - center[1]) ** 2 < radius * radius
-        case Box():
+        case Box() | Square():
             return np.ones((row.size, column.size), dtype=np.bool_)
+        case Ramp((top, left), (bottom, right)):
+            if left == right:
+                return np.ones((row.size, column.size), dtype=np.bool_)
+            over = 1 if right > left else -1
+            return (row - top) * abs(right - left) >= (column - left) * over * (bottom - top)
+        case Arch(_, (left, right), thickness):
+            end = size[1] if right is None else right
+            roof = row < shape.rows[0] + thickness
+            return roof | (column < left + thickness) | (column >= end - thickness)
+        case Container((_, bottom_row), (left, right), thickness):
+            end = size[1] if right is None else right
+            floor = row >= (size[0] if bottom_row is None else bottom_row) - thickness
+            return floor | (column < left + thickness) | (column >= end - thickness)
+        case Wave(first, height, length, phase):
+            turn = (column + phase) % length
+            return row >= first + height * np.minimum(2 * turn, 2 * (length - turn)) // length
         case Frame():
             last_row, last_column = size[0] - 1, size[1] - 1
             return (row == 0) | (row == last_row) | (column == 0) | (column == last_column)

@@ -14,9 +14,10 @@
 `draw` may also be a `|` block, one statement a line. A file with several scenes has a list under `scenes`.
 """
 
+from powderdsl.worlds.scene.fixed import parse_statement
 from powderdsl.worlds.scene.load import draw_scene, find_scene, load_scene, load_scenes, shipped_scenes
 from powderdsl.worlds.scene.read import Scene, read_scenes
-from powderdsl.worlds.scene.statements import STATEMENTS, parse_statement
+from powderdsl.worlds.scene.statements import STATEMENTS
 
 __all__ = [
     "STATEMENTS",

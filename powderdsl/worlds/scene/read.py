@@ -10,7 +10,7 @@ from powderdsl.diagnostics import Label, Reporter, Source, Span, suggest
 from powderdsl.model.schema import Key, Reader, first_line
 from powderdsl.syntax import yaml_tree
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, mask
-from powderdsl.worlds.scene.statements import parse_statement
+from powderdsl.worlds.scene.fixed import parse_statement
 
 SCENE_KEYS = {
     "scene": Key("word", "the scene's name", True),

@@ -1,0 +1,291 @@
+"""Statements as written -> a checked `Generator`: names known, elements resolved, numbers within bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from powderdsl.diagnostics import Reporter, suggest
+from powderdsl.model.types import Ruleset
+from powderdsl.tasks.statement_lists import BROKEN, Item, Repeat
+from powderdsl.tasks.task import MAX_NUMBER, MAX_REPEATS, Drawing, Generator, Group, Region, Stamp, Target
+from powderdsl.worlds.raster import Size, mask
+from powderdsl.worlds.scene.amounts import Amount, Interval, filled_in, interval, number
+from powderdsl.worlds.scene.fixed import shape_of
+from powderdsl.worlds.scene.statements import NUMBERS, RANGES, ElementChoice, Statement, Word
+
+MAX_DRAWINGS = 4_096
+"""Drawings of one world, repetitions counted."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a generator is made of, as written: sections of a file, with the changes of a split on top."""
+
+    name: str
+    fill: int
+    knobs: Mapping[str, int]
+    lets: Sequence[tuple[Word, Amount]]
+    regions: Mapping[str, Sequence[Statement]]
+    stamps: Mapping[str, Stamp]
+    parts: Mapping[str, Sequence[Item]]
+    targets: Mapping[str, Sequence[Item]]
+    items: Sequence[Item]
+    broken: frozenset[str] = frozenset()
+    """Knobs whose definition has been reported."""
+
+
+@dataclass
+class Drawer:
+    """Checks one plan. What is wrong goes to the reporter; the generator is of use only if nothing was."""
+
+    plan: Plan
+    ruleset: Ruleset
+    size: Size
+    reporter: Reporter
+    names: dict[str, Interval] = field(default_factory=dict)
+    used_parts: set[str] = field(default_factory=set)
+    broken: set[str] = field(default_factory=set)
+    """Names whose definition has been reported: using them is no second mistake."""
+    count: int = 0
+    cells: int = 0
+
+    def generator(self) -> Generator:
+        plan = self.plan
+        lets = self.lets(plan.lets, self.names)
+        regions = tuple(self.region(name, shapes) for name, shapes in plan.regions.items())
+        groups = self.groups(plan.items)
+        targets = tuple(Target(name, self.groups(items)) for name, items in plan.targets.items())
+        stamps = tuple(plan.stamps.values())
+        return Generator(plan.name, plan.fill, lets, groups, regions, targets, stamps)
+
+    def lets(
+        self, written: Sequence[tuple[Word, Amount]], names: dict[str, Interval]
+    ) -> tuple[tuple[str, Amount], ...]:
+        """Named numbers in order; `names` gets their bounds."""
+        found = []
+        for word, amount in written:
+            filled = self.filled(amount, names) if amount is not BROKEN else None
+            names[word.text] = (0, 0)
+            if filled is None:
+                self.broken.add(word.text)
+            else:
+                names[word.text] = self.bounds(filled, names)
+                found.append((word.text, filled))
+        return tuple(found)
+
+    def region(self, name: str, shapes: Sequence[Statement]) -> Region:
+        found = [self.drawing(one, self.names) for one in shapes]
+        drawings = tuple(one for one in found if one is not None)
+        drawn = any(
+            part.op in ("draw", "name") for one in drawings for a in one.amounts if a for part in a.walk()
+        )
+        return Region(name, drawings, drawn)
+
+    def groups(self, items: Sequence[Item], inside: tuple[str, ...] = ()) -> tuple[Group, ...]:
+        """Repetitions, and what stands between them, each a group."""
+        found: list[Group] = []
+        for item in items:
+            if isinstance(item, Repeat):
+                found += self.repeated(item)
+            elif item.kind == "part":
+                found += self.part(item, inside)
+            else:
+                found += self.single(item)
+            if self.cells > MAX_DRAWINGS:
+                message = f"a world of more than {MAX_DRAWINGS:,} drawings"
+                self.reporter.error("PD508", message, item.span, "here it is too much", helps=["draw less"])
+                break
+        return tuple(found)
+
+    def part(self, statement: Statement, inside: tuple[str, ...]) -> tuple[Group, ...]:
+        name = statement.name
+        assert name is not None
+        if name.text not in self.plan.parts:
+            self.unknown("part", name, self.plan.parts)
+            return ()
+        self.used_parts.add(name.text)
+        if name.text in inside:
+            self.reporter.error("PD307", f"the part `{name.text}` is made of itself", name.span, "here")
+            return ()
+        return self.groups(self.plan.parts[name.text], (*inside, name.text))
+
+    def single(self, statement: Statement) -> tuple[Group, ...]:
+        self.count += 1
+        self.cells += 1
+        drawing = self.drawing(statement, self.names)
+        return () if drawing is None else (Group(self.count, number(1), 1, (), (drawing,)),)
+
+    def repeated(self, repeat: Repeat) -> tuple[Group, ...]:
+        self.count += 1
+        place = self.count
+        names = dict(self.names)
+        for word, _ in repeat.lets:
+            if word.text in self.names or word.text in self.plan.knobs:
+                self.reporter.error(
+                    "PD308", f"`{word.text}` already means something", word.span, "second meaning"
+                )
+        count = self.filled(repeat.count, self.names)
+        lets = self.lets(repeat.lets, names)
+        drawings = []
+        for statement in repeat.statements:
+            self.count += 1
+            if statement.kind == "part":
+                label = "a part cannot stand in a repetition"
+                self.reporter.error("PD605", "a part in a repetition", statement.span, label)
+                continue
+            drawings.append(self.drawing(statement, names))
+        if count is None or any(one is None for one in drawings):
+            return ()
+        low, most = self.bounds(count, self.names)
+        if low < 0 or most > MAX_REPEATS:
+            message = f"{low}..{most} repetitions"
+            span = repeat.count.span
+            self.reporter.error("PD606", message, span, f"they must lie in 0..{MAX_REPEATS}")
+            return ()
+        self.cells += most * len(drawings)
+        if most == 0 or not drawings:
+            return ()
+        return (Group(place, count, most, lets, tuple(one for one in drawings if one)),)
+
+    def drawing(self, statement: Statement, names: Mapping[str, Interval]) -> Drawing | None:
+        ids = self.ids(statement.choice) if statement.choice else ()
+        over = frozenset(self.ids(statement.over)) if statement.over else None
+        where, stamp = statement.where, statement.name
+        if where is not None and where.text not in self.plan.regions:
+            self.unknown("region", where, self.plan.regions)
+        if stamp is not None and stamp.text not in self.plan.stamps:
+            self.unknown("stamp", stamp, self.plan.stamps)
+        amounts = [None if one is None else self.filled(one, names) for one in statement.numbers]
+        if any(new is None and old is not None for new, old in zip(amounts, statement.numbers, strict=True)):
+            return None
+        found = Drawing(
+            self.count,
+            statement.kind,
+            tuple(amounts),
+            ids,
+            where.text if where else None,
+            over,
+            stamp.text if stamp else None,
+            statement.span,
+        )
+        return found if self.numbers_fit(found, names) and (ids or statement.choice is None) else None
+
+    def filled(self, amount: Amount, names: Mapping[str, Interval]) -> Amount | None:
+        """The amount with knobs filled in, or None after reporting names that nothing defines."""
+        if any(part.value in self.broken or part.value in self.plan.broken for part in amount.walk()):
+            return None
+        known = {**dict.fromkeys(names), **dict.fromkeys(self.plan.knobs)}
+        unknown = [part for part in amount.walk() if part.op == "name" and part.value not in known]
+        for part in unknown:
+            assert part.span is not None
+            self.unknown("number", Word(str(part.value), part.span), known)
+        if unknown:
+            return None
+        try:
+            found = filled_in(amount, self.plan.knobs)
+            interval(found, names)
+        except ZeroDivisionError:
+            self.reporter.error("PD606", "a division by zero", amount.span, "the divisor can be 0")
+            return None
+        for part in found.walk():
+            if part.op == "draw":
+                (low, _), (_, high) = (interval(arg, names) for arg in part.args)
+                if low > high:
+                    label = "the first must not be above the second"
+                    self.reporter.error("PD606", f"a range {low}..{high} without numbers", part.span, label)
+                    return None
+        return found
+
+    def bounds(self, amount: Amount, names: Mapping[str, Interval]) -> Interval:
+        return interval(amount, names)
+
+    def numbers_fit(self, drawing: Drawing, names: Mapping[str, Interval]) -> bool:
+        """Whether all numbers can be what their statement needs; reports those that cannot."""
+        fits = True
+        for amount, (what, lowest) in zip(drawing.amounts, NUMBERS[drawing.kind], strict=True):
+            if amount is None:
+                continue
+            low, high = self.bounds(amount, names)
+            least = max(lowest, -MAX_NUMBER)
+            most = 100 if drawing.kind == "scatter" else MAX_NUMBER
+            # A range that begins before the world is cut off, as everything is that lies outside.
+            least = -MAX_NUMBER if drawing.kind in RANGES and lowest == 0 else least
+            if low < least or high > most:
+                can_be = f"it can be {low}..{high}" if low < high else f"it is {low}"
+                self.reporter.error("PD606", f"{what} must lie in {least}..{most}", amount.span, can_be)
+                fits = False
+        return fits and self.covers_something(drawing, names)
+
+    def covers_something(self, drawing: Drawing, names: Mapping[str, Interval]) -> bool:
+        """Whether the shape can cover a cell; reports one that never does."""
+        amounts = drawing.amounts
+        never = ""
+        for i in range(RANGES.get(drawing.kind, 0)):
+            start, stop = amounts[2 * i], amounts[2 * i + 1]
+            assert start is not None
+            low = self.bounds(start, names)[0]
+            high = self.size[i] if stop is None else self.bounds(stop, names)[1]
+            if low >= high or start == stop or low >= self.size[i] or high <= 0:
+                never = "rows" if i == 0 else "columns"
+        if all(one is None or one.is_number for one in amounts) and drawing.kind not in ("scatter", "stamp"):
+            values = [None if one is None else int(one.value or 0) for one in amounts]
+            if not mask(shape_of(drawing.kind, values), self.size).any():
+                never = never or "cells"
+        if never:
+            rows, columns = self.size
+            self.reporter.error(
+                "PD608",
+                "a shape that covers no cell",
+                drawing.span,
+                f"none of its {never} lie in the {rows}×{columns} world",
+                helps=[f"rows are 0 to {rows - 1}, columns 0 to {columns - 1}; rows come first"],
+            )
+        return not never
+
+    def ids(self, choice: ElementChoice) -> tuple[int, ...]:
+        """The elements of a choice, in the order written; empty after a report."""
+        return choice_ids(choice, self.ruleset, self.reporter, self.plan.knobs)
+
+    def unknown(self, what: str, word: Word, known: Mapping[str, object]) -> None:
+        helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
+        self.reporter.error("PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps)
+
+
+def choice_ids(
+    choice: ElementChoice, ruleset: Ruleset, reporter: Reporter, knobs: Mapping[str, int]
+) -> tuple[int, ...]:
+    """The elements of a choice by id, in the order written, tags in the order of ids. Empty after a report."""
+    named: list[int] = []
+    for word in choice.names:
+        named += element_ids(word, ruleset, reporter)
+    ids = tuple(dict.fromkeys(named))
+    if choice.how == "any":
+        ids = tuple(element.id for element in ruleset.elements if element.id not in ids)
+    if choice.how == "first":
+        assert choice.count is not None
+        count = filled_in(choice.count, knobs)
+        if not count.is_number or not 1 <= int(count.value or 0) <= len(ids):
+            label = f"a number from 1 to {len(ids)}, or knobs"
+            reporter.error("PD606", "how many of them must be fixed", choice.count.span, label)
+            return ()
+        ids = ids[: int(count.value or 0)]
+    if not ids and not choice.names:
+        reporter.error("PD604", "a choice among no elements", choice.span, "nothing is left")
+    if not ids and choice.how == "any" and choice.names:
+        reporter.error("PD604", "a choice among no elements", choice.span, "nothing is left")
+    return ids
+
+
+def element_ids(word: Word, ruleset: Ruleset, reporter: Reporter) -> tuple[int, ...]:
+    """The element, or all elements with the tag, of a name; empty after reporting PD604."""
+    element = ruleset.element(word.text)
+    if element is not None:
+        return (element.id,)
+    tagged = tuple(one.id for one in ruleset.elements if word.text in one.tags)
+    if not tagged:
+        known = {one.name for one in ruleset.elements} | {tag for one in ruleset.elements for tag in one.tags}
+        helps = suggest(word.text, known, "its elements")
+        label = "neither an element nor a tag of these rules"
+        reporter.error("PD604", f"unknown element `{word.text}`", word.span, label, helps=helps)
+    return tagged

@@ -1,0 +1,273 @@
+"""Running tasks: batches of episodes on tensors. Actions in, rewards out, on the simulator's device."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.backends.torch_native import PackedState
+from powderdsl.simulator import Simulator, World
+from powderdsl.simulator import compile as compile_rules
+from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.tasks.task import Task
+from powderdsl.tasks.torch_actions import Hands, params_of
+from powderdsl.tasks.torch_generator import Made, WorldMaker
+from powderdsl.tasks.torch_measures import Facts, Given, Meter, measures_of, scalar_value, scalars_of
+
+__all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """A batch of episodes.
+
+    `seed`, int64 [B], says which worlds they started as; `acted`, int64 [B], how many actions each has had;
+    `failed`, bool [B], whether `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] where all
+    worlds have the same; `targets` uint8 [B, H, W], 255 where there is none; `start` and `before`, float64 [B, n],
+    what rewards remember of the start and of the action before.
+    """
+
+    world: World
+    seed: Tensor
+    acted: Tensor
+    failed: Tensor
+    regions: Mapping[str, Tensor]
+    targets: Mapping[str, Tensor]
+    start: Tensor
+    before: Tensor
+
+    def __len__(self) -> int:
+        return len(self.seed)
+
+
+class TaskProgram:
+    """A task made executable for one split. Made by `compile_task`."""
+
+    def __init__(self, task: Task, split: str, simulator: Simulator):
+        self.task, self.split, self.simulator = task, split, simulator
+        device = simulator.device
+        self._makers = [WorldMaker(one, task.size, device) for one in task.split(split).variants]
+        self._measures = measures_of(task.goal)
+        self._places = {measure: number for number, measure in enumerate(self._measures)}
+        fixed = self._makers[0].fixed_cells
+        for maker in self._makers[1:]:
+            same = maker.fixed_cells
+            fixed = {n: v for n, v in fixed.items() if n in same and torch.equal(v, same[n])}
+        self._fixed = fixed
+        self._meter = Meter(simulator.ruleset, self._measures, task.size, fixed, device)
+        counts = any(part.op == "action" and part.value == "painted" for part in scalars_of(task.goal))
+        self._hands = Hands(simulator, task.agent, task.size, counts=counts)
+        agent = task.agent
+        self.action_nvec: tuple[int, int, int, int, int] = (
+            agent.bins[1],
+            agent.bins[0],
+            len(agent.choices),
+            3,
+            3,
+        )
+        """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
+
+    # Beginning
+
+    def start(self, seeds: Tensor) -> Episodes:
+        """New episodes of the worlds `seeds`, int64 [B], 0 or more each."""
+        seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
+        made = self._made(seeds)
+        nothing = torch.zeros_like(seeds)
+        clock = (seeds, nothing.clone(), nothing.clone())
+        world = World(self.simulator, self._hands.fresh_state(made.ids), *clock)
+        measured = self._meter.take(self._given(world, made.regions, made.targets, {}))
+        return Episodes(
+            world, seeds, nothing.clone(), nothing.bool(), made.regions, made.targets, measured, measured
+        )
+
+    def _made(self, seeds: Tensor) -> Made:
+        """The start worlds of seeds; where a split has several variants, each world comes from its own."""
+        if len(self._makers) == 1:
+            return self._makers[0].make(seeds)
+        batch, (height, width) = len(seeds), self.task.size
+        device = seeds.device
+        variant = torch.remainder(seeds, len(self._makers))
+        ids = torch.zeros(batch, height, width, dtype=torch.uint8, device=device)
+        regions = dict(self._fixed)
+        for region in self._makers[0].generator.regions:
+            if region.name not in regions:
+                regions[region.name] = torch.zeros(batch, height, width, dtype=torch.bool, device=device)
+        targets = {one.name: torch.zeros_like(ids) for one in self._makers[0].generator.targets}
+        for number, maker in enumerate(self._makers):
+            places = (variant == number).nonzero()[:, 0]
+            if len(places):
+                made = maker.make(seeds[places])
+                ids[places] = made.ids
+                for name in regions.keys() - self._fixed.keys():
+                    regions[name][places] = made.regions[name]
+                for name, target in targets.items():
+                    target[places] = made.targets[name]
+        return Made(ids, regions, targets)
+
+    def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
+        """The episodes where `mask`, bool [B], is set, made anew as worlds `seeds`, int64 [B]; the others unchanged.
+
+        With `reuse` the tensors of `episodes` are written to, and must not be used afterwards.
+        """
+        places = mask.nonzero()[:, 0]
+        if len(places) == 0:
+            return episodes
+        seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
+        new = self.start(seeds[places])
+        if len(places) == len(mask):
+            return new
+
+        def placed(old: Tensor, fresh: Tensor) -> Tensor:
+            return (old if reuse else old.clone()).index_copy_(0, places, fresh)
+
+        def all_placed(old: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {
+                name: value if name in self._fixed else placed(value, fresh[name])
+                for name, value in old.items()
+            }
+
+        world, other = episodes.world, new.world
+        state: Mapping[str, Tensor]
+        if isinstance(world.state, PackedState):
+            state = world.state.put(places, other.state, reuse=reuse)
+        else:
+            state = {name: placed(value, other.state[name]) for name, value in world.state.items()}
+        clock = [placed(getattr(world, name), getattr(other, name)) for name in ("seed", "index", "step")]
+        return Episodes(
+            World(self.simulator, state, *clock),
+            placed(episodes.seed, new.seed),
+            placed(episodes.acted, new.acted),
+            placed(episodes.failed, new.failed),
+            all_placed(episodes.regions, new.regions),
+            all_placed(episodes.targets, new.targets),
+            placed(episodes.start, new.start),
+            placed(episodes.before, new.before),
+        )
+
+    # Acting
+
+    def act(
+        self,
+        episodes: Episodes,
+        actions: Tensor,
+        *,
+        reuse: bool = False,
+        params: Mapping[str, Any] | None = None,
+    ) -> tuple[Episodes, Tensor, Tensor, Tensor]:
+        """One action of each episode, int64 [B, 5] as `check_actions` gives them, and the steps after it.
+
+        Args:
+            reuse: the tensors of `episodes` are written to, and must not be used afterwards.
+            params: parameters of the rules for this action, one number each or [B].
+
+        Returns:
+            the episodes; reward float32 [B]; success bool [B], whether `success` of `end:` holds now; over bool [B]:
+            success, failure, or no action left. With the last action the free steps have run.
+        """
+        agent, goal = self.task.agent, self.task.goal
+        done = self._hands.act(episodes.world, actions, reuse=reuse)
+        world = self.simulator.step(done.world, agent.steps_per_action, params=params)
+        acted = episodes.acted + 1
+        last = acted >= agent.actions
+        if agent.free_steps:
+            world = self._free(world, last, params)
+        now = self._meter.take(self._given(world, episodes.regions, episodes.targets, params or {}))
+        action = {
+            "taken": acted,
+            "left": agent.actions - acted,
+            "painted": done.painted,
+            "placed": done.placed,
+            "blown": done.blown,
+        }
+        facts = Facts(self._places, now, episodes.start, episodes.before, action)
+        nothing = torch.zeros(len(acted), dtype=torch.float64, device=acted.device)
+        success, failed = (
+            nothing.bool() if one is None else scalar_value(one, facts) != 0
+            for one in (goal.success, goal.failure)
+        )
+        over = last | success | failed
+        reward = nothing if goal.each is None else scalar_value(goal.each, facts)
+        if goal.final is not None:
+            reward = reward + torch.where(over, scalar_value(goal.final, facts), nothing)
+        after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
+        return after, reward.float(), success, over
+
+    def _free(self, world: World, last: Tensor, params: Mapping[str, Any] | None) -> World:
+        """The steps after the last action, in the worlds that had it."""
+        steps = self.task.agent.free_steps
+        places = last.nonzero()[:, 0]
+        if len(places) == 0:
+            return world
+        if len(places) == len(last):
+            return self.simulator.step(world, steps, params=params)
+        own = {
+            name: value[places] if isinstance(value, Tensor) and value.ndim else value
+            for name, value in (params or {}).items()
+        }
+        ahead = self.simulator.step(world.select(places), steps, params=own)
+        state = {name: value.index_copy(0, places, ahead.state[name]) for name, value in world.state.items()}
+        return replace(world, state=state, step=world.step.index_copy(0, places, ahead.step))
+
+    def _given(
+        self,
+        world: World,
+        regions: Mapping[str, Tensor],
+        targets: Mapping[str, Tensor],
+        params: Mapping[str, Any],
+    ) -> Given:
+        return Given(
+            world.state, world.step, params_of(self.simulator, params, len(world.step)), regions, targets
+        )
+
+
+def compile_task(
+    task: Task | str,
+    *,
+    split: str = "train",
+    backend: str = "auto",
+    device: str | torch.device = "cpu",
+    threads: int | None = None,
+) -> TaskProgram:
+    """A program for one split of a task, or of the task of a name or path.
+
+    Args:
+        backend, device, threads: those of `powderdsl.compile`; one thread unless said otherwise.
+
+    Raises:
+        CompileError: PD801 for a split that the task does not have, PD701 for a backend or device that is not there.
+    """
+    found = task if isinstance(task, Task) else load_task(task)
+    check_split(found, split)
+    simulator = compile_rules(found.ruleset, backend, str(device), 1 if threads is None else threads)
+    return TaskProgram(found, split, simulator)
+
+
+def check_actions(program: TaskProgram, actions: Any) -> Tensor:
+    """Actions from outside as int64 [B, 5] on the program's device; those that are no numbers of an action are refused.
+
+    Raises:
+        TypeError: numbers that are not whole. ValueError: a wrong shape, or a number out of range, with its index.
+    """
+    try:
+        tensor = torch.as_tensor(actions)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"actions: {' '.join(str(error).split())}") from None
+    if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
+        raise TypeError(f"actions must be whole numbers, found {tensor.dtype}")
+    if tensor.ndim != 2 or tensor.shape[1] != 5:
+        raise ValueError(f"actions must have the shape [episodes, 5], found {list(tensor.shape)}")
+    tensor = tensor.to(torch.int64)
+    bounds = torch.tensor(program.action_nvec, device=tensor.device)
+    bad = (tensor < 0) | (tensor >= bounds)
+    if bool(bad.any()):
+        row, column = bad.nonzero()[0].tolist()
+        name = ("x", "y", "choice", "vx", "vy")[column]
+        most = program.action_nvec[column] - 1
+        value = int(tensor[row, column])
+        raise ValueError(f"actions[{row}, {column}] ({name}) is {value}: it must lie in 0..{most}")
+    return tensor.to(program.simulator.device)

@@ -1,0 +1,243 @@
+"""Reward and end expressions: syntax -> `Scalar`, cell conditions checked as those of rules are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+
+from powderdsl.diagnostics import Span, suggest
+from powderdsl.model.expressions import Typer
+from powderdsl.model.literals import read_number
+from powderdsl.model.operands import Asleep, Number, Operand, Poisoned, SetOf
+from powderdsl.model.scope import Scope
+from powderdsl.model.types import FLAG, Expr
+from powderdsl.syntax.ast import Syntax
+from powderdsl.tasks.task import Measure, Scalar
+
+MEASURES = {
+    "count": "count(CELLS in REGION)",
+    "share": "share(CELLS in REGION)",
+    "sum": "sum(NUMBER in REGION)",
+    "mean": "mean(NUMBER in REGION)",
+    "highest": "highest(CELLS in REGION)",
+    "match": "match(TARGET)",
+}
+"""What can be taken of a whole world, and how it is written."""
+
+MEMORIES = {"start": "start(VALUE)", "change": "change(VALUE)"}
+ARITHMETIC = {"min": "min(A, B)", "max": "max(A, B)", "abs": "abs(A)"}
+FUNCTIONS = {**MEASURES, **MEMORIES, **ARITHMETIC}
+
+ACTION_WORDS = ("taken", "left", "painted", "placed", "blown")
+"""Numbers of the action that was just taken, and of how many there were and will be."""
+
+_BINARY = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "mod": "mod"}
+_COMPARE = {"<": "lt", "<=": "le", "==": "eq"}
+REGION_LET = "in "
+"""How the names of regions begin among the values that cell conditions read."""
+
+
+@dataclass
+class GoalChecker:
+    """Checks the expressions of one task."""
+
+    typer: Typer
+    regions: frozenset[str]
+    targets: frozenset[str]
+    knobs: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        names: dict[str, Operand] = {name: Number(Fraction(value)) for name, value in self.knobs.items()}
+        names |= {name: Expr("let", FLAG, value=REGION_LET + name) for name in self.regions}
+        self.scope = Scope("", names)
+
+    def number(self, syntax: Syntax) -> Scalar | None:
+        """A reward, or None after reporting what is wrong with it."""
+        found = self._checked(syntax)
+        if found is not None and not any(one.op in ("measure", "action") for one in parts_of(found)):
+            label = "it says the same of every world"
+            self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
+        return found
+
+    def condition(self, syntax: Syntax) -> Scalar | None:
+        """A condition that ends an episode, or None after a report."""
+        found = self.number(syntax)
+        if found is not None and not found.is_condition:
+            self.typer.reporter.error(
+                "PD401", "expected a condition, found a number", syntax.span, "compare it: `… > 0`"
+            )
+            return None
+        return found
+
+    def _checked(self, syntax: Syntax) -> Scalar | None:
+        self.typer.start_rule(syntax.span)
+        try:
+            return self.scalar(syntax)
+        except Poisoned:
+            return None
+        except Asleep as asleep:
+            self.typer.fail("PD301", f"`{asleep.name}` is not loaded", syntax.span, "hangs on it")
+            return None
+
+    # Arithmetic on numbers of the whole world
+
+    def scalar(self, syntax: Syntax) -> Scalar:
+        kind, parts = syntax.kind, syntax.children
+        if kind in ("integer", "decimal", "percent"):
+            return Scalar("const", value=float(read_number(syntax, self.typer)))
+        if kind in ("yes", "no"):
+            return Scalar("const", value=float(kind == "yes"), is_condition=True)
+        if kind == "name":
+            return self.name(syntax)
+        if kind == "call":
+            return self.call(syntax)
+        if kind == "negate":
+            return Scalar("neg", (self.value(parts[0]),))
+        if kind in _BINARY:
+            return Scalar(_BINARY[kind], (self.value(parts[0]), self.value(parts[1])))
+        if kind == "choose":
+            yes, condition, no = parts
+            return Scalar("choose", (self.truth(condition), self.value(yes), self.value(no)))
+        if kind in ("and_", "or_"):
+            both = (self.truth(parts[0]), self.truth(parts[1]))
+            return Scalar(kind.rstrip("_"), both, is_condition=True)
+        if kind == "not_":
+            return Scalar("not", (self.truth(parts[0]),), is_condition=True)
+        if kind == "compare":
+            return self.compare(syntax)
+        raise self._needs_measure(syntax)
+
+    def value(self, syntax: Syntax) -> Scalar:
+        return self.scalar(syntax)
+
+    def truth(self, syntax: Syntax) -> Scalar:
+        found = self.scalar(syntax)
+        if not found.is_condition:
+            raise self.typer.fail(
+                "PD401", "expected a condition, found a number", syntax.span, "compare it: `… > 0`"
+            )
+        return found
+
+    def compare(self, syntax: Syntax) -> Scalar:
+        values = [self.value(part) for part in syntax.children]
+        found: Scalar | None = None
+        for i, sign in enumerate(syntax.text.split()):
+            left, right = values[i], values[i + 1]
+            if sign in (">", ">="):
+                left, right, sign = right, left, sign.replace(">", "<")
+            one = Scalar(_COMPARE.get(sign, "eq"), (left, right), is_condition=True)
+            if sign == "!=":
+                one = Scalar("not", (one,), is_condition=True)
+            found = one if found is None else Scalar("and", (found, one), is_condition=True)
+        assert found is not None
+        return found
+
+    def name(self, syntax: Syntax) -> Scalar:
+        if syntax.text in self.knobs:
+            return Scalar("const", value=float(self.knobs[syntax.text]))
+        if syntax.text in ACTION_WORDS:
+            return Scalar("action", value=syntax.text, is_condition=False)
+        raise self._needs_measure(syntax)
+
+    def _needs_measure(self, syntax: Syntax) -> Poisoned:
+        """Something of each cell stands where one number of the whole world is wanted, or nobody knows the name."""
+        names = [*ACTION_WORDS, *FUNCTIONS, *self.knobs]
+        text = syntax.span.text
+        if syntax.kind == "name" and self.typer.find(syntax.text, syntax.span, self.scope) is None:
+            helps = suggest(syntax.text, [*names, *self.typer.symbols.names()])
+            return self.typer.fail(
+                "PD301", f"unknown name `{syntax.text}`", syntax.span, "not defined", helps
+            )
+        return self.typer.fail(
+            "PD401",
+            "expected one number of the whole world",
+            syntax.span,
+            "this is something of each cell",
+            (f"write `count({text})`, or `share({text})`",),
+        )
+
+    # Numbers of the whole world
+
+    def call(self, syntax: Syntax) -> Scalar:
+        name, parts = syntax.text, syntax.children
+        span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(name))
+        if name not in FUNCTIONS:
+            helps = suggest(name, FUNCTIONS, "functions")
+            raise self.typer.fail("PD301", f"unknown function `{name}`", span, "not a function", helps)
+        wanted = 2 if name in ("min", "max") else 1
+        if len(parts) != wanted:
+            message = f"`{name}` takes {wanted} value{'s' * (wanted > 1)}, found {len(parts)}"
+            usage = (f"write `{FUNCTIONS[name]}`",)
+            raise self.typer.fail("PD406", message, syntax.span, "", usage)
+        if name in ARITHMETIC:
+            return Scalar(name, tuple(self.value(part) for part in parts))
+        if name in MEMORIES:
+            inner = self.value(parts[0])
+            if any(one.op in ("start", "before", "action") for one in parts_of(inner)):
+                raise self.typer.fail("PD406", f"`{name}` of what is no number of a world", parts[0].span)
+            if name == "start":
+                return Scalar("start", (inner,))
+            return Scalar("sub", (inner, Scalar("before", (inner,))))
+        return Scalar("measure", value=self.measure(name, parts[0]))
+
+    def measure(self, how: str, cells: Syntax) -> Measure:
+        if how == "match":
+            if cells.kind != "name" or cells.text not in self.targets:
+                helps = suggest(cells.text, self.targets, "targets") or ("the task defines no targets",)
+                raise self.typer.fail(
+                    "PD802", f"unknown target `{cells.text}`", cells.span, "not defined", helps
+                )
+            return Measure("match", None, None, cells.text)
+        region = None
+        if cells.kind == "in_" and cells.children[1].kind == "name":
+            word = cells.children[1]
+            if word.text in self.regions:
+                region, cells = word.text, cells.children[0]
+            elif self.typer.find(word.text, word.span, self.scope) is None:
+                helps = suggest(word.text, self.regions, "regions") or ("the task defines no regions",)
+                raise self.typer.fail(
+                    "PD802", f"unknown region `{word.text}`", word.span, "not defined", helps
+                )
+        value = self.cells(how, cells)
+        return Measure(how, value, region)
+
+    def cells(self, how: str, syntax: Syntax) -> Expr:
+        """The expression of each cell that a measure is taken of."""
+        operand = self.typer.evaluate(self.within(syntax), self.scope)
+        if how in ("count", "share", "highest"):
+            found = self.typer.flag(operand, syntax.span)
+        else:
+            value = self.typer.value(operand, syntax.span)
+            if isinstance(value, Number) or value.kind.name not in _SUMMABLE:
+                raise self.typer.wrong(value, "a number of each cell", syntax.span, "such as a field")
+            found = value
+        if any(part.op == "draw" for part in found.walk()):
+            raise self.typer.fail("PD406", "a reward draws no random numbers", syntax.span, "a draw")
+        if found.op == "const" or (isinstance(operand, SetOf) and not operand.ids):
+            label = "every cell fulfils this" if found.value else "no cell can fulfil this"
+            self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
+        return found
+
+    def within(self, syntax: Syntax) -> Syntax:
+        """The syntax with `CELLS in REGION` written as `CELLS and REGION`."""
+        parts = tuple(self.within(part) for part in syntax.children)
+        right = parts[1] if syntax.kind in ("in_", "not_in") else None
+        if right is None or right.kind != "name" or right.text not in self.regions:
+            return Syntax(syntax.kind, parts, syntax.text, syntax.span)
+        if syntax.kind == "not_in":
+            parts = (parts[0], Syntax("not_", (right,), "", right.span))
+        return Syntax("and_", parts, "", syntax.span)
+
+
+_SUMMABLE = ("int", "flag", "real")
+
+
+def parts_of(scalar: Scalar) -> list[Scalar]:
+    """The scalar and everything in it."""
+    found, stack = [], [scalar]
+    while stack:
+        one = stack.pop()
+        found.append(one)
+        stack += one.args
+    return found

@@ -1,0 +1,101 @@
+"""Stamps: pictures that a task file draws in ASCII, or names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from powderdsl.diagnostics import CompileError, Span
+from powderdsl.model.schema import Reader
+from powderdsl.model.types import Element, Ruleset
+from powderdsl.syntax import yaml_tree
+from powderdsl.tasks.task import MAX_SIDE, Stamp
+from powderdsl.worlds.ascii import load_ascii, parse_ascii
+from powderdsl.worlds.image import read_image
+from powderdsl.worlds.scene import load_scene
+
+LEAVE = 255
+"""In a stamp: the cell stays as it is."""
+
+
+def read_stamp(key: yaml_tree.Scalar, node: yaml_tree.Node, reader: Reader, ruleset: Ruleset) -> Stamp | None:
+    """The picture of a stamp, or None after a report."""
+    entries = reader.mapping(node, "stamp", "a stamp")
+    art, scene = reader.scalar(entries, "art"), reader.scalar(entries, "scene")
+    if (art is None) == (scene is None):
+        label = "neither `art` nor `scene`" if art is None else "both `art` and `scene`"
+        reader.reporter.error("PD109", f"the stamp `{key.text}` needs one picture", key.span, label)
+        return None
+    ids: np.ndarray | None
+    if scene is not None:
+        ids = _named(scene, reader, ruleset)
+    else:
+        assert art is not None
+        ids = _drawn(art, _legend(entries, reader), reader, ruleset)
+    if ids is None:
+        return None
+    if max(ids.shape) > MAX_SIDE:
+        reader.reporter.error(
+            "PD607", f"a stamp of {ids.shape[0]}×{ids.shape[1]} cells", key.span, "too large"
+        )
+        return None
+    return Stamp(key.text, tuple(tuple(int(one) for one in row) for row in ids))
+
+
+def _legend(entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], reader: Reader) -> dict[str, str]:
+    node = entries["legend"][1] if "legend" in entries else None
+    found = {}
+    for key, value in node.entries if isinstance(node, yaml_tree.Mapping) else ():
+        if len(key.text) != 1 or not isinstance(value, yaml_tree.Scalar):
+            reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
+        else:
+            found[key.text] = value.text
+    return found
+
+
+def _drawn(
+    art: yaml_tree.Scalar, legend: dict[str, str], reader: Reader, ruleset: Ruleset
+) -> np.ndarray | None:
+    """ASCII art, in which `?` leaves cells as they are."""
+    hole = replace(ruleset.elements[0], name="?", pack="?", id=LEAVE, glyph="?")
+    elements: list[Element] = [one for one in ruleset.elements if one.id != LEAVE]
+    if art.style == "quoted" and art.content.text.split() != art.text.split():
+        helps = ["write `art: |`, and the rows below it"]
+        reader.reporter.error("PD107", "art with escapes", art.span, "quoted, on one line", helps=helps)
+        return None
+    span = art.content
+    try:
+        return parse_ascii(span, [*elements, hole], reader.reporter, {"?": "?", **legend})
+    except CompileError as error:
+        for one in error.diagnostics:
+            reader.reporter.error(one.code, one.message, one.primary.span or _first(art), helps=one.helps)
+    except ValueError as error:
+        reader.reporter.error("PD110", str(error), _first(art))
+    return None
+
+
+def _first(scalar: yaml_tree.Scalar) -> Span:
+    return scalar.span
+
+
+def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> np.ndarray | None:
+    """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
+    path = Path(word.text)
+    if path.is_absolute() or ".." in path.parts:
+        label = "pictures lie beside the task, or below it"
+        reader.reporter.error("PD101", f"`{word.text}` lies elsewhere", word.span, label)
+        return None
+    suffix = path.suffix.partition("#")[0].lower()
+    beside = str(Path(word.span.source.name).parent / word.text)
+    try:
+        if suffix == ".png":
+            return read_image(beside, ruleset.elements)
+        if suffix == ".txt":
+            return load_ascii(beside, ruleset.elements)
+        return load_scene(beside if suffix in (".yaml", ".yml") else word.text, ruleset)
+    except CompileError as error:
+        for one in error.diagnostics:
+            reader.reporter.error(one.code, one.message, word.span, notes=one.notes, helps=one.helps)
+    return None

@@ -1,0 +1,204 @@
+"""The checked task: resolved, ranges known, knobs filled in. Frozen; no torch, no NumPy but in stamps.
+
+`task_file.read_task` makes it from a file; `generator` and `episodes` run it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from powderdsl.diagnostics import Span
+from powderdsl.model.types import Expr, Ruleset
+from powderdsl.worlds.raster import Size
+from powderdsl.worlds.scene.amounts import Amount
+
+BLOW = -1
+"""Among the choices of an agent: blow, instead of placing an element."""
+
+NO_CHANGE = -2
+"""Among the choices of an agent: leave the world as it is."""
+
+MAX_SIDE = 1024
+"""Rows or columns of a task's worlds."""
+
+MAX_NUMBER = 4096
+"""Rows, columns, widths and radii of generated shapes lie within ±MAX_NUMBER."""
+
+MAX_REPEATS = 256
+"""Repetitions of one group."""
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A whole number that is set from outside: ``--lines 8``. `value` is what it is in this task."""
+
+    name: str
+    default: int
+    lo: int
+    hi: int
+    value: int
+    about: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One statement of a generator.
+
+    `number` is its place among all statements and enters the hash of its draws. `amounts` stand in the order of
+    `worlds.scene.statements.SHAPES`; None is an open end. One of `ids` is drawn uniformly, in the order given.
+    Only cells of the region `where` are painted, and only those that hold one of `over`.
+    """
+
+    number: int
+    kind: str
+    amounts: tuple[Amount | None, ...]
+    ids: tuple[int, ...]
+    where: str | None = None
+    over: frozenset[int] | None = None
+    stamp: str | None = None
+    span: Span | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Drawings that are made `count` times in a row (a number of repetitions that may be drawn), with own names."""
+
+    number: int
+    count: Amount
+    most: int
+    """The largest `count`."""
+    lets: tuple[tuple[str, Amount], ...]
+    drawings: tuple[Drawing, ...]
+
+
+@dataclass(frozen=True)
+class Region:
+    """A named set of cells: the union of some shapes. Its drawings have no element."""
+
+    name: str
+    shapes: tuple[Drawing, ...]
+    drawn: bool
+    """Whether it hangs on draws, so that every world has its own."""
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """A drawn or saved picture: rows of ids; 255 leaves a cell as it is."""
+
+    name: str
+    rows: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A picture that worlds can be compared with: what its drawings paint, and nothing where they do not."""
+
+    name: str
+    groups: tuple[Group, ...]
+
+
+@dataclass(frozen=True)
+class Generator:
+    """How a world starts: `fill` everywhere, then all groups in order. `lets` are draws that everything shares."""
+
+    name: str
+    fill: int
+    lets: tuple[tuple[str, Amount], ...]
+    groups: tuple[Group, ...]
+    regions: tuple[Region, ...]
+    targets: tuple[Target, ...]
+    stamps: tuple[Stamp, ...]
+
+
+@dataclass(frozen=True)
+class Split:
+    """A set of worlds: world `seed` comes from variant ``seed mod len(variants)``. Fixed scenes are variants."""
+
+    name: str
+    about: str
+    variants: tuple[Generator, ...]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """What an agent may do, and for how long.
+
+    An action is (x, y, choice, vx, vy). The block of `brush` (rows, columns) cells around the centre of bin
+    (y, x) of `bins` (rows, columns) is filled with the element ``choices[choice]``; where that is BLOW, its cells get
+    the motion ``speed · (vy − 1, vx − 1)`` as (rows, columns) in the field `speed_field`; where it is
+    NO_CHANGE, nothing happens.
+    """
+
+    choices: tuple[int, ...]
+    """Element ids, ascending, then BLOW, then NO_CHANGE. If every element may be placed, choice and id are the same number."""
+    brush: Size
+    bins: Size
+    actions: int
+    """Actions of an episode."""
+    steps_per_action: int
+    free_steps: int
+    """Steps that run inside the last action, after its own."""
+    speed_field: str | None
+    speed: float
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number taken of a whole world.
+
+    `how` is ``count sum mean share highest`` of the cell expression `value` over a region (all cells if None), or
+    ``match``: the share of a target's cells that hold its element.
+    """
+
+    how: str
+    value: Expr | None
+    region: str | None
+    target: str | None = None
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """Arithmetic on measures, one number a world.
+
+    `op`: ``const`` (value), ``measure`` (value: Measure), ``action`` (value: ``taken``, ``left``, ``painted``,
+    ``blown``, ``placed``), ``start`` and ``before`` (the argument at the start, and after the previous action),
+    ``add sub mul div mod neg abs min max lt le eq and or not choose``. Conditions are 0 or 1; x / 0 is 0.
+    """
+
+    op: str
+    args: tuple[Scalar, ...] = ()
+    value: Any = None
+    is_condition: bool = False
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What counts. `each` is given after every action, `final` with the last; conditions end an episode early."""
+
+    each: Scalar | None
+    final: Scalar | None
+    success: Scalar | None
+    failure: Scalar | None
+
+
+@dataclass(frozen=True)
+class Task:
+    """A checked task. `knobs` are filled in; `ruleset` has the task's parameters."""
+
+    name: str
+    about: str
+    ruleset: Ruleset
+    size: Size
+    knobs: tuple[Knob, ...]
+    agent: Agent
+    goal: Goal
+    splits: tuple[Split, ...]
+
+    def split(self, name: str) -> Split:
+        """The split of a name. Raises KeyError."""
+        for split in self.splits:
+            if split.name == name:
+                return split
+        raise KeyError(name)

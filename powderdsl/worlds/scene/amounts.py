@@ -1,0 +1,92 @@
+"""Whole numbers in statements: written out, named, drawn (`a..b`), and arithmetic on them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from powderdsl.diagnostics import Span
+
+Interval = tuple[int, int]
+"""Lowest and highest value."""
+
+
+@dataclass(frozen=True)
+class Amount:
+    """A number of a statement.
+
+    `op`: ``number`` (value: int), ``name`` (value: str), ``draw`` (two arguments: uniform, both ends included),
+    ``add sub mul div mod neg``; ``div`` and ``mod`` round down.
+    """
+
+    op: str
+    args: tuple[Amount, ...] = ()
+    value: int | str | None = None
+    span: Span | None = field(default=None, compare=False, repr=False)
+
+    def walk(self) -> Iterator[Amount]:
+        """This amount and everything in it."""
+        yield self
+        for arg in self.args:
+            yield from arg.walk()
+
+    @property
+    def is_number(self) -> bool:
+        return self.op == "number"
+
+
+def number(value: int, span: Span | None = None) -> Amount:
+    return Amount("number", (), value, span)
+
+
+def calculate(op: str, a: int, b: int) -> int:
+    """The value of an operation. Raises ZeroDivisionError."""
+    match op:
+        case "add":
+            return a + b
+        case "sub":
+            return a - b
+        case "mul":
+            return a * b
+        case "div":
+            return a // b
+        case "mod":
+            return a % b
+    raise AssertionError(op)
+
+
+def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
+    """The amount with named numbers filled in and arithmetic on numbers done. Raises ZeroDivisionError."""
+    if amount.op == "name" and amount.value in values:
+        return number(values[str(amount.value)], amount.span)
+    args = tuple(filled_in(arg, values) for arg in amount.args)
+    if args and all(arg.is_number for arg in args):
+        first, *rest = (int(arg.value or 0) for arg in args)
+        if amount.op == "neg":
+            return number(-first, amount.span)
+        if amount.op != "draw":
+            return number(calculate(amount.op, first, rest[0]), amount.span)
+        if first == rest[0]:
+            return number(first, amount.span)
+    return Amount(amount.op, args, amount.value, amount.span)
+
+
+def interval(amount: Amount, names: Mapping[str, Interval]) -> Interval:
+    """Bounds of what the amount can be. Raises KeyError for an unknown name, ZeroDivisionError if a divisor may be 0."""
+    if amount.op == "number":
+        value = int(amount.value or 0)
+        return value, value
+    if amount.op == "name":
+        return names[str(amount.value)]
+    first, *rest = (interval(arg, names) for arg in amount.args)
+    if amount.op == "neg":
+        return -first[1], -first[0]
+    second = rest[0]
+    if amount.op == "draw":
+        return min(first[0], second[0]), max(first[1], second[1])
+    if amount.op in ("div", "mod") and second[0] <= 0 <= second[1]:
+        raise ZeroDivisionError
+    if amount.op == "mod":
+        return (0, second[1] - 1) if second[0] > 0 else (second[0] + 1, 0)
+    corners = [calculate(amount.op, a, b) for a in first for b in second]
+    return min(corners), max(corners)
