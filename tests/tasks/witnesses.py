@@ -1,0 +1,144 @@
+"""Scripted players of the shipped tasks: short, and shown only what a person would see of a world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Cells = NDArray[np.bool_]
+Act = tuple[str | int, ...]
+"""A choice, and the row and column it is made at; of `blow` also its direction downwards and to the right, −1..1."""
+
+WAIT: Act = ("nothing", 0, 0)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One world before an action: ids uint8 [64, 64], the task's regions bool [64, 64], and the number of the action."""
+
+    ids: NDArray[np.uint8]
+    regions: Mapping[str, Cells]
+    elements: tuple[str, ...]
+    turn: int
+
+    def __getitem__(self, name: str) -> Cells:
+        """A region, or the cells that hold an element."""
+        return self.regions[name] if name in self.regions else self.ids == self.elements.index(name)
+
+
+def most(cells: Cells) -> tuple[int, int]:
+    """A cell in the middle of the 4×4 tile with most of the cells: the uppermost and leftmost of such tiles."""
+    tiles = cells.reshape(16, 4, 16, 4).sum((1, 3))
+    row, column = divmod(int(tiles.argmax()), 16)
+    return 4 * row + 2, 4 * column + 2
+
+
+def middle(cells: Cells) -> tuple[int, int]:
+    """The mean row and column of cells; (32, 32) of none."""
+    rows, columns = np.nonzero(cells)
+    return (int(rows.mean()), int(columns.mean())) if len(rows) else (32, 32)
+
+
+def burn_the_weeds(seen: Seen) -> Act:
+    return "fire", *most(seen["plant"])
+
+
+def dig_a_channel(seen: Seen) -> Act:
+    """Along the bottom of the lake, then straight down into the cave."""
+    (_, start), (bottom, end) = middle(seen["lake"]), middle(seen["cave"])
+    path = [(18, column) for column in range(start, end, 4 if end > start else -4)]
+    path += [(row, end) for row in range(18, bottom, 4)]
+    rock = ~(seen["empty"] | seen["water"])
+    closed = [(row, column) for row, column in path if rock[row, column]]
+    return ("empty", *closed[0]) if closed else WAIT
+
+
+def ice_bridge(seen: Seen) -> Act:
+    return "ice", *most(seen["bridge"] & ~seen["ice"])
+
+
+def build_an_arch(seen: Seen) -> Act:
+    """A scaffold of wood, stones on it; then the scaffold goes."""
+    beam, gap = seen["span"], seen["passage"]
+    under = gap & np.roll(beam, 4, 0)
+    if not (beam & ~seen["stone"]).any():
+        return "empty", *most(gap & ~seen["empty"])
+    if (under & ~seen["wood"]).any():
+        return "wood", *most(under & ~seen["wood"])
+    return "stone", *most(beam & ~seen["stone"])
+
+
+def blow_up_the_heap(seen: Seen) -> Act:
+    row, column = middle(seen["sand"] & seen["place"])
+    return ("dust" if seen.turn % 2 == 0 else "fire"), row + 3, column
+
+
+def greenhouses(seen: Seen) -> Act:
+    """Water into the house with the fewest plants, above them."""
+    house = min(("house_a", "house_b", "house_c"), key=lambda name: (seen[name] & seen["plant"]).sum())
+    row, column = middle(seen[house] & seen["plant"])
+    return "water", row - 4, column
+
+
+def keep_ice(seen: Seen) -> Act:
+    gap = seen["shell"] & ~seen["block"] & ~seen["wood"]
+    return ("wood", *most(gap)) if gap.any() else WAIT
+
+
+def sort_sand_and_stone(seen: Seen) -> Act:
+    """The uppermost layer first."""
+    on_top = (seen["sand"] | seen["stone"]) & ~seen["left_side"] & ~seen["right_side"]
+    if not on_top.any():
+        return WAIT
+    row = int(np.nonzero(on_top.any(1))[0][0])
+    sand = (seen["sand"] & on_top)[row].sum() > (seen["stone"] & on_top)[row].sum()
+    return "blow", row + 1, 32, 0, -1 if sand else 1
+
+
+def herd_gas(seen: Seen) -> Act:
+    gas = seen["gas"] & seen["outside"]
+    row, column = middle(gas)
+    hem = int(np.nonzero((seen["wall"] & ~seen["outside"])[1:63, 26:38].any(1))[0].max()) + 1
+    return "blow", row, column, int(row < hem + 6), int(row >= hem + 2)
+
+
+def firebreak(seen: Seen) -> Act:
+    left = middle(seen["fire"])[1] < 32
+    strip = np.zeros_like(seen["plant"])
+    strip[:, 24:28] = left
+    strip[:, 36:40] = not left
+    cells = strip & seen["plant"]
+    return ("empty", *most(cells)) if cells.any() else WAIT
+
+
+def quench_lava(seen: Seen) -> Act:
+    return "water", *most(seen["lava"])
+
+
+def prime_the_cloners(seen: Seen) -> Act:
+    """Water above the cloner of a tank that has none."""
+    for name in ("tank_a", "tank_b", "tank_c"):
+        if not (seen[name] & seen["water"]).any():
+            row, column = middle(seen[name] & seen["cloner"])
+            return "water", row - 4, column
+    return WAIT
+
+
+WITNESSES: dict[str, Callable[[Seen], Act]] = {
+    "burn-the-weeds": burn_the_weeds,
+    "dig-a-channel": dig_a_channel,
+    "ice-bridge": ice_bridge,
+    "build-an-arch": build_an_arch,
+    "blow-up-the-heap": blow_up_the_heap,
+    "greenhouses": greenhouses,
+    "keep-ice": keep_ice,
+    "sort-sand-and-stone": sort_sand_and_stone,
+    "herd-gas": herd_gas,
+    "firebreak": firebreak,
+    "quench-lava": quench_lava,
+    "prime-the-cloners": prime_the_cloners,
+}
+"""Who solves which task."""
