@@ -89,13 +89,13 @@ def keep_ice(seen: Seen) -> Act:
 
 
 def sort_sand_and_stone(seen: Seen) -> Act:
-    """The uppermost layer first."""
-    on_top = (seen["sand"] | seen["stone"]) & ~seen["left_side"] & ~seen["right_side"]
-    if not on_top.any():
-        return WAIT
-    row = int(np.nonzero(on_top.any(1))[0][0])
-    sand = (seen["sand"] & on_top)[row].sum() > (seen["stone"] & on_top)[row].sum()
-    return "blow", row + 1, 32, 0, -1 if sand else 1
+    """What lies on the uppermost shelf that is not empty, the larger part first; then a pause until it is calm."""
+    on_shelves = ~seen["left_side"] & ~seen["right_side"]
+    for shelf in (16, 34, 52):
+        sand, stone = ((seen[name] & on_shelves)[shelf - 10 : shelf].sum() for name in ("sand", "stone"))
+        if sand + stone > 0:
+            return "blow", shelf - 3, 32, 0, -1 if sand > stone else 1
+    return WAIT
 
 
 def herd_gas(seen: Seen) -> Act:
@@ -105,13 +105,11 @@ def herd_gas(seen: Seen) -> Act:
     return "blow", row, column, int(row < hem + 6), int(row >= hem + 2)
 
 
-def firebreak(seen: Seen) -> Act:
-    left = middle(seen["fire"])[1] < 32
-    strip = np.zeros_like(seen["plant"])
-    strip[:, 24:28] = left
-    strip[:, 36:40] = not left
-    cells = strip & seen["plant"]
-    return ("empty", *most(cells)) if cells.any() else WAIT
+def firewall(seen: Seen) -> Act:
+    """From the top downwards, well before the fire."""
+    column = 26 if middle(seen["fire"])[1] < 32 else 38
+    rows = np.nonzero(seen["plant"][:, column - 2 : column + 2].any(1))[0]
+    return ("wall", int(rows[0]), column) if len(rows) else WAIT
 
 
 def quench_lava(seen: Seen) -> Act:
@@ -137,7 +135,7 @@ WITNESSES: dict[str, Callable[[Seen], Act]] = {
     "keep-ice": keep_ice,
     "sort-sand-and-stone": sort_sand_and_stone,
     "herd-gas": herd_gas,
-    "firebreak": firebreak,
+    "firewall": firewall,
     "quench-lava": quench_lava,
     "prime-the-cloners": prime_the_cloners,
 }
