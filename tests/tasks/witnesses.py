@@ -99,10 +99,11 @@ def sort_sand_and_stone(seen: Seen) -> Act:
 
 
 def herd_gas(seen: Seen) -> Act:
-    gas = seen["gas"] & seen["outside"]
-    row, column = middle(gas)
-    hem = int(np.nonzero((seen["wall"] & ~seen["outside"])[1:63, 26:38].any(1))[0].max()) + 1
-    return "blow", row, column, int(row < hem + 6), int(row >= hem + 2)
+    """Down until it is below the curtain, then to the right."""
+    row, column = middle(seen["gas"] & seen["outside"])
+    curtain = seen["wall"] & ~seen["outside"] & ~seen["cage"]
+    hem = int(np.nonzero(curtain[1:63, 1:63].any(1))[0].max()) + 2
+    return "blow", row, column, int(row < hem + 5), int(row > hem)
 
 
 def firewall(seen: Seen) -> Act:
