@@ -222,6 +222,12 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_rgb": (None, [pointer, integer, integer, pointer, pointer, long]),
         "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
         "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
+        "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
+        "pd_fill": (None, [pointer, integer, integer, pointer, pointer]),
+        "pd_fill_real": (None, [pointer, integer, pointer, pointer]),
+        "pd_count_others": (None, [pointer, integer, integer, pointer, pointer, pointer]),
+        "pd_put": (None, [pointer, integer, integer, integer, pointer, integer, pointer]),
+        "pd_put_real": (None, [pointer, integer, pointer, long, integer, pointer]),
         "pd_run": (None, [pointer, long, integer, pointer, pointer, pointer, pointer, pointer]),
     }
     for name, (result, arguments) in signatures.items():

@@ -22,9 +22,26 @@ class PackedState(Mapping[str, Tensor]):
     def __init__(
         self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
     ):
-        self.program, self.handle, self.like = program, handle, like
+        self.program, self.like = program, like
+        self._handle: int | None = handle
         self._tensors: dict[str, Tensor] = {}
-        weakref.finalize(self, program.library.pd_free, handle)
+        self._free = weakref.finalize(self, program.library.pd_free, handle)
+
+    @property
+    def handle(self) -> int:
+        """The batch in native memory. Raises RuntimeError once it has been taken."""
+        if self._handle is None:
+            raise RuntimeError(
+                "these worlds were stepped with `reuse`: only those that came of it can be used"
+            )
+        return self._handle
+
+    def take(self) -> int:
+        """The batch, for another to own; this state must not be used afterwards."""
+        handle, self._handle = self.handle, None
+        self._free.detach()
+        self._tensors.clear()
+        return handle
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._tensors:
@@ -40,8 +57,7 @@ class PackedState(Mapping[str, Tensor]):
         """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
         program = self.program
         if out.dtype == torch.float32:
-            parts = (f"{name}.row", f"{name}.column") if out.ndim == 4 else (name,)
-            for i, part in enumerate(parts):
+            for i, part in enumerate(self._parts(name)):
                 first = out[:, i] if out.ndim == 4 else out
                 program.library.pd_store_real(
                     self.handle, program.layout.reals[part], address(first), out.stride(0)
@@ -52,6 +68,59 @@ class PackedState(Mapping[str, Tensor]):
                 self.handle, slot, bits, signed, out.element_size(), address(out), out.stride(0)
             )
         return out
+
+    def fill(self, name: str, blocks: Tensor, value: Tensor) -> None:
+        """One value in a block of cells of each world, in place.
+
+        Args:
+            blocks: int32 [B, 4]: first row, the one after the last, first column, the one after the last.
+            value: [B], or [B, 2] as (row, column) for vectors.
+        """
+        library, program = self.program.library, self.program
+        self._tensors.pop(name, None)
+        if self.like[name][0] == torch.float32:
+            for part, one in zip(
+                self._parts(name), value.float().view(len(blocks), -1).unbind(1), strict=True
+            ):
+                one = one.contiguous()
+                library.pd_fill_real(self.handle, program.layout.reals[part], address(blocks), address(one))
+        else:
+            slot, bits, _ = program.planes_of(name)
+            whole = value.to(torch.int32).contiguous()
+            library.pd_fill(self.handle, slot, bits, address(blocks), address(whole))
+
+    def count_others(self, name: str, blocks: Tensor, value: Tensor) -> Tensor:
+        """How many cells of each world's block do not hold a whole number: int64 [B]. Arguments as for `fill`."""
+        slot, bits, _ = self.program.planes_of(name)
+        whole, counts = value.to(torch.int32).contiguous(), torch.empty(len(blocks), dtype=torch.int64)
+        self.program.library.pd_count_others(
+            self.handle, slot, bits, address(blocks), address(whole), address(counts)
+        )
+        return counts
+
+    def put(self, places: Tensor, state: Mapping[str, Tensor]) -> None:
+        """The worlds `places`, int64 [n], replaced by those of another state, in place."""
+        library, program, count = self.program.library, self.program, len(places)
+        for name in self.like:
+            value = state[name].contiguous()
+            if value.dtype == torch.float32:
+                for i, part in enumerate(self._parts(name)):
+                    first = value[:, i] if value.ndim == 4 else value
+                    real = program.layout.reals[part]
+                    library.pd_put_real(
+                        self.handle, real, address(first), value.stride(0), count, address(places)
+                    )
+            else:
+                slot, bits, _ = program.planes_of(name)
+                library.pd_put(
+                    self.handle, slot, bits, value.element_size(), address(value), count, address(places)
+                )
+            if name in self._tensors:
+                self._tensors[name][places] = value
+
+    def _parts(self, name: str) -> tuple[str, ...]:
+        """The reals of a slot: two of a vector."""
+        return (f"{name}.row", f"{name}.column") if len(self.like[name][1]) == 4 else (name,)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.like)
@@ -82,7 +151,7 @@ class NativeProgram:
         seed, index, start = (part.contiguous() for part in job.clock)
         batch = len(seed)
         if isinstance(job.state, PackedState) and job.state.program is self:
-            handle = self.library.pd_copy(job.state.handle)
+            handle = job.state.take() if job.reuse else self.library.pd_copy(job.state.handle)
             like = job.state.like
         else:
             handle, like = self._pack(job.state)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.backends.torch_native import PackedState
 from powderdsl.simulator import Simulator, World
 from powderdsl.simulator import compile as compile_rules
 from powderdsl.tasks.shipped_tasks import check_split, load_task
@@ -116,8 +117,11 @@ class TaskProgram:
         if len(places) == 0:
             return episodes
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
-        new = self.start(seeds[places])
-        if len(places) == len(mask):
+        return self.put(episodes, places, self.start(seeds[places]), reuse=reuse)
+
+    def put(self, episodes: Episodes, places: Tensor, new: Episodes, *, reuse: bool = False) -> Episodes:
+        """The episodes with those of numbers `places`, int64 [n], replaced by `new` ones, in order. `reuse` as above."""
+        if len(places) == len(episodes):
             return new
 
         def placed(old: Tensor, fresh: Tensor) -> Tensor:
@@ -130,7 +134,11 @@ class TaskProgram:
             }
 
         world, other = episodes.world, new.world
-        state = {name: placed(value, other.state[name]) for name, value in world.state.items()}
+        state = world.state
+        if reuse and isinstance(state, PackedState):
+            state.put(places, other.state)
+        else:
+            state = {name: placed(value, other.state[name]) for name, value in state.items()}
         clock = [placed(getattr(world, name), getattr(other, name)) for name in ("seed", "index", "step")]
         return Episodes(
             World(self.simulator, state, *clock),
@@ -165,7 +173,7 @@ class TaskProgram:
         """
         agent, goal = self.task.agent, self.task.goal
         done = self._hands.act(episodes.world, actions, reuse=reuse)
-        world = self.simulator.step(done.world, agent.steps_per_action, params=params)
+        world = self.simulator.step(done.world, agent.steps_per_action, params=params, reuse=reuse)
         acted = episodes.acted + 1
         last = acted >= agent.actions
         if agent.free_steps:

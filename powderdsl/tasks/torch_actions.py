@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from powderdsl.backends.torch_native import PackedState
 from powderdsl.model.state import Slot
 from powderdsl.simulator import Simulator, World
 from powderdsl.tasks.task import WIND, Agent
@@ -31,6 +32,8 @@ class Hands:
         self.agent, self.size, self.device = agent, size, sim.device
         self.choices = torch.tensor(agent.choices, device=self.device)
         self._places = [self._lines(axis) for axis in (0, 1)]
+        self._blocks = [torch.stack([lines.amin(1), lines.amax(1) + 1], 1).int() for lines, _ in self._places]
+        """First row (or column) of each bin's brush, and the one after its last: int32 [bins, 2]."""
         self.places_elements = any(choice != WIND for choice in agent.choices)
         known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=self.device)
         fresh = sim.world(known[None]).state
@@ -88,6 +91,8 @@ class Hands:
         blown = choice == WIND
         rows, columns = (self._places[axis][0][actions[:, 1 - axis]] for axis in (0, 1))
         cells = (rows[:, :, None] * self.size[1] + columns[:, None]).flatten(1)
+        if reuse and isinstance(world.state, PackedState):
+            return self._act_packed(world, world.state, actions, choice, blown)
         state = dict(world.state)
         painted = torch.zeros_like(choice)
         if self.places_elements:
@@ -101,6 +106,22 @@ class Hands:
             self._blow(state, cells, actions, blown, reuse)
         return Done(replace(world, state=state), painted, (~blown).long(), blown.long())
 
+    def _act_packed(
+        self, world: World, state: PackedState, actions: Tensor, choice: Tensor, blown: Tensor
+    ) -> Done:
+        """The same where worlds lie packed: blocks are filled there."""
+        block = torch.cat([self._blocks[axis][actions[:, 1 - axis]] for axis in (0, 1)], 1)
+        ids, painted = choice.clamp(min=0), torch.zeros_like(choice)
+        if self.places_elements:
+            where = torch.where(blown[:, None], 0, block)
+            painted = state.count_others("element", where, ids)
+            for name, table in self._fresh.items():
+                state.fill(name, where, table[ids])
+        if self.agent.wind_field is not None:
+            where = torch.where(blown[:, None], block, 0)
+            state.fill(self.agent.wind_field, where, self._wind(actions))
+        return Done(world, painted, (~blown).long(), blown.long())
+
     def _place(
         self, state: dict[str, Tensor], cells: Tensor, choice: Tensor, blown: Tensor, reuse: bool
     ) -> None:
@@ -113,8 +134,11 @@ class Hands:
         self, state: dict[str, Tensor], cells: Tensor, actions: Tensor, blown: Tensor, reuse: bool
     ) -> None:
         name = str(self.agent.wind_field)
-        wind = self.agent.wind_speed * (actions[:, [4, 3]] - 1).to(state[name].dtype)
-        self._write(state, name, cells, wind, ~blown, reuse)
+        self._write(state, name, cells, self._wind(actions), ~blown, reuse)
+
+    def _wind(self, actions: Tensor) -> Tensor:
+        """The velocity of each action, float32 [B, 2]."""
+        return self.agent.wind_speed * (actions[:, [4, 3]] - 1).to(torch.float32)
 
     def _write(
         self,
