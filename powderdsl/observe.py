@@ -114,6 +114,20 @@ class Observer:
         return torch.stack(rows).to(self.device)
 
     @cached_property
+    def matrix_names(self) -> tuple[str, ...]:
+        """What the channels of `matrix` are: elements, properties and fields by name; ``name.row`` of vectors."""
+        elements = {element.id: element.name for element in self.ruleset.elements}
+        names: list[str] = []
+        for name in self.ruleset.matrix:
+            if name == "elements":
+                names.extend(elements.get(number, "") for number in range(self.ruleset.slots))
+            elif name in self.slots and self.slots[name].planes == 2:
+                names.extend(f"{name}.{part}" for part in ("row", "column"))
+            else:
+                names.append(name)
+        return tuple(names)
+
+    @cached_property
     def matrix_tables(self) -> tuple[tuple[int, ...], Tensor]:
         """The channels of `matrix` from those of `compact`: the channel that each is read from, and float32 [n, 256],
         what it is where that channel has a number. Fields that do not last read as 0."""
@@ -138,7 +152,7 @@ class Observer:
         return tuple(slot for slot in self.slots.values() if not slot.resets)
 
     def _floor(self, slot: Slot) -> float:
-        """Half of the smallest step of a slot's codes is 1/16 of this: 2⁻¹⁵ of the largest value, as a power of two."""
+        """Eight times the smallest step of a slot's codes: a power of two near 2⁻¹⁵ of its largest value."""
         return 2.0 ** (math.ceil(math.log2(max(abs(slot.kind.lo), abs(slot.kind.hi), 1e-3))) - 15)
 
     def planes(self, state: State, out: Any = None) -> Tensor:
