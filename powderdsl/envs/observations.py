@@ -62,10 +62,11 @@ def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
     if kind != "matrix":
         helps = suggest(str(kind), KINDS, "kinds") or ("kinds: " + ", ".join(KINDS),)
         raise ValueError(f"no observation {kind!r}; {'; '.join(helps)}")
-    sources, tables = observer.matrix_tables
-    reals = [abs(bound) for slot in observer.slots.values() for bound in (slot.kind.lo, slot.kind.hi)]
-    limit = max(float(tables.abs().max()), *reals)
-    box = Box(-limit, limit, (len(sources), *size), np.float32)
+    ruleset = simulator.ruleset
+    bounds = [abs(one) for slot in observer.slots.values() for one in (slot.kind.lo, slot.kind.hi)]
+    bounds += [float(observer.table(prop.name).abs().max()) for prop in ruleset.properties]
+    limit = max(ruleset.slots, *bounds)
+    box = Box(-limit, limit, (len(observer.matrix_names), *size), np.float32)
     return Observation(kind, box, observer.matrix_names)
 
 

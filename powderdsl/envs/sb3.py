@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from powderdsl.envs.frames import check_render_mode, frames
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.envs.vector import array
+from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 
 Array = NDArray[Any]
@@ -35,7 +36,7 @@ class PowderVecEnv(VecEnv):
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Task | TaskProgram,
         num_envs: int = 1,
         *,
         render_mode: str | None = None,

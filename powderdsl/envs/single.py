@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from powderdsl.envs.frames import RENDER_MODES, check_render_mode, frames
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.envs.vector import array
+from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 
 
@@ -30,7 +31,7 @@ class PowderEnv(gymnasium.Env[NDArray[Any], NDArray[np.int64]], EzPickle):
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 15}  # noqa: RUF012 as Gymnasium declares it
 
     def __init__(
-        self, task: str | Path | Task, *, render_mode: str | None = None, render_scale: int = 8, **how: Any
+        self, task: str | Path | Task | TaskProgram, *, render_mode: str | None = None, render_scale: int = 8, **how: Any
     ):
         EzPickle.__init__(self, task, render_mode=render_mode, render_scale=render_scale, **how)
         self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale

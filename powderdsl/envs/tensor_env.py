@@ -14,7 +14,7 @@ from torch import Tensor
 
 from powderdsl.backends.torch_random import MASK, mix
 from powderdsl.envs.observations import observation_of
-from powderdsl.tasks.episodes import Episodes, check_actions, compile_task, load_task
+from powderdsl.tasks.episodes import Episodes, TaskProgram, check_actions, compile_task, load_task
 from powderdsl.tasks.task import Task
 
 Info = dict[str, Any]
@@ -40,7 +40,8 @@ class TensorEnv:
     """`num_envs` episodes of a task at once. Nothing that it returns is written to later.
 
     Args:
-        task: name of a shipped task, path of a file, or a task.
+        task: name of a shipped task, path of a file, a task, or a program of one, which several environments can share;
+            a program has its split, knobs, parameters, backend and device already.
         split: which worlds: ``train``, ``test``, or another of the task's.
         observation: a kind of `observations.KINDS`.
         knobs: values for the task's knobs. params: for parameters of its rules, for good; `reset` sets them for a while.
@@ -59,7 +60,7 @@ class TensorEnv:
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Task | TaskProgram,
         num_envs: int = 1,
         *,
         split: str = "train",
@@ -79,20 +80,22 @@ class TensorEnv:
                 raise ValueError(f"{name} must be a whole number from 1, found {number!r}")
         if last_action not in LAST_ACTIONS:
             raise ValueError(f"last_action is one of {', '.join(LAST_ACTIONS)}; found {last_action!r}")
-        if isinstance(task, Task) and (knobs or params):
-            raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
-        found = task if isinstance(task, Task) else load_task(task, knobs=knobs, params=params)
-        self.program = compile_task(found, split=split, backend=backend, device=device, threads=threads)
-        self.task, self.split, self.num_envs, self.worlds = found, split, num_envs, worlds
+        if not isinstance(task, TaskProgram):
+            if isinstance(task, Task) and (knobs or params):
+                raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
+            found = task if isinstance(task, Task) else load_task(task, knobs=knobs, params=params)
+            task = compile_task(found, split=split, backend=backend, device=device, threads=threads)
+        self.program, self.task, self.split = task, task.task, task.split
+        self.num_envs, self.worlds = num_envs, worlds
         self.simulator = self.program.simulator
         self.device = self.simulator.device
         self.autoreset_mode = _mode(autoreset_mode)
-        self.observation = observation_of(observation, self.simulator, found.size)
+        self.observation = observation_of(observation, self.simulator, self.task.size)
         self.single_action_shape, self.action_nvec = (5,), self.program.action_nvec
         self.last_action_terminates = last_action == "terminates" or (
-            last_action == "auto" and found.goal.final is not None
+            last_action == "auto" and self.task.goal.final is not None
         )
-        self.actions = min(found.agent.actions, max_episode_steps or found.agent.actions)
+        self.actions = min(self.task.agent.actions, max_episode_steps or self.task.agent.actions)
         self.episodes: Episodes | None = None
         """The worlds as they are: to look at; their tensors are written to by the next call."""
         self.params: dict[str, Tensor] = {}

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from powderdsl.envs.frames import RENDER_MODES, check_render_mode, frames
 from powderdsl.envs.tensor_env import Info, TensorEnv
+from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 
 Array = NDArray[Any]
@@ -31,7 +32,7 @@ class PowderVectorEnv(VectorEnv[Any, Any, Any]):
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Task | TaskProgram,
         num_envs: int = 1,
         *,
         render_mode: str | None = None,

@@ -51,14 +51,14 @@ class TaskProgram:
         self.task, self.split, self.simulator = task, split, simulator
         device = simulator.device
         self._makers = [WorldMaker(one, task.size, device) for one in task.split(split).variants]
-        self._measures = measures_of(task.goal)
-        self._places = {measure: number for number, measure in enumerate(self._measures)}
+        self.measures = measures_of(task.goal)
+        self._places = {measure: number for number, measure in enumerate(self.measures)}
         fixed = self._makers[0].fixed_cells
         for maker in self._makers[1:]:
             same = maker.fixed_cells
             fixed = {n: v for n, v in fixed.items() if n in same and torch.equal(v, same[n])}
         self._fixed = fixed
-        self._meter = Meter(simulator.ruleset, self._measures, task.size, fixed, device)
+        self._meter = Meter(simulator.ruleset, self.measures, task.size, fixed, device)
         self._hands = Hands(simulator, task.agent, task.size)
         agent = task.agent
         self.action_nvec: tuple[int, int, int, int, int] = (
