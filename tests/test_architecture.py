@@ -31,7 +31,17 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_EVERYTHING = (*_TESTING, "properties", "pytest_plugin", "bench", "envs", "web", "experiments", "cli")
+_EVERYTHING = (
+    *_TESTING,
+    "properties",
+    "pytest_plugin",
+    "bench",
+    "tasks",
+    "envs",
+    "web",
+    "experiments",
+    "cli",
+)
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
@@ -63,9 +73,10 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "properties": (*_TESTING, "user_cache"),
     "pytest_plugin": (*_TESTING, "properties"),
     "bench": _SCREEN,
-    "envs": _SCREEN,
+    "tasks": (*_COMPILER, "simulator", "worlds"),
+    "envs": (*_SCREEN, "tasks"),
     "web": _SCREEN,
-    "experiments": (*_SCREEN, "envs", "web"),
+    "experiments": (*_SCREEN, "tasks", "envs", "web"),
     "cli": (*_EVERYTHING[:-1], "user_cache"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
@@ -81,7 +92,8 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("backends.torch_*", *_PROGRAMS, *_STEPS, "testing", "envs", "experiments")
+_TASKS = ("tasks.torch_*", "tasks.episodes")
+_TORCH = ("backends.torch_*", *_PROGRAMS, *_STEPS, "testing", *_TASKS, "envs", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),

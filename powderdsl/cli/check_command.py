@@ -20,6 +20,8 @@ from powderdsl.ledgers.account import ledger_data, ledger_text
 from powderdsl.ledgers.book import Ledger
 from powderdsl.ledgers.book import ledger as make_ledger
 from powderdsl.model.types import Ruleset
+from powderdsl.tasks.shipped_tasks import is_task, load_task_with_diagnostics
+from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:
     from powderdsl.ir.cost import PassCost
@@ -44,9 +46,10 @@ if TYPE_CHECKING:
 def command(
     rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool, cost: bool, ledger: bool
 ) -> int:
-    """Find the mistakes in rule files, all at once.
+    """Find the mistakes in rule files and tasks, all at once.
 
-    Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml.
+    Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml. A task is
+    a shipped one by name, or a file that begins with `task:`.
 
     Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
     """
@@ -56,11 +59,15 @@ def command(
     ledgers: dict[str, Ledger] = {}
     errors = warnings = 0
     for name in rules:
-        ruleset, diagnostics = _check(name)
+        found_task = _check_task(name) if is_task(name) else None
+        ruleset, diagnostics = _check(name) if found_task is None else (None, found_task[1])
         counts = Counter(one.severity for one in diagnostics)
         errors += counts[Severity.ERROR]
         warnings += counts[Severity.WARNING]
         found |= dict.fromkeys(one for one in diagnostics if notes or one.severity is not Severity.NOTE)
+        if found_task is not None:
+            lines.append(_task_summary(name, found_task[0], counts))
+            continue
         lines.append(_summary(name, ruleset, counts, notes))
         if cost and ruleset is not None:
             expenses[name] = _costs(ruleset)
@@ -94,6 +101,23 @@ def _check(name: str) -> tuple[Ruleset | None, tuple[Diagnostic, ...]]:
         return load_with_diagnostics(name)
     except CompileError as error:
         return None, error.diagnostics
+
+
+def _check_task(name: str) -> tuple[Task | None, tuple[Diagnostic, ...]]:
+    try:
+        return load_task_with_diagnostics(name)
+    except CompileError as error:
+        return None, error.diagnostics
+
+
+def _task_summary(name: str, task: Task | None, counts: Counter[Severity]) -> str:
+    """`name: 3 splits, no errors`."""
+    parts = [counted(counts[Severity.ERROR], "error")]
+    if task is not None:
+        parts = [counted(len(task.splits), "split"), *parts]
+    if counts[Severity.WARNING]:
+        parts.append(counted(counts[Severity.WARNING], "warning"))
+    return f"{task.name if task else name}: {', '.join(parts)}"
 
 
 def _costs(ruleset: Ruleset) -> tuple[PassCost, ...]:

@@ -5,20 +5,22 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import click
 
-from powderdsl.cli.exits import colour_wanted
-from powderdsl.cli.options import load_rules, rules_argument, set_option
+from powderdsl.cli.exits import BadInput, colour_wanted
+from powderdsl.cli.options import WholeType, load_rules, set_option
 from powderdsl.diagnostics import Span
 from powderdsl.model.reactions import reactions
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
 from powderdsl.model.types import Element, Param, Pass, Property, Ruleset, Value
+from powderdsl.tasks.shipped_tasks import is_task
 
 
 @click.command("show")
-@rules_argument
+@click.argument("rules", metavar="RULES|TASK")
 @click.option(
     "--format",
     "layout",
@@ -28,8 +30,37 @@ from powderdsl.model.types import Element, Param, Pass, Property, Ruleset, Value
     help="Tables, or one JSON object.",
 )
 @set_option
-def command(rules: str, layout: str, settings: dict[str, str]) -> None:
-    """List elements, reactions, passes and parameters."""
+@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
+@click.option("--split", default="train", show_default=True, help="Of a task: which worlds.")
+@click.option(
+    "--seeds", type=WholeType(1, 256), default=16, show_default=True, help="Of a task: how many worlds."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Of a task: draw these worlds, with regions outlined.",
+)
+def command(
+    rules: str,
+    layout: str,
+    settings: dict[str, str],
+    knobs: tuple[str, ...],
+    split: str,
+    seeds: int,
+    out: Path | None,
+) -> None:
+    """List elements, reactions, passes and parameters; or what a task is, with pictures.
+
+    TASK is a shipped task's name, or a file that begins with `task:`.
+    """
+    if is_task(rules):
+        from powderdsl.cli.task_sheets import show_task
+
+        show_task(rules, layout, settings, knobs, split, seeds, out)
+        return
+    if out is not None or knobs:
+        raise BadInput("--out and --knob go with a task")
     ruleset = load_rules(rules, settings)
     if layout == "json":
         click.echo(json.dumps(_data(ruleset), indent=2, ensure_ascii=False))

@@ -93,6 +93,12 @@ _ROWS = (
     ("PD613", "file-not-writable", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),
+    # PD8xx: tasks
+    ("PD801", "unknown-task", _ERROR),
+    ("PD802", "unknown-task-name", _ERROR),
+    ("PD803", "invalid-knob", _ERROR),
+    ("PD804", "invalid-agent", _ERROR),
+    ("PD805", "constant-reward", _WARNING),
     # PD9xx: our own mistakes
     ("PD901", "internal-error", _ERROR),
 )

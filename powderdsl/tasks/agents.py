@@ -10,15 +10,15 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.tasks.drawings import choice_ids
 from powderdsl.tasks.statement_lists import text_span
-from powderdsl.tasks.task import WIND, Agent
+from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene.statements import read_choice
 
 MAX_ACTIONS = 1_000_000
 MAX_STEPS = 100_000
 MAX_SPEED = 1_000_000.0
-WIND_WORD = "wind"
-"""What `may:` calls blowing."""
+ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
+"""What `may:` calls what is no element."""
 
 
 def read_agent(
@@ -31,12 +31,12 @@ def read_agent(
     if not entries:
         return None
     choices = _choices(reader, entries, ruleset)
-    speed = _speed(reader, entries)
-    field = _wind_field(reader, entries, ruleset, WIND in choices, entry[0].span)
-    if WIND in choices and speed is None and "wind" not in entries:
-        helps = ["`wind: 20` is the paper's"]
+    speed = _read_speed(reader, entries)
+    field = _speed_field(reader, entries, ruleset, BLOW in choices, entry[0].span)
+    if BLOW in choices and speed is None and "speed" not in entries:
+        helps = ["`speed: 20` is the paper's"]
         reader.reporter.error(
-            "PD109", "an agent that may blow lacks `wind`", entry[0].span, "how fast?", helps=helps
+            "PD109", "an agent that may blow lacks `speed`", entry[0].span, "how fast?", helps=helps
         )
     brush, bins = _pair(reader, entries, "brush", 10, size), _pair(reader, entries, "bins", 16, size)
     actions = reader.number(entries, "actions", 1, MAX_ACTIONS)
@@ -57,13 +57,13 @@ def read_agent(
 def _choices(
     reader: Reader, entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], ruleset: Ruleset
 ) -> tuple[int, ...]:
-    """Element ids ascending, wind last."""
+    """Element ids ascending, then what is no element."""
     found: set[int] = set()
-    blows = False
+    acts: set[int] = set()
     words = reader.words(entries["may"][1]) if "may" in entries else ()
     for word in words:
-        if word.text == WIND_WORD:
-            blows = True
+        if word.text in ACTS:
+            acts.add(ACTS[word.text])
             continue
         span = text_span(word, reader.reporter)
         choice = read_choice(span, reader.reporter) if span is not None else None
@@ -72,33 +72,33 @@ def _choices(
     if "may" in entries and not words:
         label = "nothing is allowed"
         reader.reporter.error("PD804", "an agent that may do nothing", entries["may"][0].span, label)
-    return (*sorted(found), *([WIND] if blows else []))
+    return (*sorted(found), *sorted(acts, reverse=True))
 
 
-def _speed(reader: Reader, entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]]) -> float | None:
-    value = reader.scalar(entries, "wind")
+def _read_speed(reader: Reader, entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]]) -> float | None:
+    value = reader.scalar(entries, "speed")
     if value is None:
         return None
     if not re.fullmatch(r"-?[0-9]{1,7}(\.[0-9]{1,6})?", value.text) or float(value.text) == 0:
-        reader.reporter.error("PD110", "`wind` must be a number other than 0", value.span, "such as `20`")
+        reader.reporter.error("PD110", "`speed` must be a number other than 0", value.span, "such as `20`")
         return None
     return float(value.text)
 
 
-def _wind_field(
+def _speed_field(
     reader: Reader,
     entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]],
     ruleset: Ruleset,
     blows: bool,
     span: Span,
 ) -> str | None:
-    """The vector that wind sets: the one named, or the only one there is."""
+    """The vector that blowing sets: the one named, or the only one there is."""
     vectors = [one.name for one in ruleset.fields if one.kind.name == "vec2" and not one.resets]
-    named = reader.scalar(entries, "wind_field")
+    named = reader.scalar(entries, "speed_field")
     if named is not None and named.text not in vectors:
         helps = suggest(named.text, vectors, "vectors of these rules")
         message = f"`{named.text}` is no vector field"
-        reader.reporter.error("PD804", message, named.span, "wind sets a vector", helps=helps)
+        reader.reporter.error("PD804", message, named.span, "blowing sets a vector", helps=helps)
         return None
     if not blows:
         return None
@@ -106,12 +106,14 @@ def _wind_field(
         return named.text
     if len(vectors) != 1:
         message = (
-            "these rules have no field that wind could set"
+            "these rules have no field that blowing could set"
             if not vectors
-            else "wind could set several fields"
+            else "blowing could set several fields"
         )
         helps = (
-            [f"`wind_field`: one of {', '.join(vectors)}"] if vectors else ["load a pack with a vector field"]
+            [f"`speed_field`: one of {', '.join(vectors)}"]
+            if vectors
+            else ["load a pack with a vector field"]
         )
         reader.reporter.error("PD804", message, span, "which one?" if vectors else "no vector", helps=helps)
         return None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.types import Ruleset
-from powderdsl.tasks.statement_lists import Item, Repeat
+from powderdsl.tasks.statement_lists import BROKEN, Item, Repeat
 from powderdsl.tasks.task import MAX_NUMBER, MAX_REPEATS, Drawing, Generator, Group, Region, Stamp, Target
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.scene.amounts import Amount, Interval, filled_in, interval, number
@@ -31,6 +31,8 @@ class Plan:
     parts: Mapping[str, Sequence[Item]]
     targets: Mapping[str, Sequence[Item]]
     items: Sequence[Item]
+    broken: frozenset[str] = frozenset()
+    """Knobs whose definition has been reported."""
 
 
 @dataclass
@@ -43,6 +45,8 @@ class Drawer:
     reporter: Reporter
     names: dict[str, Interval] = field(default_factory=dict)
     used_parts: set[str] = field(default_factory=set)
+    broken: set[str] = field(default_factory=set)
+    """Names whose definition has been reported: using them is no second mistake."""
     count: int = 0
     cells: int = 0
 
@@ -61,9 +65,11 @@ class Drawer:
         """Named numbers in order; `names` gets their bounds."""
         found = []
         for word, amount in written:
-            filled = self.filled(amount, names)
+            filled = self.filled(amount, names) if amount is not BROKEN else None
             names[word.text] = (0, 0)
-            if filled is not None:
+            if filled is None:
+                self.broken.add(word.text)
+            else:
                 names[word.text] = self.bounds(filled, names)
                 found.append((word.text, filled))
         return tuple(found)
@@ -167,6 +173,8 @@ class Drawer:
 
     def filled(self, amount: Amount, names: Mapping[str, Interval]) -> Amount | None:
         """The amount with knobs filled in, or None after reporting names that nothing defines."""
+        if any(part.value in self.broken or part.value in self.plan.broken for part in amount.walk()):
+            return None
         known = {**dict.fromkeys(names), **dict.fromkeys(self.plan.knobs)}
         unknown = [part for part in amount.walk() if part.op == "name" and part.value not in known]
         for part in unknown:
@@ -218,7 +226,7 @@ class Drawer:
             assert start is not None
             low = self.bounds(start, names)[0]
             high = self.size[i] if stop is None else self.bounds(stop, names)[1]
-            if low >= high or low >= self.size[i] or high <= 0:
+            if low >= high or start == stop or low >= self.size[i] or high <= 0:
                 never = "rows" if i == 0 else "columns"
         if all(one is None or one.is_number for one in amounts) and drawing.kind not in ("scatter", "stamp"):
             values = [None if one is None else int(one.value or 0) for one in amounts]
@@ -281,8 +289,3 @@ def element_ids(word: Word, ruleset: Ruleset, reporter: Reporter) -> tuple[int, 
         label = "neither an element nor a tag of these rules"
         reporter.error("PD604", f"unknown element `{word.text}`", word.span, label, helps=helps)
     return tagged
-
-
-def changed(plan: Plan, **sections: object) -> Plan:
-    """The plan with other sections: what a split or a stand says."""
-    return replace(plan, **sections)  # type: ignore[arg-type]

@@ -61,7 +61,11 @@ def _drawn(
     """ASCII art, in which `?` leaves cells as they are."""
     hole = replace(ruleset.elements[0], name="?", pack="?", id=LEAVE, glyph="?")
     elements: list[Element] = [one for one in ruleset.elements if one.id != LEAVE]
-    span = art.content if art.style == "block" else art.span
+    if art.style == "quoted" and art.content.text.split() != art.text.split():
+        helps = ["write `art: |`, and the rows below it"]
+        reader.reporter.error("PD107", "art with escapes", art.span, "quoted, on one line", helps=helps)
+        return None
+    span = art.content
     try:
         return parse_ascii(span, [*elements, hole], reader.reporter, {"?": "?", **legend})
     except CompileError as error:

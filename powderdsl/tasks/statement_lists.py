@@ -10,6 +10,9 @@ from powderdsl.syntax import yaml_tree
 from powderdsl.worlds.scene.amounts import Amount
 from powderdsl.worlds.scene.statements import Statement, Word, read_amount, read_statement
 
+BROKEN = Amount("broken")
+"""A number whose mistake has been reported: what hangs on it is no second one."""
+
 MAX_STATEMENTS = 2_000
 """Statements of one list."""
 
@@ -90,16 +93,14 @@ def _repeat(item: yaml_tree.Mapping, reader: Reader) -> Repeat | None:
 
 
 def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Word, Amount]]:
-    """The names of a `let:` and their numbers, in order."""
+    """The names of a `let:` and their numbers, in order; BROKEN after a report."""
     found = []
     for key, value in reader.named(node, "a number"):
         if not isinstance(value, yaml_tree.Scalar):
             reader.shape(value, "a number")
-            continue
         span = text_span(value, reader.reporter)
         amount = read_amount(span, reader.reporter) if span is not None else None
-        if amount is not None:
-            found.append((Word(key.text, key.span), amount))
+        found.append((Word(key.text, key.span), amount or BROKEN))
     return found
 
 

@@ -13,8 +13,11 @@ from powderdsl.model.types import Expr, Ruleset
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene.amounts import Amount
 
-WIND = -1
+BLOW = -1
 """Among the choices of an agent: blow, instead of placing an element."""
+
+NO_CHANGE = -2
+"""Among the choices of an agent: leave the world as it is."""
 
 MAX_SIDE = 1024
 """Rows or columns of a task's worlds."""
@@ -123,12 +126,13 @@ class Agent:
     """What an agent may do, and for how long.
 
     An action is (x, y, choice, vx, vy). The block of `brush` (rows, columns) cells around the centre of bin
-    (y, x) of `bins` (rows, columns) is filled with the element ``choices[choice]``, or, where that is WIND, its
-    cells get the velocity ``wind_speed · (vy − 1, vx − 1)`` as (rows, columns) in the field `wind_field`.
+    (y, x) of `bins` (rows, columns) is filled with the element ``choices[choice]``; where that is BLOW, its cells get
+    the velocity ``speed · (vy − 1, vx − 1)`` as (rows, columns) in the field `speed_field`; where it is
+    NO_CHANGE, nothing happens.
     """
 
     choices: tuple[int, ...]
-    """Element ids, ascending; WIND last. If every element may be placed, choice and id are the same number."""
+    """Element ids, ascending, then BLOW, then NO_CHANGE. If every element may be placed, choice and id are the same number."""
     brush: Size
     bins: Size
     actions: int
@@ -136,8 +140,8 @@ class Agent:
     steps_per_action: int
     free_steps: int
     """Steps that run inside the last action, after its own."""
-    wind_field: str | None
-    wind_speed: float
+    speed_field: str | None
+    speed: float
 
 
 @dataclass(frozen=True)

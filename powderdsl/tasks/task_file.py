@@ -22,7 +22,7 @@ from powderdsl.tasks.agents import read_agent
 from powderdsl.tasks.drawings import Drawer, Plan, element_ids
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.stamps import read_stamp
-from powderdsl.tasks.statement_lists import read_items, read_lets, text_span
+from powderdsl.tasks.statement_lists import BROKEN, read_items, read_lets, text_span
 from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Scalar, Split, Stamp, Task
 from powderdsl.tasks.task_keys import TASK_KEYS
 from powderdsl.worlds.raster import Size
@@ -109,6 +109,7 @@ class _TaskReader:
         self.reader, self.reporter, self.entries = reader, reader.reporter, entries
         self.ruleset, self.typer, self.given = ruleset, typer, given
         self.taken: dict[str, Span] = {}
+        self.broken: set[str] = set()
 
     def task(self) -> Task:
         name = self.reader.scalar(self.entries, "task")
@@ -129,6 +130,7 @@ class _TaskReader:
             self.lists("parts", "a part"),
             self.lists("targets", "a target"),
             read_items(self.node("generate"), self.reader),
+            frozenset(self.broken),
         )
         splits, used = self.splits(plan, size)
         agent = read_agent(self.reader, self.entries.get("agent"), self.ruleset, size)
@@ -189,6 +191,7 @@ class _TaskReader:
         found: dict[str, Knob] = {}
         for key, node in self.reader.named(self.node("knobs"), "a knob"):
             self.take(key)
+            self.broken.add(key.text)
             entries = self.reader.mapping(node, "knob", "a knob")
             bounds = self.amount(self.reader.scalar(entries, "range"))
             default = self.amount(self.reader.scalar(entries, "default"))
@@ -221,6 +224,7 @@ class _TaskReader:
                 if not low <= one <= high:
                     message = f"the knob `{key.text}` must lie in {low}..{high}"
                     self.reporter.error("PD803", message, span, f"{one} lies outside", notes=[f"it is {one}"])
+            self.broken.discard(key.text)
             found[key.text] = Knob(key.text, usual, low, high, chosen, about, key.span)
         for name in self.given:
             if name not in self.taken:
@@ -307,6 +311,8 @@ class _TaskReader:
             values = dict(plan.knobs)
             for word, amount in read_lets(entries["knobs"][1], self.reader):
                 self.known(word, plan.knobs, "knob")
+                if amount is BROKEN:
+                    continue
                 filled = filled_in(amount, plan.knobs)
                 if filled.is_number:
                     values[word.text] = int(filled.value or 0)

@@ -11,7 +11,7 @@ from torch import Tensor
 from powderdsl.backends.torch_native import PackedState
 from powderdsl.model.state import Slot
 from powderdsl.simulator import Simulator, World
-from powderdsl.tasks.task import WIND, Agent
+from powderdsl.tasks.task import BLOW, Agent
 from powderdsl.worlds.raster import Size
 
 
@@ -34,7 +34,7 @@ class Hands:
         self._places = [self._lines(axis) for axis in (0, 1)]
         self._blocks = [torch.stack([lines.amin(1), lines.amax(1) + 1], 1).int() for lines, _ in self._places]
         """First row (or column) of each bin's brush, and the one after its last: int32 [bins, 2]."""
-        self.places_elements = any(choice != WIND for choice in agent.choices)
+        self.places_elements = any(choice >= 0 for choice in agent.choices)
         known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=self.device)
         fresh = sim.world(known[None]).state
         self._fresh: dict[str, Tensor] = {}
@@ -88,11 +88,11 @@ class Hands:
     def act(self, world: World, actions: Tensor, *, reuse: bool) -> Done:
         """The worlds after actions, int64 [B, 5], within their bounds. `reuse` writes into the world's own tensors."""
         choice = self.choices[actions[:, 2]]
-        blown = choice == WIND
+        blown, placed = choice == BLOW, choice >= 0
         rows, columns = (self._places[axis][0][actions[:, 1 - axis]] for axis in (0, 1))
         cells = (rows[:, :, None] * self.size[1] + columns[:, None]).flatten(1)
         if reuse and isinstance(world.state, PackedState):
-            return self._act_packed(world, world.state, actions, choice, blown)
+            return self._act_packed(world, world.state, actions, choice)
         state = dict(world.state)
         painted = torch.zeros_like(choice)
         if self.places_elements:
@@ -100,45 +100,44 @@ class Hands:
             old = state["element"].flatten(1).gather(1, cells)
             new = choice.clamp(min=0).to(torch.uint8)[:, None]
             differs = (old != new) & (inside[0][:, :, None] & inside[1][:, None]).flatten(1)
-            painted = (differs & ~blown[:, None]).sum(1)
-            self._place(state, cells, choice, blown, reuse)
-        if self.agent.wind_field is not None:
+            painted = (differs & placed[:, None]).sum(1)
+            self._place(state, cells, choice, ~placed, reuse)
+        if self.agent.speed_field is not None:
             self._blow(state, cells, actions, blown, reuse)
-        return Done(replace(world, state=state), painted, (~blown).long(), blown.long())
+        return Done(replace(world, state=state), painted, placed.long(), blown.long())
 
-    def _act_packed(
-        self, world: World, state: PackedState, actions: Tensor, choice: Tensor, blown: Tensor
-    ) -> Done:
+    def _act_packed(self, world: World, state: PackedState, actions: Tensor, choice: Tensor) -> Done:
         """The same where worlds lie packed: blocks are filled there."""
         block = torch.cat([self._blocks[axis][actions[:, 1 - axis]] for axis in (0, 1)], 1)
+        blown, placed = choice == BLOW, choice >= 0
         ids, painted = choice.clamp(min=0), torch.zeros_like(choice)
         if self.places_elements:
-            where = torch.where(blown[:, None], 0, block)
+            where = torch.where(placed[:, None], block, 0)
             painted = state.count_others("element", where, ids)
             for name, table in self._fresh.items():
                 state.fill(name, where, table[ids])
-        if self.agent.wind_field is not None:
+        if self.agent.speed_field is not None:
             where = torch.where(blown[:, None], block, 0)
-            state.fill(self.agent.wind_field, where, self._wind(actions))
-        return Done(world, painted, (~blown).long(), blown.long())
+            state.fill(self.agent.speed_field, where, self._speed(actions))
+        return Done(world, painted, placed.long(), blown.long())
 
     def _place(
-        self, state: dict[str, Tensor], cells: Tensor, choice: Tensor, blown: Tensor, reuse: bool
+        self, state: dict[str, Tensor], cells: Tensor, choice: Tensor, unchanged: Tensor, reuse: bool
     ) -> None:
         """Fresh cells of the chosen elements in everything that travels with elements."""
         ids = choice.clamp(min=0)
         for name, table in self._fresh.items():
-            self._write(state, name, cells, table[ids], blown, reuse)
+            self._write(state, name, cells, table[ids], unchanged, reuse)
 
     def _blow(
         self, state: dict[str, Tensor], cells: Tensor, actions: Tensor, blown: Tensor, reuse: bool
     ) -> None:
-        name = str(self.agent.wind_field)
-        self._write(state, name, cells, self._wind(actions), ~blown, reuse)
+        name = str(self.agent.speed_field)
+        self._write(state, name, cells, self._speed(actions), ~blown, reuse)
 
-    def _wind(self, actions: Tensor) -> Tensor:
-        """The velocity of each action, float32 [B, 2]."""
-        return self.agent.wind_speed * (actions[:, [4, 3]] - 1).to(torch.float32)
+    def _speed(self, actions: Tensor) -> Tensor:
+        """What each action blows with, as (rows, columns): float32 [B, 2]."""
+        return self.agent.speed * (actions[:, [4, 3]] - 1).to(torch.float32)
 
     def _write(
         self,

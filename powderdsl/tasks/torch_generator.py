@@ -27,8 +27,8 @@ NOTHING = 255
 CHUNK_CELLS = 1 << 20
 """Cells of the worlds that are made together on the CPU: their words fit its cache."""
 
-DENSITY_BITS = 16
-"""Scattered cells are drawn with that many bits: densities are multiples of 2⁻¹⁶."""
+CHANCE_BITS = 16
+"""Scattered cells are drawn with that many bits: chances are multiples of 2⁻¹⁶."""
 
 _NUMBERS, _STATEMENT, _COUNTER, _INDEX = 64, 0x9E3779B1, 0x85EBCA6B, 0x7A51
 """Draws of one statement and repetition; odd factors that spread counters; the worlds' index of `base_keys`, which
@@ -300,24 +300,24 @@ class _Painter:
         return picture[index[0][:, :, None], index[1][:, None, :]]
 
     def _scattered(self, repeat: int) -> Tensor:
-        """Words [B, W, K] in which each bit is set with the chance of `density` in a hundred.
+        """Words [B, W, K] in which each bit is set with the chance of `chance` in a hundred.
 
-        A draw of DENSITY_BITS bits is compared with the threshold from the last bit to the first, 64 cells at once.
+        A draw of CHANCE_BITS bits is compared with the threshold from the last bit to the first, 64 cells at once.
         """
         percent = self.numbers[0]
         assert percent is not None
-        limit = (percent[:, repeat, None] << DENSITY_BITS) // 100
+        limit = (percent[:, repeat, None] << CHANCE_BITS) // 100
         width, words = self.maker.size[1], self.maker.words
         halves = torch.arange(2 * width * words, device=limit.device)
         below = torch.zeros_like(halves)[None]
-        for place in range(DENSITY_BITS):
+        for place in range(CHANCE_BITS):
             counters = (
-                ((halves + 1) * DENSITY_BITS + place) * (_NUMBERS * 256) + repeat * _NUMBERS + _NUMBERS - 1
+                ((halves + 1) * CHANCE_BITS + place) * (_NUMBERS * 256) + repeat * _NUMBERS + _NUMBERS - 1
             )
             drawn = self.draws.hashes.draw(self.drawing.number, counters)
             bit = -(limit >> place & 1)
             below = (bit & ~drawn) | (~(bit ^ drawn) & below)
-        below = torch.where(limit >> DENSITY_BITS > 0, -1, below) & MASK
+        below = torch.where(limit >> CHANCE_BITS > 0, -1, below) & MASK
         low, high = below.view(-1, width, words, 2).unbind(-1)
         return low | high << 32
 

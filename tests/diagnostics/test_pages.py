@@ -3,7 +3,8 @@
 A page has a wrong example and, mostly, the mended one:
 
 * ``yaml wrong`` and ``yaml right`` are rule files; ``# with: core`` at the top names packs to load with them.
-* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII; both use the rules of the paper.
+* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task; all use the
+  rules of the paper.
 * ``text`` is the message itself, for what no file can show; `SITUATIONS` brings it about.
 
 The text under the caret stands in the example, in a comment ``# ^ text`` below it.
@@ -28,6 +29,7 @@ from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
+from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.files import replacing
 from powderdsl.worlds.image import read_image
@@ -92,6 +94,8 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
         if "scene" in one.info.split():
             load_scene(path, paper_rules())
             return ()
+        if "task" in one.info.split():
+            return load_task_with_diagnostics(path)[1]
         if "world" in one.info.split():
             read_ascii(one.text, paper_rules().elements, name="page.txt")
             return ()
@@ -239,6 +243,7 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD609": read_a_soft_picture,
     "PD612": write_a_film_without_the_package,
     "PD613": write_into_no_folder,
+    "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }
 """How to bring about each message that a page shows."""

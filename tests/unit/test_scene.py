@@ -11,20 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
-from powderdsl.worlds.raster import (
-    MAX_COORDINATE,
-    Arch,
-    Box,
-    Container,
-    Disk,
-    Frame,
-    Line,
-    Ramp,
-    Square,
-    Wave,
-    mask,
-    paint,
-)
+from powderdsl.worlds.raster import MAX_COORDINATE, Box, Disk, Frame, Line, mask, paint
 from powderdsl.worlds.scene import (
     STATEMENTS,
     find_scene,
@@ -193,17 +180,6 @@ def test_every_statement_is_written_as_its_help_says():
         assert type(statement(usage).shape).__name__.lower() == {"fill": "box"}.get(name, name)
 
 
-def test_the_shapes_of_generators():
-    ramp = ["......", "...x..", "..xx..", ".xxx..", "......"]
-    assert picture(mask(Ramp((3, 1), (1, 3)), (5, 6))) == ramp
-    assert picture(mask(Ramp((1, 3), (3, 1)), (5, 6))) == ramp
-    assert picture(mask(Ramp((1, 1), (3, 1)), (5, 3))) == ["...", ".x.", ".x.", ".x.", "..."]
-    assert picture(mask(Square((2, 2), 1), (4, 4))) == ["....", ".xx.", ".xx.", "...."]
-    assert picture(mask(Arch((1, 4), (0, 4), 1), (4, 5))) == [".....", "xxxx.", "x..x.", "x..x."]
-    assert picture(mask(Container((0, None), (1, None), 1), (3, 5))) == [".x..x", ".x..x", ".xxxx"]
-    assert picture(mask(Wave(1, 2, 4, 0), (4, 8))) == ["........", "x...x...", "xx.xxx.x", "xxxxxxxx"]
-
-
 # Files
 
 
@@ -342,7 +318,7 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("frame", "PD605", "\n"),
         ("frame wall wall", "PD605", "wall"),
         ("heap wall", "PD605", "heap"),
-        ("scatter sand density 5%", "PD605", "scatter sand density 5%"),
+        ("scatter sand chance 5%", "PD605", "scatter sand chance 5%"),
         ("part rocks", "PD605", "part rocks"),
         ("disk (any but sand) at (1, 1) radius 2", "PD605", "(any but sand)"),
         ("disk sand at (1..3, 1) radius 2", "PD605", "1..3"),

@@ -16,6 +16,7 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedTok
 from lark.utils import TextSlice
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
+from powderdsl.syntax.hints import CUT, was_cut
 from powderdsl.worlds.raster import MAX_COORDINATE
 from powderdsl.worlds.scene.amounts import Amount, number
 
@@ -38,7 +39,7 @@ STATEMENTS = {
 
 GENERATOR_STATEMENTS = {
     **STATEMENTS,
-    "scatter": "scatter ELEMENT density NUMBER%",
+    "scatter": "scatter ELEMENT chance NUMBER%",
     "stamp": "stamp NAME at (ROW, COLUMN)",
     "part": "part NAME",
 }
@@ -57,7 +58,7 @@ NUMBERS: dict[str, tuple[tuple[str, int], ...]] = {
     "wave": (("a row", -MAX_COORDINATE), ("a height", 0), ("a length", 2), ("a phase", -MAX_COORDINATE)),
     "frame": (),
     "fill": (),
-    "scatter": (("a density", 0),),
+    "scatter": (("a chance", 0),),
     "stamp": _POINT,
     "part": (),
 }
@@ -328,6 +329,8 @@ def _report_syntax(error: UnexpectedInput, statement: Span, reporter: Reporter) 
 
 def _usage(statement: Span) -> tuple[str, ...]:
     """How the statement is written, if its first word says which it is; otherwise the word that was meant."""
+    if was_cut(statement.source.text, statement.start, statement.end):
+        return (CUT,)
     word = next(iter(statement.text.split(maxsplit=1)), "")
     if word in GENERATOR_STATEMENTS:
         return (GENERATOR_STATEMENTS[word],)

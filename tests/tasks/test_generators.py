@@ -1,0 +1,299 @@
+"""Generated worlds: functions of their seed alone, drawn uniformly, laid out as the paper's tasks are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.tasks.shipped_tasks import load_task, shipped_tasks
+from powderdsl.tasks.task_file import read_task
+from powderdsl.worlds.raster import mask
+from powderdsl.worlds.scene import load_scenes
+from powderdsl.worlds.scene.fixed import shape_of
+
+ROOT = Path(__file__).resolve().parents[2]
+HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\nagent: {may: any, actions: 3}\n"
+
+
+def task_of(text: str):
+    reporter = Reporter()
+    task = read_task(Source("test.yaml", HEAD + text), reporter)
+    assert [one.code for one in reporter.diagnostics] == []
+    return task
+
+
+def maker(torch, task, split: str = "train", variant: int = 0):
+    from powderdsl.tasks.torch_generator import WorldMaker
+
+    return WorldMaker(task.split(split).variants[variant], task.size, torch.device("cpu"))
+
+
+def worlds(torch, text: str, count: int) -> np.ndarray:
+    return maker(torch, task_of(text)).make(torch.arange(count)).ids.numpy()
+
+
+EVERYTHING = """
+knobs: {most: {default: 4, range: 0..9}}
+let: {row: 8..53, edge: row / 2}
+regions:
+  spot:
+    - disk at (row, 30) radius 9
+    - box columns edge:edge+4
+  left_half: box columns :32
+stamps:
+  hut:
+    art: |
+      ?^?
+      ^.^
+    legend: {"^": wood}
+parts:
+  ground:
+    - wave water at 50 height 6 length 16 phase 0..15
+    - ramp sand from (row, 5) to (63, 40)
+targets:
+  wanted:
+    - fill stone in spot
+    - disk sand at (row, 9) radius 3
+generate:
+  - part ground
+  - repeat 0..most:
+      - let: {thick: 1..5}
+      - line (any but sand) from (0..63, 0..63) to (0..63, 0..63) width thick
+      - scatter lava chance 5..30% over (empty, water)
+  - repeat most:
+      - arch stone rows row:row+9 columns edge:edge + (5..20) width 1..3
+      - container wood rows 2:9 columns 0..9:end width 1
+      - stamp hut at (0..60, -1..60)
+  - fill plant in spot over (wall, ice)
+  - scatter acid chance 50% in left_half
+  - frame wall
+"""
+
+
+def test_a_world_is_the_same_alone_and_in_any_batch(torch, monkeypatch):
+    from powderdsl.tasks import torch_generator
+
+    one = maker(torch, task_of(EVERYTHING))
+    seeds = torch.tensor([0, 7, 2**40, 3, 12_345, 2**62])
+    together = one.make(seeds)
+    assert len({world.numpy().tobytes() for world in together.ids}) == 6
+    for order in ([5, 0, 3], [4], [1, 1, 2]):
+        alone = one.make(seeds[order])
+        assert torch.equal(alone.ids, together.ids[order])
+        assert torch.equal(alone.regions["spot"], together.regions["spot"][order])
+        assert torch.equal(alone.targets["wanted"], together.targets["wanted"][order])
+    monkeypatch.setattr(torch_generator, "CHUNK_CELLS", 2 * 64 * 64)
+    chunked = one.make(seeds)
+    assert torch.equal(chunked.ids, together.ids)
+    assert torch.equal(chunked.regions["left_half"], together.regions["left_half"])
+    assert torch.equal(chunked.targets["wanted"], together.targets["wanted"])
+
+
+def test_what_regions_targets_and_stamps_hold(torch):
+    made = maker(torch, task_of(EVERYTHING)).make(torch.arange(4))
+    assert made.regions["left_half"].shape == (1, 64, 64)
+    assert made.regions["left_half"][0, :, :32].all()
+    assert not made.regions["left_half"][0, :, 32:].any()
+    target, spot = made.targets["wanted"], made.regions["spot"]
+    assert ((target == 9) <= spot).all()
+    assert set(target.unique().tolist()) == {2, 9, 255}
+    text = "stamps:\n  hut:\n    art: |\n      ?^?\n      ^.^\n    legend: {'^': wood}\n"
+    text += "generate: [fill water, 'stamp hut at (-1, 62)']\n"
+    corner = worlds(torch, text, 1)[0]
+    assert corner[0, 60:].tolist() == [3, 3, 5, 0]
+    assert (corner[1:] == 3).all()
+
+
+def test_draws_are_uniform(torch):
+    """χ² of numbers read off the worlds, on fixed seeds: 99.9 % points."""
+    ids = worlds(torch, "generate:\n  - square sand at (0..63, 0..63) half 1\n", 6400)
+    rows = np.array([np.nonzero((one == 2).any(1))[0].max() for one in ids])
+    columns = np.array([np.nonzero((one == 2).any(0))[0].max() for one in ids])
+    for places in (rows, columns):
+        found = np.bincount(places, minlength=64)
+        assert ((found - 100) ** 2 / 100).sum() < 106.0  # 63 degrees of freedom
+    # Row and column are drawn apart: sixteen fields are equally full.
+    fields = np.bincount(rows // 16 * 4 + columns // 16, minlength=16)
+    assert ((fields - 400) ** 2 / 400).sum() < 37.7
+    kinds = Counter(worlds(torch, "generate: [fill any]\n", 5600)[:, 0, 0].tolist())
+    assert sorted(kinds) == list(range(14))
+    assert sum((kinds[i] - 400) ** 2 / 400 for i in kinds) < 34.5
+    text = "generate:\n  - repeat 0..7:\n      - let: {at_row: 1..62}\n      - box sand rows 5:6 columns at_row:at_row+1\n"
+    counts = np.bincount((worlds(torch, text, 4000) == 2).sum((1, 2)), minlength=8)
+    assert 380 < counts[0] < 620  # an eighth: nothing is drawn
+    density = (worlds(torch, "generate: [scatter sand chance 30%]\n", 50) == 2).mean()
+    assert abs(density - 0.3) < 0.004  # 4 standard deviations
+    assert (worlds(torch, "generate: [scatter sand chance 100%]\n", 2) == 2).all()
+    assert (worlds(torch, "generate: [scatter sand chance 0%]\n", 2) == 0).all()
+
+
+def test_drawn_numbers_are_those_of_their_statement(torch):
+    """Each world is what worlds/raster.py makes of one of the shapes that the statement allows."""
+    text = "let: {row: 8..53}\ngenerate:\n  - disk sand at (row, row + 2) radius 3 * (1..3)\n"
+    allowed = {
+        (mask(shape_of("disk", [row, row + 2, 3 * k]), (64, 64))).tobytes()
+        for row in range(8, 54)
+        for k in (1, 2, 3)
+    }
+    found = {(one == 2).tobytes() for one in worlds(torch, text, 2000)}
+    assert found == allowed
+
+
+# The shipped tasks
+
+
+def test_the_designed_worlds_are_the_recorded_ones(torch):
+    task = load_task("world-model")
+    recorded = np.load(ROOT / "tests" / "data" / "population.npz")["start_ids"]
+    for number, expected in enumerate(recorded):
+        assert np.array_equal(maker(torch, task, "designed", number).make(torch.tensor([5])).ids[0], expected)
+    assert len(task.split("designed").variants) == len(recorded) == 8
+    scenes = load_scenes(ROOT / "tasks" / "scenes" / "designed.yaml", task.ruleset)
+    assert [one.name for one in task.split("designed").variants] == list(scenes)
+
+
+def element(task, name: str) -> int:
+    return next(one.id for one in task.ruleset.elements if one.name == name)
+
+
+@pytest.mark.parametrize("split", ["train", "test", "handmade"])
+def test_sand_pushing_is_laid_out_as_the_paper_says(torch, split):
+    task = load_task("sand-pushing")
+    wall, sand = element(task, "wall"), element(task, "sand")
+    variants = task.split(split).variants
+    blocks = []
+    for number in range(len(variants)):
+        ids = maker(torch, task, split, number).make(torch.arange(60)).ids.numpy()
+        columns = np.concatenate([ids[:, :22, 54:63], ids[:, 42:, 54:63]], 1)
+        assert (columns == wall).all()
+        assert (ids[:, 22:42, 54:63] == 0).all()
+        assert (ids[:, [0, -1]] == wall).all()
+        assert (ids[:, :, [0, -1]] == wall).all()
+        for one in ids:
+            rows, places = np.nonzero(one == sand)
+            assert len(rows) == 100
+            assert (rows.max() - rows.min(), places.max() - places.min()) == (9, 9)
+            blocks.append((int(rows.min()) + 5, int(places.min()) + 5))
+    if split == "handmade":
+        centers = list(dict.fromkeys(blocks))
+        assert centers == [(32, 8), (8, 8), (54, 8)]
+        assert len(variants) == 8
+    else:
+        assert {8, 53} <= {row for row, _ in (block(torch, task, split))}
+        assert all(8 <= row <= 53 and 8 <= column <= 43 for row, column in blocks)
+
+
+def block(torch, task, split: str) -> set[tuple[int, int]]:
+    ids = maker(torch, task, split).make(torch.arange(600)).ids.numpy()
+    return {(int(r.min()) + 5, int(c.min()) + 5) for r, c in (np.nonzero(one == 2) for one in ids)}
+
+
+def test_the_hand_made_worlds(torch):
+    """The obstacles as TASKS of the paper list them, drawn here by slices."""
+    task = load_task("sand-pushing")
+    ids = {one.name: one.id for one in task.ruleset.elements}
+
+    def drawn(*boxes: tuple[str, slice, slice]) -> np.ndarray:
+        world = np.zeros((64, 64), dtype=np.uint8)
+        for name, rows, columns in boxes:
+            world[rows, columns] = ids[name]
+        return world
+
+    def line(world, start, end):
+        world[mask(shape_of("line", [*start, *end, 25 if start != (0, 0) else 15]), (64, 64))] = 0
+        return world
+
+    every = slice(None)
+    full = drawn(("wall", every, every))
+    corner = ("wall", slice(40, 64), slice(0, 16))
+    detour = full.copy()
+    for start, end in (((32, 8), (0, 8)), ((8, 8), (8, 50)), ((0, 50), (32, 50))):
+        line(detour, start, end)
+    obstacles = [
+        drawn(),
+        drawn(("wall", slice(16, 48), slice(32, 36))),
+        line(full.copy(), (0, 0), (32, 63)),
+        detour,
+        drawn(("water", slice(40, 64), every)),
+        drawn(
+            corner,
+            ("plant", every, slice(30, 40)),
+            ("wall", slice(55, 64), slice(40, 45)),
+            ("lava", slice(55, 64), slice(45, None)),
+        ),
+        drawn(corner, ("stone", every, slice(30, 45))),
+        drawn(
+            ("lava", slice(42, 44), every),
+            ("stone", slice(44, 46), every),
+            ("dust", slice(46, None), every),
+            ("lava", slice(None, 20), every),
+            ("stone", slice(20, 22), every),
+            ("dust", slice(22, 24), every),
+            ("plant", slice(24, 26), every),
+            ("wall", slice(None, 26), slice(40, None)),
+        ),
+    ]
+    centers = [(32, 8), (32, 8), (8, 8), (32, 8), (54, 8), (32, 8), (32, 8), (32, 8)]
+    for number, (world, (row, column)) in enumerate(zip(obstacles, centers, strict=True)):
+        world[[0, -1]] = world[:, [0, -1]] = ids["wall"]
+        world[row - 5 : row + 5, column - 5 : column + 5] = ids["sand"]
+        world[:, 54:63] = ids["wall"]
+        world[22:42, 54:63] = 0
+        found = maker(torch, task, "handmade", number).make(torch.tensor([number])).ids[0].numpy()
+        assert np.array_equal(found, world), number
+
+
+def test_path_building_is_laid_out_as_the_paper_says(torch):
+    task = load_task("path-building")
+    wall, water, cloner = (element(task, name) for name in ("wall", "water", "cloner"))
+    for split in ("train", "test"):
+        ids = maker(torch, task, split).make(torch.arange(40)).ids.numpy()
+        spring = ids[:, 5:15, 5:35]
+        assert (spring[:, 1:-1, 1:-1] == cloner).all()
+        assert ((spring == cloner).sum((1, 2)) == 8 * 28).all()
+        assert ((spring == water).sum((1, 2)) == 10 * 30 - 8 * 28).all()
+        assert (ids[:, 40:64, 44:46] == wall).all()
+        assert (ids[:, 40:63, 46:63] == 0).all()
+        assert (ids[:, [0, -1]] == wall).all()
+
+
+def test_obstacles_have_the_paper_s_numbers():
+    """Ranges, counts and order of shapes, read off the checked tasks."""
+    for name in ("sand-pushing", "destroying", "path-building"):
+        task = load_task(name, knobs={"complexity": 16})
+        train, test = task.split("train").variants[0], task.split("test").variants[0]
+        drawn = [group for group in train.groups if group.most > 1]
+        assert [(group.most, group.drawings[0].kind) for group in drawn] == [(16, "line"), (16, "disk")]
+        (squares,) = (group for group in test.groups if group.most > 1)
+        assert squares.most == (10 if name == "path-building" else 5)
+        bounds = [
+            [(a.args[0].value, a.args[1].value) for a in group.drawings[0].amounts]
+            for group in (*drawn, squares)
+        ]
+        place = (0, 63)
+        assert bounds == [[place] * 4 + [(1, 9)], [place, place, (5, 19)], [place, place, (5, 19)]]
+        for group in (*drawn, squares):
+            assert (group.count.args[0].value, group.count.op) == (0, "draw")
+            assert (2 in group.drawings[0].ids) == (name != "sand-pushing")
+            assert len(group.drawings[0].ids) == 14 - (name == "sand-pushing")
+
+
+def test_shipped_tasks_have_names_of_their_own_and_say_what_they_ask():
+    for name in shipped_tasks():
+        task = load_task(name)
+        assert task.name == name
+        assert task.about.endswith(".")
+        assert all(split.about.endswith(".") for split in task.splits)
+        assert all(knob.about for knob in task.knobs)
+
+
+def test_knobs_reach_the_worlds(torch):
+    bare = load_task("sand-pushing", knobs={"lines": 0, "disks": 0})
+    ids = maker(torch, bare).make(torch.arange(20)).ids
+    assert ((ids == 0).sum((1, 2)) == 64 * 64 - (ids == 1).sum((1, 2)) - 100).all()
+    few = load_task("world-model", knobs={"kinds": 2, "lines": 9})
+    assert set(maker(torch, few).make(torch.arange(50)).ids.unique().tolist()) == {0, 1, 2, 3}

@@ -1,0 +1,89 @@
+"""Shapes of whole batches cover the cells that worlds/raster.py says, one world at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from powderdsl.worlds.raster import Arch, Container, Ramp, Square, Wave, mask
+from powderdsl.worlds.scene.fixed import shape_of
+
+PLACE = st.integers(-12, 90)
+SIZES = st.sampled_from([(1, 1), (7, 9), (64, 64), (65, 30), (130, 12)])
+
+
+def picture(cells: np.ndarray) -> list[str]:
+    return ["".join("x" if cell else "." for cell in row) for row in cells]
+
+
+def test_the_shapes_of_generators():
+    ramp = ["......", "...x..", "..xx..", ".xxx..", "......"]
+    assert picture(mask(Ramp((3, 1), (1, 3)), (5, 6))) == ramp
+    assert picture(mask(Ramp((1, 3), (3, 1)), (5, 6))) == ramp
+    assert picture(mask(Ramp((1, 1), (3, 1)), (5, 3))) == ["...", ".x.", ".x.", ".x.", "..."]
+    assert picture(mask(Square((2, 2), 1), (4, 4))) == ["....", ".xx.", ".xx.", "...."]
+    assert picture(mask(Arch((1, 4), (0, 4), 1), (4, 5))) == [".....", "xxxx.", "x..x.", "x..x."]
+    assert picture(mask(Container((0, None), (1, None), 1), (3, 5))) == [".x..x", ".x..x", ".xxxx"]
+    assert picture(mask(Wave(1, 2, 4, 0), (4, 8))) == ["........", "x...x...", "xx.xxx.x", "xxxxxxxx"]
+
+
+def ranges() -> st.SearchStrategy[list[int | None]]:
+    """A start and an end above it; perhaps open."""
+    start = st.integers(0, 70)
+    return st.tuples(start, st.integers(1, 70) | st.none()).map(
+        lambda pair: [pair[0], None if pair[1] is None else pair[0] + pair[1]]
+    )
+
+
+NUMBERS: dict[str, st.SearchStrategy[Any]] = {
+    "line": st.tuples(PLACE, PLACE, PLACE, PLACE, st.integers(1, 25)).map(list),
+    "disk": st.tuples(PLACE, PLACE, st.integers(1, 40)).map(list),
+    "square": st.tuples(PLACE, PLACE, st.integers(1, 40)).map(list),
+    "box": st.tuples(ranges(), ranges()).map(lambda pair: pair[0] + pair[1]),
+    "ramp": st.tuples(PLACE, PLACE, PLACE, PLACE).map(list),
+    "arch": st.tuples(ranges(), ranges(), st.integers(1, 9)).map(lambda t: [*t[0], *t[1], t[2]]),
+    "container": st.tuples(ranges(), ranges(), st.integers(1, 9)).map(lambda t: [*t[0], *t[1], t[2]]),
+    "wave": st.tuples(PLACE, st.integers(0, 20), st.integers(2, 30), PLACE).map(list),
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_batches_cover_the_same_cells(torch, kind):
+    from powderdsl.tasks.torch_shapes import covered_rows, unpack, words_of_rows
+
+    @settings(max_examples=60, deadline=None, derandomize=True)
+    @given(batch=st.lists(NUMBERS[kind], min_size=1, max_size=6), size=SIZES)
+    def compare(batch, size):
+        opens = [batch[0][i] is None for i in range(len(batch[0]))]
+        batch = [one for one in batch if [n is None for n in one] == opens]
+        columns = [None if n[0] is None else torch.tensor(n) for n in zip(*batch, strict=True)]
+        words = words_of_rows(covered_rows(kind, columns, size), size)
+        found = unpack([words], size[0]).bool().numpy()
+        for one, numbers in zip(found, batch, strict=True):
+            assert np.array_equal(one, mask(shape_of(kind, numbers), size)), (numbers, size)
+
+    compare()
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), size=SIZES)
+def test_bits_and_cells_are_the_same(seed, size):
+    import torch
+
+    from powderdsl.tasks.torch_shapes import pack, unpack
+
+    ids = torch.from_numpy(np.random.default_rng(seed).integers(0, 16, (3, *size), dtype=np.uint8))
+    planes = [pack((ids >> place & 1).bool()) for place in range(4)]
+    assert torch.equal(unpack(planes, size[0]), ids)
+
+
+def test_whole_roots_are_exact(torch):
+    from powderdsl.tasks.torch_shapes import root
+
+    n = torch.tensor([0, 1, 2, 3, 4, 2**26, 2**25 - 1, 67_108_863])
+    assert torch.equal(root(n * n), n)
+    assert torch.equal(root((n * n - 1).clamp(min=0)), (n - 1).clamp(min=0))
