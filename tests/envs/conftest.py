@@ -15,7 +15,7 @@ rules: core+sand+water+wind
 size: [16, 16]
 fill: empty
 knobs:
-  disks: {default: 3, range: 0..8, about: up to how many disks there are}
+  disks: {default: 3, range: 1..8, about: up to how many disks there are}
 regions:
   pit: box rows 11:15 columns 1:15
 generate:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from powderdsl.diagnostics import CompileError
@@ -136,7 +137,7 @@ def test_nothing_returned_is_written_to_later(small: TaskProgram, kind: str) -> 
         kept.append((result, copy.deepcopy(result)))
         found, wanted = spoiled.step(actions)[0], result[0]
     for before, after in kept:
-        np.testing.assert_equal(before, after)
+        assert data_equivalence(before, after, exact=True)
 
 
 def test_seeds_are_those_of_slots(small: TaskProgram) -> None:
@@ -182,11 +183,11 @@ def test_options_choose_worlds_and_parameters(small: TaskProgram) -> None:
 
 def test_a_task_file_takes_splits_knobs_and_parameters(task_file: Path) -> None:
     env = TensorEnv(
-        task_file, 2, split="test", knobs={"disks": 0}, params={"water.melt": 0.5}, backend="dense"
+        task_file, 2, split="test", knobs={"disks": 1}, params={"water.melt": 0.5}, backend="dense"
     )
     observed, _ = env.reset(seed=0)
     assert observed[:, 0, 1:-1, 1:-1].sum() == 0  # the test split is an empty box
-    assert env.task.knobs[0].value == 0
+    assert env.task.knobs[0].value == 1
     assert env.simulator.ruleset.params[0].default == 0.5
     for how in ({"split": "tset"}, {"params": {"water.mlet": 1}}, {"knobs": {"disk": 1}}):
         with pytest.raises(CompileError):
@@ -260,7 +261,7 @@ def test_bad_input_is_refused_and_changes_nothing(small: TaskProgram) -> None:
 )
 def test_bad_arguments_are_refused(small: TaskProgram, how: dict[str, Any]) -> None:
     (name,) = how
-    with pytest.raises(ValueError, match=name.replace("observation", "kinds")):
+    with pytest.raises(ValueError, match=name):
         PowderVectorEnv(small, **how)
 
 
