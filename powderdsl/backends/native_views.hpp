@@ -169,6 +169,7 @@ API void pd_store_real(const void* batch, int slot, float* data, int64_t apart) 
     store_real(b.g, b.groups[lane / LANES].real[slot], lane % LANES, data + b.at(lane, apart, b.g.width));
 }
 
+typedef uint8_t Bytes __attribute__((vector_size(16), may_alias));
 // Reals in eight bits: 128 is 0, further from it in steps that grow with the value. `floor` is a power of two.
 API void pd_codes(const void* batch, int slot, float floor, uint8_t* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
@@ -185,15 +186,11 @@ API void pd_codes(const void* batch, int slot, float floor, uint8_t* data, int64
       }
       const float* in = f->data + row * b.g.stride + HALO;
       for (int x = 0; x < b.g.width; x += CHUNK) {  // rows go on behind the last column
-        uint8_t codes[CHUNK];
-        for (int i = 0; i < CHUNK; i++) {
-          int32_t bits;
-          float far = __builtin_fabsf(in[x + i]) + floor;
-          memcpy(&bits, &far, 4);
-          bits = (bits - one + (1 << 19)) >> 20;
-          codes[i] = (uint8_t)(128 + (in[x + i] < 0 ? -bits : bits));
-        }
-        memcpy(out + x, codes, std::min(CHUNK, b.g.width - x));
+        F value = (F)*(const Fu*)(in + x);
+        I bits = (I)value, sign = bits >> 31;
+        I size = ((I)((F)(bits & 0x7fffffff) + floor) - one + (1 << 19)) >> 20;
+        Bytes codes = __builtin_convertvector(((size ^ sign) - sign) + 128, Bytes);
+        memcpy(out + x, &codes, std::min(CHUNK, b.g.width - x));
       }
     }
   }

@@ -8,7 +8,7 @@ from powderdsl.tasks.shipped_tasks import shipped_tasks
 
 
 def env_id(task: str) -> str:
-    """The id of a shipped task: ``sand-box`` becomes ``powderdsl/SandBox-v0``."""
+    """The id of a shipped task: ``some-task`` becomes ``powderdsl/SomeTask-v0``."""
     return f"powderdsl/{''.join(part.capitalize() for part in task.split('-'))}-v0"
 
 

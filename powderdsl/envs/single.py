@@ -31,7 +31,12 @@ class PowderEnv(gymnasium.Env[NDArray[Any], NDArray[np.int64]], EzPickle):
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 15}  # noqa: RUF012 as Gymnasium declares it
 
     def __init__(
-        self, task: str | Path | Task | TaskProgram, *, render_mode: str | None = None, render_scale: int = 8, **how: Any
+        self,
+        task: str | Path | Task | TaskProgram,
+        *,
+        render_mode: str | None = None,
+        render_scale: int = 8,
+        **how: Any,
     ):
         EzPickle.__init__(self, task, render_mode=render_mode, render_scale=render_scale, **how)
         self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
@@ -60,4 +65,6 @@ class PowderEnv(gymnasium.Env[NDArray[Any], NDArray[np.int64]], EzPickle):
 
     def render(self) -> Any:
         """A picture uint8 [H, W, 3], or text, in the mode that was chosen."""
-        return None if self.render_mode is None else frames(self.tensors, self.render_mode, self.render_scale)[0]
+        return (
+            None if self.render_mode is None else frames(self.tensors, self.render_mode, self.render_scale)[0]
+        )

@@ -75,9 +75,9 @@ class TensorEnv:
         device: str | torch.device = "cpu",
         threads: int | None = None,
     ):
-        for name, number in (("num_envs", num_envs), ("worlds", worlds), ("max_episode_steps", max_episode_steps)):
-            if number is not None and (isinstance(number, bool) or not isinstance(number, int) or number < 1):
-                raise ValueError(f"{name} must be a whole number from 1, found {number!r}")
+        _check_count("num_envs", num_envs)
+        _check_count("worlds", worlds)
+        _check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps)
         if last_action not in LAST_ACTIONS:
             raise ValueError(f"last_action is one of {', '.join(LAST_ACTIONS)}; found {last_action!r}")
         if not isinstance(task, TaskProgram):
@@ -158,7 +158,7 @@ class TensorEnv:
             "_world": mask.clone(),
         }
 
-    def _bases(self, seed: int | Sequence[int | None] | None) -> tuple[Tensor, Tensor]:
+    def _bases(self, seed: Any) -> tuple[Tensor, Tensor]:
         """The seed of each slot, and whether it is a new one."""
         old = self._base
         if old is None:
@@ -283,7 +283,11 @@ class TensorEnv:
         last = {"world": self.episodes.seed.clone(), "success": info["success"].clone()}
         last |= {name: info[name].clone() for name in ("episode_return", "episode_length")}
         info["final_info"] = last | {f"_{name}": ended.clone() for name in last}
-        info["final_obs"], info["_final_obs"], info["_final_info"] = observed[over], ended.clone(), ended.clone()
+        info["final_obs"], info["_final_obs"], info["_final_info"] = (
+            observed[over],
+            ended.clone(),
+            ended.clone(),
+        )
         fresh = self._begin(over, ended)
         assert fresh is not None
         observed[over] = self.observation.of(fresh.world)
@@ -303,6 +307,11 @@ class TensorEnv:
         return fresh
 
 
+def _check_count(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be a whole number from 1, found {value!r}")
+
+
 def _mode(value: AutoresetMode | str) -> AutoresetMode:
     """A mode of Gymnasium's, by its name in any way of writing."""
     if isinstance(value, AutoresetMode):
@@ -310,4 +319,6 @@ def _mode(value: AutoresetMode | str) -> AutoresetMode:
     for mode in AutoresetMode:
         if str(value).lower().replace("_", "") == mode.value.lower():
             return mode
-    raise ValueError(f"autoreset_mode is one of {', '.join(mode.name for mode in AutoresetMode)}; found {value!r}")
+    raise ValueError(
+        f"autoreset_mode is one of {', '.join(mode.name for mode in AutoresetMode)}; found {value!r}"
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -43,9 +42,9 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def small(task_file: Path) -> Iterator[TaskProgram]:
+def small(task_file: Path) -> TaskProgram:
     """The small task on the backend `planes`."""
     import torch
 
     torch.set_num_threads(1)
-    yield compile_task(str(task_file), backend="planes")
+    return compile_task(str(task_file), backend="planes")

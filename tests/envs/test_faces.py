@@ -175,7 +175,9 @@ def test_goals_pass_both_checkers_and_hindsight_replay(small: TaskProgram) -> No
         check_sb3(goals(small))
     env = DummyVecEnv([lambda: goals(small)])
     env.seed(0)
-    buffer = HerReplayBuffer(200, env.observation_space, env.action_space, env, goal_selection_strategy="future")
+    buffer = HerReplayBuffer(
+        200, env.observation_space, env.action_space, env, goal_selection_strategy="future"
+    )
     rng, observed = np.random.default_rng(3), env.reset()
     for _ in range(60):
         actions = rng.integers(0, small.action_nvec, (1, 5))

@@ -26,7 +26,13 @@ def native(small: TaskProgram, tmp_path_factory: pytest.TempPathFactory) -> Iter
 @pytest.mark.parametrize(("size", "envs"), [((16, 16), 3), ((16, 70), 11), ((16, 130), 2)])
 @pytest.mark.parametrize("kind", ["ids", "compact"])
 def test_packed_episodes_are_the_same(
-    native: Simulator, small: TaskProgram, task_file: Path, tmp_path: Path, size: tuple[int, int], envs: int, kind: str
+    native: Simulator,
+    small: TaskProgram,
+    task_file: Path,
+    tmp_path: Path,
+    size: tuple[int, int],
+    envs: int,
+    kind: str,
 ) -> None:
     """In lanes and in strips, with words that are full and not."""
     path = tmp_path / "sized.yaml"

@@ -101,9 +101,7 @@ def test_autoreset_is_a_loop_by_hand(small: TaskProgram, mode: AutoresetMode) ->
 @pytest.mark.parametrize("mode", MODES)
 def test_it_is_what_gymnasium_makes_of_single_worlds(small: TaskProgram, mode: AutoresetMode) -> None:
     ours = PowderVectorEnv(small, ENVS, autoreset_mode=mode, observation="compact")
-    theirs = SyncVectorEnv(
-        [lambda: PowderEnv(small, observation="compact")] * ENVS, autoreset_mode=mode
-    )
+    theirs = SyncVectorEnv([lambda: PowderEnv(small, observation="compact")] * ENVS, autoreset_mode=mode)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert np.array_equal(ours.reset(seed=3)[0], theirs.reset(seed=3)[0])
@@ -160,7 +158,7 @@ def test_seeds_are_those_of_slots(small: TaskProgram) -> None:
 
 def test_options_choose_worlds_and_parameters(small: TaskProgram) -> None:
     env, usual = (PowderVectorEnv(small, 4, autoreset_mode="disabled") for _ in range(2))
-    still = np.zeros((4, 5), np.int64) + [0, 0, 1, 1, 1]
+    still = np.tile([0, 0, 1, 1, 1], (4, 1))
     _, info = env.reset(options={"worlds": [5, 6, 5, 6], "params": {"water.melt": [0.0, 0.0, 1.0, 1.0]}})
     assert info["world"].tolist() == [5, 6, 5, 6]
     usual.reset(options={"worlds": [5, 6, 5, 6]})
