@@ -38,6 +38,7 @@ from powderdsl.model.types import Kernel
 from powderdsl.passes import PIPELINE
 from powderdsl.syntax import parse, yaml_tree
 from powderdsl.syntax.parse import reserved_words
+from powderdsl.tasks.task_keys import TASK_KEYS
 
 DOCS = Path(__file__).resolve().parent
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -70,7 +71,7 @@ def keys(context: str) -> str:
     """The keys of one kind of mapping in a rule file."""
     rows = [
         (f"`{name}`" + (" *" if key.required else ""), SHAPES[key.shape], key.about)
-        for name, key in KEYS[context].items()
+        for name, key in {**KEYS, **TASK_KEYS}[context].items()
     ]
     if context in OPEN:
         rows.append((f"*{OPEN[context]}'s name*", "an expression", "its value"))
@@ -189,7 +190,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "shipped": shipped,
     "stages": stages,
     "commands": commands,
-    **{f"keys {context}": partial(keys, context) for context in KEYS},
+    **{f"keys {context}": partial(keys, context) for context in (*KEYS, *TASK_KEYS)},
 }
 """What can stand between markers, by name."""
 

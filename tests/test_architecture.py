@@ -31,17 +31,8 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_EVERYTHING = (
-    *_TESTING,
-    "properties",
-    "pytest_plugin",
-    "bench",
-    "tasks",
-    "envs",
-    "web",
-    "experiments",
-    "cli",
-)
+_AFTER = ("tasks", "envs", "web", "experiments", "cli")
+_EVERYTHING = (*_TESTING, "properties", "pytest_plugin", "bench", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.

@@ -6,6 +6,8 @@ Fenced blocks are run page by page, in order, in one temporary directory:
   top say what it is loaded with (its `needs` otherwise) and what is expected: ``# with: core+sand``,
   ``# error: PD301``, ``# warning: PD507``, ``# note: PD506``; ``# file: docs/examples/x.yaml`` demands that
   it is all of that file. It is saved under its name for later blocks to load, and its `tests:` are run.
+  One with ``task:`` is a task, which must have no mistakes.
+* ``statements`` of a generator and ``rewards``, one a line, with the names of `TASK`.
 * ``rules``: one rule a line, each loaded in a pass of its own. ``expressions``: one value a line.
 * ``python``: one namespace a page. A line ``VALUE  # uint8 [8, 64, 64]`` is compared.
 * ``console``: what follows ``$ powderdsl`` is run; other lines must occur in what it prints. The exit code
@@ -29,6 +31,7 @@ from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.model.types import Ruleset
 from powderdsl.pack_tests import run_examples
+from powderdsl.tasks.shipped_tasks import load_task_with_diagnostics
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -52,7 +55,17 @@ class Block:
         return found[1].strip() if found else ""
 
 
-RUNNABLE = ("yaml", "rules", "expressions", "python", "console")
+RUNNABLE = ("yaml", "rules", "expressions", "statements", "rewards", "python", "console")
+TASK = """task: example
+rules: powderworld
+size: [64, 64]
+fill: empty
+knobs: {kinds: {default: 3, range: 1..4}}
+let: {row: 8..53}
+regions: {pit: box rows 50:63, slot: box columns 54:63}
+targets: {house: [fill wood in pit]}
+agent: {may: [any, blow], speed: 20, actions: 64}
+"""
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -78,6 +91,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run_yaml(block: Block) -> None:
     text = block.text
+    if text.startswith("task:"):
+        run_task(text)
+        return
     if not re.search(r"^(pack|ruleset):", text, re.MULTILINE):
         text = f"pack: example\n{text}"
     name = re.search(r"^(?:pack|ruleset): *(\w+)", text, re.MULTILINE)
@@ -98,6 +114,19 @@ def run_yaml(block: Block) -> None:
             assert codes == wanted, [f"{one.code} {one.message}" for one in own]
     if ruleset is not None:
         run_tests(ruleset, name[1])
+
+
+def run_task(text: str) -> None:
+    Path("task.yaml").write_text(text, encoding="utf-8")
+    _, found = load_task_with_diagnostics("task.yaml")
+    assert [f"{one.code} {one.message}" for one in found] == []
+
+
+def run_task_lines(block: Block) -> None:
+    """`statements` and `rewards`: each line in a task of its own."""
+    for line in filter(None, block.text.splitlines()):
+        rest = f"generate:\n  - {line}\n" if block.language == "statements" else f"reward:\n  each: {line}\n"
+        run_task(TASK + rest)
 
 
 def diagnosed(*names: str | Path) -> tuple[Ruleset | None, tuple[Diagnostic, ...]]:
@@ -173,6 +202,8 @@ def run_block(block: Block, namespace: dict[str, Any]) -> None:
             run_yaml(block)
         case "rules" | "expressions":
             run_lines(block)
+        case "statements" | "rewards":
+            run_task_lines(block)
         case "console":
             run_console(block)
         case "python":
@@ -264,6 +295,9 @@ def test_every_table_of_keys_is_shown(generate: Any) -> None:
         ("yaml", "# with: core\n# note: PD506\nparams: {}\n"),
         ("rules", "# with: core\nwall -> empty\nwall -> salt\n"),
         ("expressions", "# with: core\ncount(wall) > 1\ncount(wall) > wall\n"),
+        ("yaml", "task: bad\nrules: core\n"),
+        ("statements", "fill wall\nfill wal\n"),
+        ("rewards", "count(wall)\ncount(wal)\n"),
         ("console", "$ powderdsl explain PD999\n"),
         ("console", "$ powderdsl explain PD301\nerror[PD301]\n"),
         ("console", "$ powderdsl --version\npowderdsl 77.0\n"),
@@ -273,7 +307,7 @@ def test_every_table_of_keys_is_shown(generate: Any) -> None:
     ],
 )
 def test_blocks_can_fail(language: str, text: str, folder: Path) -> None:
-    with pytest.raises(AssertionError):
+    with pytest.raises((AssertionError, CompileError)):
         run_block(Block(language, text, 1), {})
 
 

@@ -323,6 +323,56 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
   }
   put_back(c);
 }
+// One box of cells in each world: int64 [worlds][4], first row, the one after the last, first column, the one after the
+// last; empty where nothing changes. Visits the rows of each lane that lie in it.
+template <class Visit> static void in_boxes(Batch& b, const int64_t* boxes, Visit visit) {
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    const int64_t* box = boxes + 4 * (b.g.strips ? lane / LANES : lane);
+    const int64_t top = b.g.strips ? lane % LANES * b.g.height : 0;
+    const int first = (int)std::max<int64_t>(box[0] - top, 0), last = (int)std::min<int64_t>(box[1] - top, b.g.height);
+    if (first < last && box[2] < box[3]) visit(b.groups[lane / LANES], lane % LANES, b.g.strips ? lane / LANES : lane, first, last, box);
+  }
+}
+API void pd_fill(void* batch, int slot, int bits, const int64_t* boxes, const int64_t* values) {
+  Batch& b = *(Batch*)batch;
+  in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
+    for (int i = 0; i < bits; i++) {
+      Plane* p = group.slot[slot + i];
+      const bool set = values[world] >> i & 1;
+      if (p->zero && !set) continue;
+      if (p->zero) memset(p->data, 0, sizeof(V) * b.g.cells());
+      p->zero = false;
+      p->around = p->beyond = 0;
+      for (int w = 0; w < b.g.words; w++) {
+        const int from = (int)std::max<int64_t>(box[2] - 64 * w, 0), to = (int)std::min<int64_t>(box[3] - 64 * w, 64);
+        if (from >= to) continue;
+        const u64 mask = (to - from == 64 ? ~0ull : (1ull << (to - from)) - 1) << from;
+        for (int y = first; y < last; y++) {
+          u64& word = ((u64*)p->data)[((size_t)y * b.g.words + w) * LANES + lane];
+          word = set ? word | mask : word & ~mask;
+        }
+      }
+    }
+  });
+}
+API void pd_fill_real(void* batch, int slot, const int64_t* boxes, const float* values) {
+  Batch& b = *(Batch*)batch;
+  Context* c = borrow(b.g);
+  in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
+    Field* f = group.real[slot];
+    for (int y = first; y < last; y++) {
+      const size_t r = (size_t)lane * b.g.height + y;
+      float* row = f->data + r * b.g.stride + HALO;
+      if (!f->live[r] && values[world] == 0) continue;
+      if (!f->live[r]) std::fill_n(row, b.g.width, 0.f);
+      std::fill(row + box[2], row + box[3], values[world]);
+      f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
+      if (f->live[r]) f->still = false;
+      finish_row(*c, row);
+    }
+  });
+  put_back(c);
+}
 API void pd_run(void* batch, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, const uint8_t* planes, const float* reals) {
   Batch& b = *(Batch*)batch;
   Clocks k{seed, index, step};

@@ -69,35 +69,6 @@ class PackedState(Mapping[str, Tensor]):
             )
         return out
 
-    def fill(self, name: str, blocks: Tensor, value: Tensor) -> None:
-        """One value in a block of cells of each world, in place.
-
-        Args:
-            blocks: int32 [B, 4]: first row, the one after the last, first column, the one after the last.
-            value: [B], or [B, 2] as (row, column) for vectors.
-        """
-        library, program = self.program.library, self.program
-        self._tensors.pop(name, None)
-        if self.like[name][0] == torch.float32:
-            for part, one in zip(
-                self._parts(name), value.float().view(len(blocks), -1).unbind(1), strict=True
-            ):
-                one = one.contiguous()
-                library.pd_fill_real(self.handle, program.layout.reals[part], address(blocks), address(one))
-        else:
-            slot, bits, _ = program.planes_of(name)
-            whole = value.to(torch.int32).contiguous()
-            library.pd_fill(self.handle, slot, bits, address(blocks), address(whole))
-
-    def count_others(self, name: str, blocks: Tensor, value: Tensor) -> Tensor:
-        """How many cells of each world's block do not hold a whole number: int64 [B]. Arguments as for `fill`."""
-        slot, bits, _ = self.program.planes_of(name)
-        whole, counts = value.to(torch.int32).contiguous(), torch.empty(len(blocks), dtype=torch.int64)
-        self.program.library.pd_count_others(
-            self.handle, slot, bits, address(blocks), address(whole), address(counts)
-        )
-        return counts
-
     def put(self, places: Tensor, state: Mapping[str, Tensor]) -> None:
         """The worlds `places`, int64 [n], replaced by those of another state, in place."""
         library, program, count = self.program.library, self.program, len(places)
@@ -121,6 +92,32 @@ class PackedState(Mapping[str, Tensor]):
     def _parts(self, name: str) -> tuple[str, ...]:
         """The reals of a slot: two of a vector."""
         return (f"{name}.row", f"{name}.column") if len(self.like[name][1]) == 4 else (name,)
+
+    def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
+        """The state with one box of cells in each world filled, without unpacking the rest.
+
+        Args:
+            boxes: int64 [B, 4]: first row, the one after the last, first column, the one after the last, all within
+                the grid; empty where nothing changes.
+            values: by slot: int64 [B], float32 [B] for reals, float32 [B, 2] for vectors.
+            reuse: write to this state itself, and return it.
+        """
+        program = self.program
+        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        boxes = boxes.contiguous()
+        for name, value in values.items():
+            changed._tensors.pop(name, None)
+            if value.is_floating_point():
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 2 else (name,)
+                for part, numbers in zip(parts, value.T if value.ndim == 2 else value[None], strict=True):
+                    numbers = numbers.contiguous()
+                    slot = program.layout.reals[part]
+                    program.library.pd_fill_real(changed.handle, slot, address(boxes), address(numbers))
+            else:
+                value = value.contiguous()
+                slot, bits, _ = program.planes_of(name)
+                program.library.pd_fill(changed.handle, slot, bits, address(boxes), address(value))
+        return changed
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.like)

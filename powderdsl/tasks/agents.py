@@ -110,11 +110,9 @@ def _speed_field(
             if not vectors
             else "blowing could set several fields"
         )
-        helps = (
-            [f"`speed_field`: one of {', '.join(vectors)}"]
-            if vectors
-            else ["load a pack with a vector field"]
-        )
+        helps = ("load a pack with a vector field",)
+        if vectors:
+            helps = (f"`speed_field`: one of {', '.join(vectors)}",)
         reader.reporter.error("PD804", message, span, "which one?" if vectors else "no vector", helps=helps)
         return None
     return vectors[0]

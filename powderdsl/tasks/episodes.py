@@ -16,7 +16,7 @@ from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.torch_actions import Hands, params_of
 from powderdsl.tasks.torch_generator import Made, WorldMaker
-from powderdsl.tasks.torch_measures import Facts, Given, Meter, measures_of, scalar_value
+from powderdsl.tasks.torch_measures import Facts, Given, Meter, measures_of, scalar_value, scalars_of
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 
@@ -59,7 +59,8 @@ class TaskProgram:
             fixed = {n: v for n, v in fixed.items() if n in same and torch.equal(v, same[n])}
         self._fixed = fixed
         self._meter = Meter(simulator.ruleset, self.measures, task.size, fixed, device)
-        self._hands = Hands(simulator, task.agent, task.size)
+        counts = any(part.op == "action" and part.value == "painted" for part in scalars_of(task.goal))
+        self._hands = Hands(simulator, task.agent, task.size, counts=counts)
         agent = task.agent
         self.action_nvec: tuple[int, int, int, int, int] = (
             agent.bins[1],

@@ -209,7 +209,7 @@ class GoalChecker:
             found = self.typer.flag(operand, syntax.span)
         else:
             value = self.typer.value(operand, syntax.span)
-            if isinstance(value, Number) or (isinstance(value, Expr) and value.kind.name not in _SUMMABLE):
+            if isinstance(value, Number) or value.kind.name not in _SUMMABLE:
                 raise self.typer.wrong(value, "a number of each cell", syntax.span, "such as a field")
             found = value
         if any(part.op == "draw" for part in found.walk()):

@@ -228,7 +228,7 @@ class _TaskReader:
             found[key.text] = Knob(key.text, usual, low, high, chosen, about, key.span)
         for name in self.given:
             if name not in self.taken:
-                helps = suggest(name, found, "knobs") or ["the task has no knobs"]
+                helps = suggest(name, found, "knobs") or ("the task has no knobs",)
                 self.reporter.error("PD803", f"no knob `{name}`", None, helps=helps)
         return tuple(found.values())
 

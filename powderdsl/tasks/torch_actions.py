@@ -28,12 +28,12 @@ class Done:
 class Hands:
     """An agent's hands on the worlds of one simulator and size."""
 
-    def __init__(self, sim: Simulator, agent: Agent, size: Size):
-        self.agent, self.size, self.device = agent, size, sim.device
+    def __init__(self, sim: Simulator, agent: Agent, size: Size, *, counts: bool):
+        """`counts`: whether the cells that actions change are counted."""
+        self.agent, self.size, self.device, self.counts = agent, size, sim.device, counts
         self.choices = torch.tensor(agent.choices, device=self.device)
+        self._edges = [self._ends(axis) for axis in (0, 1)]
         self._places = [self._lines(axis) for axis in (0, 1)]
-        self._blocks = [torch.stack([lines.amin(1), lines.amax(1) + 1], 1).int() for lines, _ in self._places]
-        """First row (or column) of each bin's brush, and the one after its last: int32 [bins, 2]."""
         self.places_elements = any(choice >= 0 for choice in agent.choices)
         known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=self.device)
         fresh = sim.world(known[None]).state
@@ -65,6 +65,12 @@ class Hands:
         lines = center[:, None] - brush // 2 + torch.arange(brush, device=self.device)
         return lines.clamp(0, side - 1), (lines >= 0) & (lines < side)
 
+    def _ends(self, axis: int) -> Tensor:
+        """The first row (or column) of the brush at each bin within the grid, and the one after the last: int64 [bins, 2]."""
+        side, bins, brush = self.size[axis], self.agent.bins[axis], self.agent.brush[axis]
+        first = (2 * torch.arange(bins, device=self.device) + 1) * side // (2 * bins) - brush // 2
+        return torch.stack([first, first + brush], 1).clamp(0, side)
+
     def fresh_state(self, ids: Tensor) -> dict[str, Tensor]:
         """The state of new worlds of known ids, uint8 [B, H, W]: what `Simulator.world` makes, without its checks."""
         state = {"element": ids}
@@ -89,37 +95,45 @@ class Hands:
         """The worlds after actions, int64 [B, 5], within their bounds. `reuse` writes into the world's own tensors."""
         choice = self.choices[actions[:, 2]]
         blown, placed = choice == BLOW, choice >= 0
+        if isinstance(world.state, PackedState):
+            return self._packed(world, world.state, actions, choice, reuse)
         rows, columns = (self._places[axis][0][actions[:, 1 - axis]] for axis in (0, 1))
         cells = (rows[:, :, None] * self.size[1] + columns[:, None]).flatten(1)
-        if reuse and isinstance(world.state, PackedState):
-            return self._act_packed(world, world.state, actions, choice)
         state = dict(world.state)
         painted = torch.zeros_like(choice)
-        if self.places_elements:
+        if self.places_elements and self.counts:
             inside = [self._places[axis][1][actions[:, 1 - axis]] for axis in (0, 1)]
             old = state["element"].flatten(1).gather(1, cells)
             new = choice.clamp(min=0).to(torch.uint8)[:, None]
             differs = (old != new) & (inside[0][:, :, None] & inside[1][:, None]).flatten(1)
             painted = (differs & placed[:, None]).sum(1)
+        if self.places_elements:
             self._place(state, cells, choice, ~placed, reuse)
         if self.agent.speed_field is not None:
             self._blow(state, cells, actions, blown, reuse)
         return Done(replace(world, state=state), painted, placed.long(), blown.long())
 
-    def _act_packed(self, world: World, state: PackedState, actions: Tensor, choice: Tensor) -> Done:
-        """The same where worlds lie packed: blocks are filled there."""
-        block = torch.cat([self._blocks[axis][actions[:, 1 - axis]] for axis in (0, 1)], 1)
+    def _packed(self, world: World, state: PackedState, actions: Tensor, choice: Tensor, reuse: bool) -> Done:
+        """The same on packed worlds: only the blocks are written, and nothing is unpacked unless cells are counted."""
         blown, placed = choice == BLOW, choice >= 0
-        ids, painted = choice.clamp(min=0), torch.zeros_like(choice)
+        edges = [self._edges[axis][actions[:, 1 - axis]] for axis in (0, 1)]
+        boxes = torch.cat(edges, 1)
+        painted = torch.zeros_like(choice)
+        before = state["element"] if self.places_elements and self.counts else None
         if self.places_elements:
-            where = torch.where(placed[:, None], block, 0)
-            painted = state.count_others("element", where, ids)
-            for name, table in self._fresh.items():
-                state.fill(name, where, table[ids])
+            ids = choice.clamp(min=0)
+            values = {name: table[ids] for name, table in self._fresh.items()}
+            values = {name: one if one.is_floating_point() else one.long() for name, one in values.items()}
+            state = state.fill(torch.where(placed[:, None], boxes, 0), values, reuse=reuse)
         if self.agent.speed_field is not None:
-            where = torch.where(blown[:, None], block, 0)
-            state.fill(self.agent.speed_field, where, self._speed(actions))
-        return Done(world, painted, placed.long(), blown.long())
+            speed = self.agent.speed * (actions[:, [4, 3]] - 1).float()
+            reuse = reuse or state is not world.state
+            state = state.fill(
+                torch.where(blown[:, None], boxes, 0), {self.agent.speed_field: speed}, reuse=reuse
+            )
+        if before is not None:
+            painted = (before != state["element"]).sum((1, 2))
+        return Done(replace(world, state=state), painted, placed.long(), blown.long())
 
     def _place(
         self, state: dict[str, Tensor], cells: Tensor, choice: Tensor, unchanged: Tensor, reuse: bool
@@ -133,11 +147,8 @@ class Hands:
         self, state: dict[str, Tensor], cells: Tensor, actions: Tensor, blown: Tensor, reuse: bool
     ) -> None:
         name = str(self.agent.speed_field)
-        self._write(state, name, cells, self._speed(actions), ~blown, reuse)
-
-    def _speed(self, actions: Tensor) -> Tensor:
-        """What each action blows with, as (rows, columns): float32 [B, 2]."""
-        return self.agent.speed * (actions[:, [4, 3]] - 1).to(torch.float32)
+        speed = self.agent.speed * (actions[:, [4, 3]] - 1).to(state[name].dtype)
+        self._write(state, name, cells, speed, ~blown, reuse)
 
     def _write(
         self,

@@ -29,11 +29,15 @@ _LOOKING = ("look", "count", "sum", "inside", "coordinate")
 """Operations that see more than the cell itself: a window on the world would change them."""
 
 
+def scalars_of(goal: Goal) -> list[Scalar]:
+    """Every part of a goal's expressions."""
+    scalars = [one for one in (goal.each, goal.final, goal.success, goal.failure) if one is not None]
+    return [part for one in scalars for part in parts_of(one)]
+
+
 def measures_of(goal: Goal) -> tuple[Measure, ...]:
     """Every measure of a goal once."""
-    scalars = [one for one in (goal.each, goal.final, goal.success, goal.failure) if one is not None]
-    found = [part.value for one in scalars for part in parts_of(one) if part.op == "measure"]
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(part.value for part in scalars_of(goal) if part.op == "measure"))
 
 
 @dataclass(frozen=True)

@@ -165,7 +165,7 @@ def pack(cells: Tensor) -> Tensor:
     return (bits << shift).sum(-2).transpose(-1, -2).contiguous()
 
 
-def unpack(planes: Sequence[Tensor], height: int) -> Tensor:
+def unpack(planes: Sequence[Tensor] | Tensor, height: int) -> Tensor:
     """Numbers whose bits are planes, int64 [..., W, ⌈H/64⌉] each, lowest first: uint8 [..., H, W]."""
     found: Tensor | None = None
     table = _EIGHT_ROWS.to(planes[0].device)

@@ -278,7 +278,8 @@ class _Reading:
         if op == "name":
             return Amount("name", (), str(token), span)
         if op != "number":
-            args = tuple(self._amount(child, what, instead) for child in tree.children)  # type: ignore[arg-type]
+            parts: list[Any] = tree.children
+            args = tuple(self._amount(part, what, instead) for part in parts)
             if op == "neg" and args[0].is_number:
                 return number(-int(args[0].value or 0), span)
             if op == "draw" and args[0].is_number and args[1].is_number:

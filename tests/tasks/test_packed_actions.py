@@ -1,0 +1,67 @@
+"""Actions on worlds that stay packed in native code do what they do to tensors."""
+
+from __future__ import annotations
+
+import pytest
+
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.tasks.task_file import read_task
+
+TASK = """task: packed
+rules: powderworld
+size: SIZE
+fill: empty
+generate:
+  - repeat 6:
+      - disk any at (0..63, 0..63) radius 3..15
+agent: {may: [any, blow, nothing], speed: 20, actions: 12, steps_per_action: 2, bins: [5, 16], free_steps: 3}
+reward: {each: painted + count(sand) + 100 * placed}
+"""
+
+
+@pytest.mark.parametrize("size", ["[64, 64]", "[20, 70]"])
+def test_packed_worlds_are_acted_on_alike(torch, size):
+    """Few worlds are cut into strips in native code, many are not; 70 columns are more than one word."""
+    from powderdsl.tasks.episodes import compile_task
+
+    task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
+    native, plain = (compile_task(task, backend=backend) for backend in ("native", "torch"))
+    for batch, reuse in ((1, True), (3, False), (20, True), (20, False)):
+        one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
+        random = torch.Generator().manual_seed(batch)
+        for _ in range(13):
+            actions = torch.stack(
+                [torch.randint(0, n, (batch,), generator=random) for n in native.action_nvec], 1
+            )
+            given, before = (
+                one,
+                None if reuse else {name: value.clone() for name, value in one.world.state.items()},
+            )
+            one, reward, _, over = native.act(one, actions, reuse=reuse)
+            other, expected, _, also = plain.act(other, actions)
+            assert torch.equal(reward, expected)
+            assert torch.equal(over, also)
+            for name, value in other.world.state.items():
+                assert torch.equal(one.world.state[name], value), name
+            for name, value in (before or {}).items():
+                fresh = native.simulator.step(given.world, 0).state[name]  # unpacked anew
+                assert torch.equal(fresh, value), name
+
+
+def test_filling_boxes_of_a_packed_state(torch):
+    from powderdsl.tasks.episodes import compile_task
+
+    program = compile_task("sand-pushing", backend="native")
+    world = program.simulator.step(program.start(torch.arange(9)).world, 2)
+    boxes = torch.tensor(
+        [[0, 64, 0, 64], [3, 4, 63, 64], [5, 5, 0, 64], [5, 9, 7, 7], *[[60, 64, 1, 63]] * 5]
+    )
+    motion = torch.arange(18).float().view(9, 2) - 9
+    filled = world.state.fill(boxes, {"velocity": motion, "momentum": torch.arange(9) - 4}, reuse=False)
+    for name, values in (("velocity", motion), ("momentum", torch.arange(9) - 4)):
+        expected = world.state[name].clone()
+        for number, (top, bottom, left, right) in enumerate(boxes.tolist()):
+            cells = expected[number, ..., top:bottom, left:right]
+            cells.copy_(values[number].view(*values[number].shape, 1, 1).expand_as(cells))
+        assert torch.equal(filled[name], expected), name
+    assert torch.equal(filled["element"], world.state["element"])
