@@ -14,6 +14,7 @@ import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.single import PowderEnv
@@ -336,6 +337,20 @@ def test_every_shipped_task_is_registered_and_batched() -> None:
     observed, _ = env.reset(seed=0)
     assert observed.shape == (3, 6, 64, 64)
     assert load_task("sand-pushing").size == (64, 64)
+
+
+def test_gymnasiums_own_statistics_agree(small: TaskProgram) -> None:
+    env = RecordEpisodeStatistics(PowderVectorEnv(small, ENVS))
+    env.reset(seed=0)
+    seen = 0
+    for actions in actions_of(small):
+        info = env.step(actions)[4]
+        if "episode" in info:
+            over = info["_episode"]
+            seen += int(over.sum())
+            assert np.allclose(info["episode"]["r"][over], info["episode_return"][over])
+            assert np.array_equal(info["episode"]["l"][over], info["episode_length"][over])
+    assert seen > ENVS
 
 
 def test_programs_are_shared(task_file: Path) -> None:
