@@ -218,6 +218,8 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_load": (None, [pointer, integer, integer, integer, pointer]),
         "pd_store": (None, [pointer, integer, integer, integer, integer, pointer, long]),
         "pd_load_real": (None, [pointer, integer, pointer, long]),
+        "pd_put": (None, [pointer, integer, integer, integer, integer, pointer, pointer]),
+        "pd_put_real": (None, [pointer, integer, integer, pointer, pointer]),
         "pd_fill": (None, [pointer, integer, integer, pointer, pointer]),
         "pd_fill_real": (None, [pointer, integer, pointer, pointer]),
         "pd_store_real": (None, [pointer, integer, pointer, long]),
@@ -225,8 +227,6 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
         "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
         "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
-        "pd_put": (None, [pointer, integer, integer, integer, pointer, integer, pointer]),
-        "pd_put_real": (None, [pointer, integer, pointer, long, integer, pointer]),
         "pd_run": (None, [pointer, long, integer, pointer, pointer, pointer, pointer, pointer]),
     }
     for name, (result, arguments) in signatures.items():

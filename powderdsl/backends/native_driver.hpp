@@ -323,6 +323,57 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
   }
   put_back(c);
 }
+// Some worlds of a batch anew, from arrays of these worlds alone: the lanes of world places[k] from the k-th world.
+template <class Visit> static void in_places(Batch& b, int count, const int64_t* places, Visit visit) {
+  for (int k = 0; k < count; k++)
+    for (int strip = 0; strip < (b.g.strips ? LANES : 1); strip++) {
+      const int lane = b.g.strips ? (int)places[k] * LANES + strip : (int)places[k];
+      visit(b.groups[lane / LANES], lane % LANES, ((int64_t)k * b.g.world_height() + strip * b.g.height) * b.g.width);
+    }
+}
+template <class T> static void put_values(Batch& b, int slot, int bits, int count, const int64_t* places, const T* data) {
+  in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
+    for (int i = 0; i < bits; i++) {
+      Plane* p = group.slot[slot + i];
+      p->around = p->beyond = 0;
+      const T* cell = data + begin;
+      for (int y = 0; y < b.g.height; y++)
+        for (int w = 0; w < b.g.words; w++) {
+          const int many = std::min(64, b.g.width - 64 * w);
+          u64 word = 0;
+          for (int x = 0; x < many; x++) word |= (u64)((u64)cell[x] >> i & 1) << x;
+          cell += many;
+          if (p->zero && !word) continue;  // a plane that holds nothing goes on being skipped
+          if (p->zero) memset(p->data, 0, sizeof(V) * b.g.cells());
+          p->zero = false;
+          ((u64*)p->data)[((size_t)y * b.g.words + w) * LANES + lane] = word;
+        }
+    }
+  });
+}
+API void pd_put(void* batch, int slot, int bits, int item, int count, const int64_t* places, const void* data) {
+  Batch& b = *(Batch*)batch;
+  if (item == 1) put_values(b, slot, bits, count, places, (const uint8_t*)data);
+  else if (item == 2) put_values(b, slot, bits, count, places, (const int16_t*)data);
+  else put_values(b, slot, bits, count, places, (const int32_t*)data);
+}
+API void pd_put_real(void* batch, int slot, int count, const int64_t* places, const float* data) {
+  Batch& b = *(Batch*)batch;
+  Context* c = borrow(b.g);
+  in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
+    Field* f = group.real[slot];
+    for (int y = 0; y < b.g.height; y++) {
+      const size_t r = (size_t)lane * b.g.height + y;
+      float* row = f->data + r * b.g.stride + HALO;
+      memcpy(row, data + begin + (int64_t)y * b.g.width, sizeof(float) * b.g.width);
+      f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
+      if (f->live[r]) f->still = false;
+      finish_row(*c, row);
+    }
+  });
+  put_back(c);
+}
+
 // One box of cells in each world: int64 [worlds][4], first row, the one after the last, first column, the one after the
 // last; empty where nothing changes. Visits the rows of each lane that lie in it.
 template <class Visit> static void in_boxes(Batch& b, const int64_t* boxes, Visit visit) {

@@ -63,7 +63,6 @@ def native_source(program: Program) -> tuple[str, Layout]:
     runtime = (folder / "native_runtime.hpp").read_text(encoding="utf-8")
     driver = (folder / "native_driver.hpp").read_text(encoding="utf-8")
     views = (folder / "native_views.hpp").read_text(encoding="utf-8")
-    edits = (folder / "native_edits.hpp").read_text(encoding="utf-8")
     body = "\n\n".join(passes)
     step = f"static void run_passes(Context& c) {{\n  START;\n{calls}\n}}"
-    return "\n".join([head, runtime, tables, body, step, driver, views, edits]), layout
+    return "\n".join([head, runtime, tables, body, step, driver, views]), layout

@@ -69,26 +69,6 @@ class PackedState(Mapping[str, Tensor]):
             )
         return out
 
-    def put(self, places: Tensor, state: Mapping[str, Tensor]) -> None:
-        """The worlds `places`, int64 [n], replaced by those of another state, in place."""
-        library, program, count = self.program.library, self.program, len(places)
-        for name in self.like:
-            value = state[name].contiguous()
-            if value.dtype == torch.float32:
-                for i, part in enumerate(self._parts(name)):
-                    first = value[:, i] if value.ndim == 4 else value
-                    real = program.layout.reals[part]
-                    library.pd_put_real(
-                        self.handle, real, address(first), value.stride(0), count, address(places)
-                    )
-            else:
-                slot, bits, _ = program.planes_of(name)
-                library.pd_put(
-                    self.handle, slot, bits, value.element_size(), address(value), count, address(places)
-                )
-            if name in self._tensors:
-                self._tensors[name][places] = value
-
     def _parts(self, name: str) -> tuple[str, ...]:
         """The reals of a slot: two of a vector."""
         return (f"{name}.row", f"{name}.column") if len(self.like[name][1]) == 4 else (name,)
@@ -117,6 +97,33 @@ class PackedState(Mapping[str, Tensor]):
                 value = value.contiguous()
                 slot, bits, _ = program.planes_of(name)
                 program.library.pd_fill(changed.handle, slot, bits, address(boxes), address(value))
+        return changed
+
+    def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
+        """The state with the worlds `places`, int64 [n], replaced by those of another state of n worlds.
+
+        `reuse`: write to this state itself, and return it.
+        """
+        program = self.program
+        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        changed._tensors.clear()
+        places, count = places.contiguous(), len(places)
+        for name, value in state.items():
+            if value.dtype == torch.float32:
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
+                for i, part in enumerate(parts):
+                    plane = (value[:, i] if value.ndim == 4 else value).contiguous()
+                    number = program.layout.reals[part]
+                    program.library.pd_put_real(
+                        changed.handle, number, count, address(places), address(plane)
+                    )
+            else:
+                plane = value.contiguous()
+                slot, bits, _ = program.planes_of(name)
+                item = plane.element_size()
+                program.library.pd_put(
+                    changed.handle, slot, bits, item, count, address(places), address(plane)
+                )
         return changed
 
     def __iter__(self) -> Iterator[str]:

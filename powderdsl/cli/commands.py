@@ -16,7 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run_command", "Run rules on a world: watch it, or write a picture or an animation."),
     "check": ("check_command", "Find the mistakes in rule files and tasks, all at once."),
     "compile": ("compile_command", "Print what a stage of the compiler makes of rules."),
-    "show": ("show_command", "List elements, reactions, passes and parameters; or what a task is, with pictures."),
+    "show": ("show_command", "List elements, reactions, passes and parameters; or what a task is."),
     "test": ("test_command", "Run the tests of packs, and hold their invariants against the rules."),
     "trace": ("trace_command", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
     "fuzz": ("fuzz_command", "Compare all backends on random rules and worlds."),

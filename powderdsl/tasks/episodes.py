@@ -135,11 +135,11 @@ class TaskProgram:
             }
 
         world, other = episodes.world, new.world
-        state = world.state
-        if reuse and isinstance(state, PackedState):
-            state.put(places, other.state)
+        state: Mapping[str, Tensor]
+        if isinstance(world.state, PackedState):
+            state = world.state.put(places, other.state, reuse=reuse)
         else:
-            state = {name: placed(value, other.state[name]) for name, value in state.items()}
+            state = {name: placed(value, other.state[name]) for name, value in world.state.items()}
         clock = [placed(getattr(world, name), getattr(other, name)) for name in ("seed", "index", "step")]
         return Episodes(
             World(self.simulator, state, *clock),

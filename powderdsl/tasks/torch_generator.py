@@ -30,7 +30,7 @@ CHUNK_CELLS = 1 << 20
 CHANCE_BITS = 16
 """Scattered cells are drawn with that many bits: chances are multiples of 2⁻¹⁶."""
 
-_NUMBERS, _STATEMENT, _COUNTER, _INDEX = 64, 0x9E3779B1, 0x85EBCA6B, 0x7A51
+_NUMBERS, _STATEMENT, _COUNTER, _INDEX = 128, 0x9E3779B1, 0x85EBCA6B, 0x7A51
 """Draws of one statement and repetition; odd factors that spread counters; the worlds' index of `base_keys`, which
 keeps draws of generators apart from those of rules."""
 
@@ -66,17 +66,26 @@ def name_number(name: str) -> int:
 
 
 class _Draws:
-    """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter."""
+    """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter.
 
-    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Tensor]):
-        self.hashes, self.statement, self.names = hashes, statement, names
-        device = hashes.keys.device
-        self.counters = torch.arange(repeats, device=device) * _NUMBERS
+    `wanted` is how many draws there will be: all of them are hashed at once.
+    """
+
+    def __init__(
+        self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Tensor], wanted: int
+    ):
+        self.hashes, self.names, self.device = hashes, names, hashes.keys.device
         self.used = 0
+        self.drawn: Tensor | None = None
+        if wanted:
+            counters = torch.arange(repeats, device=self.device)[:, None] * _NUMBERS
+            counters = (counters + torch.arange(wanted, device=self.device)).flatten()
+            self.drawn = hashes.draw(statement, counters).view(-1, repeats, wanted)
 
     def uniform(self, low: Tensor | int, high: Tensor | int) -> Tensor:
         """Whole numbers from `low` to `high`, both included; where there are none, `low`."""
-        drawn = self.hashes.draw(self.statement, self.counters + self.used)
+        assert self.drawn is not None
+        drawn = self.drawn[..., self.used]
         self.used += 1
         return low + ((drawn * (high - low + 1)) >> 32)
 
@@ -91,7 +100,7 @@ class _Draws:
         if amount.op == "neg":
             return -parts[0]
         if amount.op in ("div", "mod") and any(isinstance(part, Tensor) for part in parts):
-            a, b = (torch.as_tensor(part, device=self.counters.device) for part in parts)
+            a, b = (torch.as_tensor(part, device=self.device) for part in parts)
             return torch.div(a, b, rounding_mode="floor") if amount.op == "div" else torch.remainder(a, b)
         return calculate(amount.op, parts[0], parts[1])  # type: ignore[arg-type]
 
@@ -99,7 +108,11 @@ class _Draws:
         """int64 that broadcasts to [B, R]."""
         if amount is None:
             return None
-        return torch.as_tensor(self.value(amount), device=self.counters.device)
+        return torch.as_tensor(self.value(amount), device=self.device)
+
+
+def _draws_in(*amounts: Amount | None) -> int:
+    return sum(part.op == "draw" for one in amounts if one is not None for part in one.walk())
 
 
 class WorldMaker:
@@ -171,7 +184,7 @@ class WorldMaker:
         """`names` and more of them: int64 that broadcasts to [B, R]."""
         found = dict(names)
         for name, amount in lets:
-            value = _Draws(hashes, name_number(name), repeats, found).tensor(amount)
+            value = _Draws(hashes, name_number(name), repeats, found, _draws_in(amount)).tensor(amount)
             assert value is not None
             found[name] = value
         return found
@@ -180,7 +193,8 @@ class WorldMaker:
         """Words [B, W, K] of a region. Its own draws hang on its name and the shape's place."""
         found = []
         for number, shape in enumerate(region.shapes):
-            draws = _Draws(hashes, name_number(f"{region.name} {number}"), 1, names)
+            place = name_number(f"{region.name} {number}")
+            draws = _Draws(hashes, place, 1, names, _draws_in(*shape.amounts))
             words = self.drawn_words(shape, [draws.tensor(one) for one in shape.amounts])
             full = (len(hashes.keys[0]), 1, self.size[1], self.words)
             found.append(words.expand(full)[:, 0])
@@ -218,7 +232,7 @@ class WorldMaker:
         """Paint all groups on planes, in place."""
         batch = planes.shape[1]
         for group in groups:
-            count = _Draws(hashes, group.number, 1, names).tensor(group.count)
+            count = _Draws(hashes, group.number, 1, names, _draws_in(group.count)).tensor(group.count)
             assert count is not None
             repeats = group.most
             if planes.device.type == "cpu" and repeats > 1:
@@ -229,7 +243,8 @@ class WorldMaker:
             local = self._lets(group.lets, hashes, repeats, names)
             painters = []
             for one in group.drawings:
-                draws = _Draws(hashes, one.number, repeats, local)
+                wanted = _draws_in(*one.amounts) + (len(one.ids) > 1)
+                draws = _Draws(hashes, one.number, repeats, local, wanted)
                 painters.append(_Painter(self, one, draws, active.expand(batch, repeats), len(planes)))
             for repeat in range(repeats):
                 for painter in painters:
@@ -256,7 +271,7 @@ class _Painter:
 
     def _elements(self) -> Tensor:
         """The ids, int64 that broadcasts to [B, R]; those of stamps stand in their pictures."""
-        ids = torch.tensor(self.drawing.ids or (0,), device=self.draws.counters.device)
+        ids = torch.tensor(self.drawing.ids or (0,), device=self.draws.device)
         return ids[0] if len(ids) == 1 else ids[self.draws.uniform(0, len(ids) - 1)]
 
     def paint(self, planes: Tensor, repeat: int, regions: Mapping[str, Tensor]) -> None:

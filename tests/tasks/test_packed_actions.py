@@ -48,6 +48,30 @@ def test_packed_worlds_are_acted_on_alike(torch, size):
                 assert torch.equal(fresh, value), name
 
 
+@pytest.mark.parametrize("size", ["[64, 64]", "[20, 70]"])
+def test_packed_worlds_restart_alike(torch, size):
+    from powderdsl.tasks.episodes import compile_task
+
+    task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
+    native, plain = (compile_task(task, backend=backend) for backend in ("native", "torch"))
+    for batch, reuse in ((3, True), (3, False), (20, True)):
+        one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
+        actions = torch.tensor([[7, 2, 14, 2, 0]]).expand(batch, 5)
+        for turn in range(3):
+            one, *_ = native.act(one, actions, reuse=reuse)
+            other, *_ = plain.act(other, actions)
+            kept = one.world.state["element"].clone()
+            seeds, mask = torch.arange(batch) + 100 * turn, torch.arange(batch) % 3 == turn
+            again = native.restart(one, mask, seeds, reuse=reuse)
+            other = plain.restart(other, mask, seeds)
+            if not reuse:
+                assert torch.equal(native.simulator.step(one.world, 0).ids, kept)
+            one = again
+            for name, value in other.world.state.items():
+                assert torch.equal(one.world.state[name], value), name
+            assert one.world.step.tolist() == other.world.step.tolist()
+
+
 def test_filling_boxes_of_a_packed_state(torch):
     from powderdsl.tasks.episodes import compile_task
 

@@ -1,0 +1,30 @@
+"""Tests of tasks read many files on the same rules: those are read and checked once."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from powderdsl.compiler import load_with_diagnostics, read
+from powderdsl.diagnostics import Reporter
+from powderdsl.tasks import task_file
+
+RULES = "powderworld"
+
+
+@cache
+def loaded():  # type: ignore[no-untyped-def]
+    return load_with_diagnostics(RULES), read([RULES], Reporter())
+
+
+@pytest.fixture(autouse=True)
+def _rules_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name, params=None):  # type: ignore[no-untyped-def]
+        return loaded()[0] if name == RULES and not params else load_with_diagnostics(name, params=params)
+
+    def read_names(names, reporter):  # type: ignore[no-untyped-def]
+        return loaded()[1] if list(names) == [RULES] else read(names, reporter)
+
+    monkeypatch.setattr(task_file, "load_with_diagnostics", load)
+    monkeypatch.setattr(task_file, "read", read_names)
