@@ -21,20 +21,29 @@ class Expand(nn.Module):
 
     def __init__(self, sources: tuple[int, ...], tables: Any):
         super().__init__()
-        self.sources = sources
-        self.register_buffer("tables", torch.as_tensor(tables, dtype=torch.float32).T.contiguous())
-        self.of_elements = [channel for channel, source in enumerate(sources) if source == 0]
+        whole = torch.as_tensor(tables, dtype=torch.float32)
+        single = (whole != 0).sum(1) == 1
+        of_one = (
+            single & (whole.amax(1) == 1) & (torch.tensor(sources) == 0)
+        )  # 1 where one element is, else 0
+        flags = [*of_one.tolist(), False]
+        first = flags.index(True) if True in flags else 0
+        self.flags = slice(first, flags.index(False, first))  # in a row: then they are written at once
+        self.channels = len(sources)
+        rest = [channel for channel in range(self.channels) if not first <= channel < self.flags.stop]
+        self.others = [(channel, sources[channel]) for channel in rest]
+        self.register_buffer("tables", whole)
+        self.register_buffer("elements", whole[self.flags].argmax(1).float()[:, None, None])
 
     def forward(self, observed: Tensor) -> Tensor:
         """Bytes, or the same numbers as floats: [B, C, H, W]."""
-        numbers = observed.long()
-        batch, _, height, width = numbers.shape
-        out = torch.empty(batch, len(self.sources), height, width, device=observed.device)
-        tables = self.get_buffer("tables")
-        out[:, self.of_elements] = tables[:, self.of_elements][numbers[:, 0]].permute(0, 3, 1, 2)
-        for channel, source in enumerate(self.sources):
-            if source:
-                out[:, channel] = tables[numbers[:, source], channel]
+        batch, _, height, width = observed.shape
+        out = torch.empty(batch, self.channels, height, width, device=observed.device)
+        out[:, self.flags] = observed[:, :1].float() == self.get_buffer("elements")
+        tables, numbers = self.get_buffer("tables"), observed.int()
+        for channel, source in self.others:
+            found = tables[channel].index_select(0, numbers[:, source].flatten())
+            out[:, channel] = found.view(batch, height, width)
         return out
 
 
