@@ -173,7 +173,12 @@ def mutations() -> str:
     text = (DOCS.parent / "tests" / "mutations.yaml").read_text(encoding="utf-8")
     rows = []
     for row in yaml.load(text, yaml.CBaseLoader):
-        by = f"`check`: `{row['check']}`" if "check" in row else f"`test`: {row['test']}"
+        code, _, statement = row.get("check", "").partition(": ")
+        by = (
+            f"`check`: `{code}`" + (f" {statement}" if statement else "")
+            if code
+            else f"`test`: {row['test']}"
+        )
         rows.append((f"`{row['pack']}`", row["mistake"], by))
     return table(("pack", "mistake", "noticed by"), rows)
 

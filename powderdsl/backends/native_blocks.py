@@ -79,7 +79,7 @@ def _all_text(statement: str | Lanes) -> str:
 def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
     """One loop over lanes, which are worlds. Fields that nothing else reads are written over by each: they need one lane.
 
-    Lanes that are strips read each other: there are as many rounds as sweeps, and a round makes one sweep of all lanes.
+    Lanes that are strips read each other: sweeps follow each other through them block by block, see EACH_BLOCK.
     """
     written = {name for sweep in run for name in sweep.fields}
     used = sorted({name for sweep in run for name in _VARIABLE.findall(sweep.rows) if name.startswith("f")})
@@ -91,15 +91,15 @@ def lane_loop(run: list[Lanes], seen_outside: set[str]) -> str:
     rows = "\n".join(
         (f"if (!strips || part == {number}) " if several else "")
         + (
-            f"for (int y = 0; y < height; y++) {{\n{sweep.rows}\n}}"
+            f"for (int y = first; y < last; y++) {{\n{sweep.rows}\n}}"
             if sweep.by_row
             else f"{{\n{sweep.rows}\n}}"
         )
         for number, sweep in enumerate(run)
     )
-    rounds = f"for (int part = 0; part <= ({len(run) - 1} & strips); part++) " if several else ""
+    blocks = f"EACH_BLOCK({len(run) - 1})"
     after = "\n".join(sweep.after for sweep in run)
-    loop = f"{before}\n{rounds}for (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
+    loop = f"{before}\n{blocks} for (int l = 0; l < c.lanes; l++) {{ {places}\n{rows}\n}}\n{after}"
     outputs = [output for sweep in run for output in sweep.outputs]
     declared = " ".join(f"{'Field' if name.startswith('f') else 'Plane'}* {name};" for name, _ in outputs)
     if any(sweep.asked is None for sweep in run):

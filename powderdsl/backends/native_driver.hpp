@@ -36,8 +36,11 @@ static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int 
 static Context* new_context(const Grid& g) {
   Context* c = new (std::align_val_t(64)) Context();
   c->g = g;
-  int rest = g.width - 64 * (g.words - 1);
-  c->valid_last = splat(rest == 64 ? ~0ull : (1ull << rest) - 1);
+  c->rest = g.width - 64 * (g.words - 1);
+  c->near_rows = g.stride > 1024 ? 4 : g.stride > 512 ? 8 : 16;
+  c->near_bits = (1u << c->near_rows) - 1;
+  c->block = g.strips && REAL_ROWS <= c->near_rows ? c->near_rows : g.height;
+  c->valid_last = splat(c->rest == 64 ? ~0ull : (1ull << c->rest) - 1);
   const int whole = g.world_height();
   for (int y = -HALO; y < whole + HALO; y++) c->lines.push_back(((y % whole) + whole) % whole);
   for (int y = -HALO; y < g.height + HALO; y++) {
@@ -166,6 +169,7 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
     }
   }
   for (int i = 0; i < REALS; i++) c.real[i] = group.real[i];
+  c.present = ~0ull;
   for (long s = 0; s < steps; s++) {
     begin_step(c, k, number, s);
     reset_slots(c);

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from powderdsl.backends.native_blocks import Lanes
 from powderdsl.backends.native_layout import Layout
+from powderdsl.backends.native_loops import is_uniform
 from powderdsl.backends.native_sweeps import Sweep
 from powderdsl.ir.ops import REAL, Node, walk
 
@@ -21,7 +22,7 @@ def choices(node: Node, have: Callable[[Node], bool]) -> list[Node]:
             return []
         chain.append(node)
         node = node.args[2]
-    if len(chain) < FEWEST:
+    if len(chain) < FEWEST or is_uniform(node):  # what is the same everywhere stands in no field
         return []
     for (
         choice
@@ -71,10 +72,10 @@ def layer_lanes(
         f"some{name} |= lay_row(c, {name}, l{name}, {base}, l{base}, y, any);"
         for name, base in zip(names, bases, strict=True)
     )
-    # Sixteen rows at a time: what they read and write stays in the nearest cache while the choices pass over it.
+    # A few rows at a time: what they read and write stays in the nearest cache while the choices pass over it.
     body = [
-        "for (int from = 0; from < height; from += 16) {",
-        f"for (int y = from; y < from + 16 && y < height; y++) {{ const bool any = is_active(c, {first + count}, l, y); {copies} }}",
+        "for (int from = first; from < last; from += c.near_rows) {",
+        f"for (int y = from; y < from + c.near_rows && y < last; y++) {{ const bool any = is_active(c, {first + count}, l, y); {copies} }}",
     ]
     for level in range(count):
         at = count - 1 - level

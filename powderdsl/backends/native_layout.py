@@ -24,6 +24,8 @@ class Layout:
     """Planes that most movements carry along."""
     reach: int = 1
     """Columns beyond a row of reals that are read."""
+    rows: int = 1
+    """Rows away that reals are read at, at most."""
     halo: int = 16
     """Rows and columns beyond the grid that tables and rows of reals have room for."""
     around: int = 0

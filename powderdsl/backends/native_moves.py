@@ -9,7 +9,7 @@ from powderdsl.ir.ops import FLAG, Node, walk
 
 @dataclass(frozen=True)
 class Movement:
-    """One plane that moves: by `swap`, or by `arrive` with what movers leave behind as native_runtime.hpp calls it."""
+    """One plane that moves: by `swap`, or by `arrive` with what movers leave behind as native_planes.hpp calls it."""
 
     op: str
     content: Node

@@ -17,6 +17,16 @@ from powderdsl.backends.native_loops import (
     zero_with,
 )
 from powderdsl.backends.native_moves import Movement, depends, move_calls, movements
+from powderdsl.backends.native_presence import (
+    Asked,
+    asked_ids,
+    asked_now,
+    asked_word,
+    element_nodes,
+    element_planes,
+    only_moves,
+    there,
+)
 from powderdsl.backends.native_sweeps import unchanged
 from powderdsl.backends.native_values import ValueWriter
 from powderdsl.ir.ops import REAL, Node, PassGraph, Step, walk
@@ -28,6 +38,9 @@ class PassWriter(ValueWriter):
     def __init__(self, pass_: PassGraph, number: int, layout: Layout):
         super().__init__(pass_, layout)
         self.number = number
+        self.asked_ids = asked_ids(pass_, element_planes(layout))
+        self.asked = asked_word(self.asked_ids)
+        """All ids that the pass asks for."""
         asked = Counter(
             key
             for step in pass_.moments
@@ -45,7 +58,8 @@ class PassWriter(ValueWriter):
             current.update(step.writes)
         self.finish()
         body = self.block.text()
-        return f"// pass {self.number}\nOUTLINE void pass_{self.number}(Context& c) {{\nconst int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0; (void)words; (void)height; (void)width; (void)strips;\n{body}\n}}"
+        skip = "" if self.asked_ids is None else f"if (!({there(self.asked_ids)})) return;\n"
+        return f"// pass {self.number}\nOUTLINE void pass_{self.number}(Context& c) {{\n{skip}const int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0; (void)words; (void)height; (void)width; (void)strips;\n{body}\n}}"
 
     def borrow(self) -> None:
         """Slots that the pass both reads and writes: nobody else holds their planes while it runs."""
@@ -65,22 +79,31 @@ class PassWriter(ValueWriter):
             if id(node) in self.alive and node.type != REAL and not self.have(node)
         ]
         guards = [guard for guard in step.guards if guard.op != "const"]
+        moves_only = only_moves(step, {slot: self.before(slot, current) for slot, _ in step.writes})
+        if not moves_only and any(self.have(node) for _, node in step.writes):
+            self.anything()
         if not writes:
             return
         self.comparisons(guards)
+        guarded = len(guards) == len(step.guards) > 0 and not any(is_uniform(guard) for guard in guards)
+        condition = ""
+        if guarded:
+            self.inputs(guards)
+            now = {slot: self.before(slot, current) for slot in self.layout.planes}
+            asked = asked_now(guards, element_planes(self.layout), element_nodes(now))
+            self.asked |= asked_word(asked)
+            condition = self.guards(guards, asked)
+        if not moves_only:
+            self.anything(f"if ({condition}) " if guarded else "")
         unknown = [node for slot, node in writes if slot not in current and slot not in self.layout.planes]
-        if unknown:  # a scratch field's first write: what it held is not in a plane
-            self.inputs(unknown)
-            self.ensure(unknown)
-            writes = [(slot, node) for slot, node in writes if not self.have(node)]
-            if not writes:
-                return
-        if not guards or any(g.op == "const" for g in step.guards) or any(is_uniform(g) for g in guards):
-            self.inputs([node for _, node in writes])
-            self.ensure([node for _, node in writes])
+        if unknown or not guarded:  # a scratch field's first write: what it held is not in a plane
+            wanted = unknown if guarded else [node for _, node in writes]
+            self.inputs(wanted)
+            self.ensure(wanted)
+        writes = [(slot, node) for slot, node in writes if not self.have(node)]
+        if not writes:
             return
-        self.inputs([*guards, *(node for _, node in writes)])
-        condition = self.guards(guards)
+        self.inputs([node for _, node in writes])
         olds = {id(node): self.old(slot, current.get(slot)) for slot, node in writes}
         moved = movements([node for _, node in writes], [self.before(slot, current) for slot, _ in writes])
         carried = [node for _, node in writes if id(node) in moved]
@@ -91,6 +114,10 @@ class PassWriter(ValueWriter):
         else:
             self.change(others, olds, condition)
             self.move(carried, moved, olds)
+
+    def anything(self, condition: str = "") -> None:
+        """From here on any element may be there, until the next step looks."""
+        self.block.statements.append(f"{condition}c.present = ~0ull;")
 
     def before(self, slot: str, current: dict[str, Node]) -> Node | None:
         """The node that a slot holds before a moment."""
@@ -174,7 +201,7 @@ class PassWriter(ValueWriter):
         self.block.statements.append(f"Plane* {name} = keep(c.slot[{self.layout.planes[slot]}]);")
         return name
 
-    def guards(self, guards: list[Node]) -> str:
+    def guards(self, guards: list[Node], asked: Asked | None = None) -> str:
         """Masks of a moment in planes: first what is cheap, and the rest only where that leaves something."""
         guards = list({id(g): g for g in guards}.values())
         open_guards = [g for g in guards if not self.have(g)]
@@ -199,7 +226,7 @@ class PassWriter(ValueWriter):
                 whole[id(guard)] = name
             clean = any(is_clean(part, self.have) for part in cheap)
             outputs.append((name, " & ".join(parts) if clean else " & ".join([*parts, "valid"])))
-        self.emit_loop(loop, outputs, empty)
+        self.emit_loop(loop, outputs, empty, f"!({there(asked)})" if asked is not None else "")
         self.planes.update(whole)  # not before: until the loop has run, their planes hold nothing
         condition = " || ".join(
             f"!{name}->zero"
@@ -211,9 +238,11 @@ class PassWriter(ValueWriter):
         self.planes, self.fields, self.block = dict(self.planes), dict(self.fields), Block()
         self.ensure([need for _, rest in rest_guards for part in rest for need in self.needs(part)])
         lines = []
+        nothing = []
         loop = Loop(self.planes, self.layout)
         for guard, rest in rest_guards:
             candidate = candidates[id(guard)]
+            nothing.append(empty_condition(candidate, rest, self.planes))
             inner = loop.inner()
             wanted = f"w{names[id(guard)]}"
             value = wanted
@@ -233,16 +262,17 @@ class PassWriter(ValueWriter):
             )
         takes = " ".join(f"{name} = take(c); V a{name} = splat(0);" for name in names.values())
         ends = " ".join(f"{name}->zero = !any(a{name});" for name in names.values())
+        without = " ".join(f"{name} = keep(c.nothing);" for name in names.values())
         self.block.statements.append(
+            f"if ({' && '.join(nothing)}) {{ {without} }} else {{\n"
             f"{loop.ready()}\n{takes}\nfor (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) {{ const V valid = c.valid(w); (void)valid;\n"
-            + "\n".join(lines) + f"\n}}\n{ends}"
+            + "\n".join(lines) + f"\n}}\n{ends}\n}}"
         )  # fmt: skip
         text = self.block.text()
         self.planes, self.fields, self.block = outer
         declared = ", ".join(f"*{name}" for name in names.values())
-        otherwise = " ".join(f"{name} = keep(c.nothing);" for name in names.values())
         self.block.statements.append(
-            f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {otherwise} }}"
+            f"Plane {declared};\nif ({condition}) {{\n{text}\n}} else {{ {without} }}"
         )
         self.planes.update(names)
         return " || ".join(f"!{self.planes[id(g)]}->zero" for g in guards)
@@ -306,6 +336,16 @@ class PassWriter(ValueWriter):
             place = f"c.{kind}[{table[slot]}]"
             lines.append(f"if ({place}) give(c, {place}); {place} = {prefix}{table[slot]};")
         self.block.statements.append("\n".join(lines))
+
+
+def empty_condition(candidate: str, parts: list[Node], planes: dict[int, str]) -> str:
+    """When a mask is surely empty: its candidates are, or all planes that one of its other parts hangs on."""
+    reasons = [f"{candidate}->zero"]
+    for part in parts:
+        names = zero_with(part, planes)
+        if names is not None:
+            reasons.append(" && ".join(f"{name}->zero" for name in sorted(names)) or "true")
+    return "(" + " || ".join(f"({reason})" for reason in dict.fromkeys(reasons)) + ")"
 
 
 def _conjunctions(node: Node) -> Iterator[Node]:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from importlib.resources import files
+from operator import or_
 
 from powderdsl.backends.native_layout import Layout, layout_of, literal
 from powderdsl.backends.native_passes import PassWriter
+from powderdsl.backends.native_presence import look
 from powderdsl.ir.ops import Program
 
-GENERATOR_VERSION = 2
+GENERATOR_VERSION = 4
 """Part of every cache key: raise it when generated code changes meaning."""
+
+LIBRARY = ("vectors", "runtime", "planes", "fields")
+"""What stands before the generated passes, in this order: native_*.hpp."""
+DRIVER = ("driver", "views")
+"""What stands behind them."""
 
 SNAP = 2.0**-20
 
@@ -17,7 +25,9 @@ SNAP = 2.0**-20
 def native_source(program: Program) -> tuple[str, Layout]:
     """The whole translation unit, and its layout."""
     layout = layout_of(program)
-    passes = [PassWriter(p, i, layout).source() for i, p in enumerate(program.passes)]
+    writers = [PassWriter(p, i, layout) for i, p in enumerate(program.passes)]
+    passes = [writer.source() for writer in writers]
+    asked = reduce(or_, (writer.asked for writer in writers), 0)
     calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
     resets = [
         (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
@@ -42,6 +52,7 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"#define MOVING {layout.moving}",
         f"#define ACTIVE {layout.active}",
         f"#define REACH {layout.reach}",
+        f"#define REAL_ROWS {layout.rows}",
         f"#define HALO {layout.halo}",
         f"#define AROUND_ROWS {layout.around}",
         f"#define BEYOND_ROWS {layout.beyond}",
@@ -60,9 +71,11 @@ def native_source(program: Program) -> tuple[str, Layout]:
         f"static const std::vector<u32> STREAM_IDENT = {{{', '.join(idents)}}};",
     ])  # fmt: skip
     folder = files("powderdsl.backends")
-    runtime = (folder / "native_runtime.hpp").read_text(encoding="utf-8")
-    driver = (folder / "native_driver.hpp").read_text(encoding="utf-8")
-    views = (folder / "native_views.hpp").read_text(encoding="utf-8")
+    before, after = (
+        "\n".join((folder / f"native_{part}.hpp").read_text(encoding="utf-8") for part in parts)
+        for parts in (LIBRARY, DRIVER)
+    )
     body = "\n\n".join(passes)
-    step = f"static void run_passes(Context& c) {{\n  START;\n{calls}\n}}"
-    return "\n".join([head, runtime, tables, body, step, driver, views]), layout
+    known = "  if (c.present == ~0ull) look(c);\n" if asked else ""
+    step = f"{look(layout, asked)}\nstatic void run_passes(Context& c) {{\n  START;\n{known}{calls}\n}}"
+    return "\n".join([head, before, tables, body, step, after]), layout

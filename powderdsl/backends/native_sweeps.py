@@ -98,6 +98,7 @@ class Sweep:
     def row(self, field: str, dy: int, wraps: bool = True) -> str:
         """The pointer to a field's row, set up once a row."""
         self.used.add(field)
+        self.layout.rows = max(self.layout.rows, abs(dy))
         call = (
             f"real_row_wrapped(c, {field}, l{field}, y + {dy})"
             if wraps

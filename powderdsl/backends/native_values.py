@@ -183,19 +183,24 @@ class ValueWriter:
         return None
 
     def emit_loop(
-        self, loop: Loop, outputs: list[tuple[str, str]], empty: list[frozenset[str] | None] | None = None
+        self,
+        loop: Loop,
+        outputs: list[tuple[str, str]],
+        empty: list[frozenset[str] | None] | None = None,
+        absent: str = "",
     ) -> None:
-        """A loop that fills planes. `empty`: planes of which it is known that if they are empty, so is the output."""
+        """A loop that fills planes. `empty`: planes of which it is known that if they are empty, so is the output;
+        `absent`: a condition in C++ under which all outputs are."""
         takes = " ".join(f"{name} = take(c); V a{name} = splat(0);" for name, _ in outputs)
         declared = "Plane " + ", ".join(f"*{name}" for name, _ in outputs) + ";\n"
-        nothing = ""
+        conditions = [absent] if absent else []
         if empty and all(names is not None for names in empty):
-            asked = (
-                " && ".join(sorted({f"{name}->zero" for names in empty for name in names or ()})) or "true"
-            )
-            nothing = (
-                f"if ({asked}) {{ {' '.join(f'{name} = keep(c.nothing);' for name, _ in outputs)} }} else "
-            )
+            zero = sorted({f"{name}->zero" for names in empty for name in names or ()})
+            conditions.append(f"({' && '.join(zero) or 'true'})")
+        nothing = ""
+        if conditions:
+            without = " ".join(f"{name} = keep(c.nothing);" for name, _ in outputs)
+            nothing = f"if ({' || '.join(conditions)}) {{ {without} }} else "
         stores = "\n".join(
             f"{{ const V o = {value}; {name}->data[i] = o; a{name} |= o; }}" for name, value in outputs
         )

@@ -78,16 +78,15 @@ class _Planner:
 
     def __post_init__(self) -> None:
         alive = {id(node) for node in nodes_of(self.pass_, moments=False)}
-        self.steps = [
-            (step, writes)
-            for step in self.pass_.moments
-            if (writes := [w for w in step.writes if id(w[1]) in alive])
-        ]
+        self.steps: list[tuple[Step, list[tuple[str, Node]]]] = []
         self.olds: list[dict[str, Node]] = []
         current: dict[str, Node] = {}
-        for step, _ in self.steps:
-            self.olds.append(dict(current))
-            current.update(step.writes)
+        for step in self.pass_.moments:
+            writes = [write for write in step.writes if id(write[1]) in alive]
+            if writes:
+                self.steps.append((step, writes))
+                self.olds.append(dict(current))
+            current.update(step.writes)  # also what nobody reads: a moment after it may not be left out then
         self.written = {id(node): (i, slot) for i, (_, ws) in enumerate(self.steps) for slot, node in ws}
         roots = [node for _, node in self.pass_.outputs]
         roots += [guard for step, _ in self.steps for guard in step.guards]

@@ -1,4 +1,4 @@
-"""`powderdsl check`: every mistake in rule files, without running anything."""
+"""`powderdsl check`: every mistake in rule files, and every invariant that is easily broken."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from powderdsl.ledgers.account import ledger_data, ledger_text
 from powderdsl.ledgers.book import Ledger
 from powderdsl.ledgers.book import ledger as make_ledger
 from powderdsl.model.types import Ruleset
-from powderdsl.tasks.shipped_tasks import is_task, load_task_with_diagnostics
-from powderdsl.tasks.task import Task
+from powderdsl.tasks.task_names import is_task
 
 if TYPE_CHECKING:
     from powderdsl.ir.cost import PassCost
+    from powderdsl.tasks.task import Task
 
 
 @click.command("check")
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 def command(
     rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool, cost: bool, ledger: bool
 ) -> int:
-    """Find the mistakes in rule files and tasks, all at once.
+    """Find the mistakes in rule files and tasks, all at once, and invariants that do not hold.
 
     Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml. A task is
     a shipped one by name, or a file that begins with `task:`.
@@ -60,7 +60,7 @@ def command(
     errors = warnings = 0
     for name in rules:
         found_task = _check_task(name) if is_task(name) else None
-        ruleset, diagnostics = _check(name) if found_task is None else (None, found_task[1])
+        ruleset, diagnostics, book = _check(name) if found_task is None else (None, found_task[1], None)
         counts = Counter(one.severity for one in diagnostics)
         errors += counts[Severity.ERROR]
         warnings += counts[Severity.WARNING]
@@ -73,7 +73,7 @@ def command(
             expenses[name] = _costs(ruleset)
             lines += ["", *_cost_lines(expenses[name])]
         if ledger and ruleset is not None:
-            ledgers[name] = make_ledger(ruleset)
+            ledgers[name] = book or make_ledger(ruleset)
             lines += ["", ledger_text(ledgers[name])]
     if layout == "json" and (cost or ledger):
         data: dict[str, Any] = {"diagnostics": [*map(diagnostic_data, found)]}
@@ -96,14 +96,23 @@ def command(
     return FAILED if warnings and warnings_as_errors else OK
 
 
-def _check(name: str) -> tuple[Ruleset | None, tuple[Diagnostic, ...]]:
+def _check(name: str) -> tuple[Ruleset | None, tuple[Diagnostic, ...], Ledger | None]:
+    """The rules if they can be loaded, all that is wrong with them, and their ledger if their invariants needed it."""
     try:
-        return load_with_diagnostics(name)
+        ruleset, remarks = load_with_diagnostics(name)
     except CompileError as error:
-        return None, error.diagnostics
+        return None, error.diagnostics, None
+    if not ruleset.invariants:
+        return ruleset, remarks, None
+    from powderdsl.properties.refute import refuted  # brings numpy
+
+    book = make_ledger(ruleset)
+    return ruleset, (*remarks, *refuted(ruleset, book)), book
 
 
 def _check_task(name: str) -> tuple[Task | None, tuple[Diagnostic, ...]]:
+    from powderdsl.tasks.shipped_tasks import load_task_with_diagnostics  # brings numpy
+
     try:
         return load_task_with_diagnostics(name)
     except CompileError as error:

@@ -16,7 +16,7 @@ from powderdsl.diagnostics import Span
 from powderdsl.model.reactions import reactions
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
 from powderdsl.model.types import Element, Param, Pass, Property, Ruleset, Value
-from powderdsl.tasks.shipped_tasks import is_task
+from powderdsl.tasks.task_names import is_task
 
 
 @click.command("show")

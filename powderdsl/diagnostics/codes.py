@@ -77,6 +77,9 @@ _ROWS = (
     ("PD509", "rule-does-nothing", _WARNING),
     ("PD510", "invariant-says-nothing", _WARNING),
     ("PD511", "invariant-cannot-hold", _ERROR),
+    ("PD512", "invariant-broken", _ERROR),
+    ("PD513", "condition-decides-nothing", _WARNING),
+    ("PD514", "rule-overruled", _WARNING),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from powderdsl.diagnostics import Reporter, suggest
+from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.compose import Composition, compose
 from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
@@ -14,6 +14,7 @@ from powderdsl.model.examples import check_examples
 from powderdsl.model.expressions import Typer
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
+from powderdsl.model.needless import report_needless, report_undrawn
 from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
 from powderdsl.model.satisfy import Facts
 from powderdsl.model.scope import Scope
@@ -28,11 +29,17 @@ from powderdsl.model.symbols import (
     settled,
 )
 from powderdsl.model.types import CHANCE, FLAG, Element, Kind, Param, Property, Ruleset, Stream, Value
+from powderdsl.model.unused import report_unused
 from powderdsl.syntax.ast import Syntax
 
 
-def resolve_names(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Typer:
-    """What checks expressions against all names of some packs. Raises CompileError where names clash."""
+def resolve_names(
+    packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter
+) -> tuple[Typer, list[tuple[str, int, Span]]]:
+    """What checks expressions against all names of some packs, and where elements' own values stand.
+
+    Raises CompileError where names clash.
+    """
     composition = compose(packs, ruleset, reporter)
     reporter.raise_if_errors()  # with names that clash or packs that lack, rules would only be misread
     symbols = base_symbols(composition)
@@ -42,14 +49,14 @@ def resolve_names(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, report
     _params(symbols, typer)
     _properties(symbols, typer)
     _fields(symbols, typer)
-    _property_values(symbols, typer)
+    given = _property_values(symbols, typer)
     _sets(typer)
-    return typer
+    return typer, given
 
 
 def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Ruleset:
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter."""
-    typer = resolve_names(packs, ruleset, reporter)
+    typer, given = resolve_names(packs, ruleset, reporter)
     symbols, composition = typer.symbols, typer.symbols.composition
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
@@ -66,10 +73,11 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     }
     facts = _facts(symbols)
     check_logic(passes, facts, elaborated, reporter)
-    _check_use(composition, typer, produced_ids(passes, facts), reporter)
+    report_unused(composition, typer, produced_ids(passes, facts))
     matrix = _matrix(composition, symbols, reporter)
     reporter.raise_if_errors()
-    return Ruleset(
+    report_needless(passes, facts, reporter)
+    found = Ruleset(
         name=composition.name,
         about=composition.about,
         packs=tuple(pack.name.text for pack in packs),
@@ -84,6 +92,8 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
         tests=examples,
         invariants=invariants,
     )
+    report_undrawn(found, given, facts, reporter)
+    return found
 
 
 def _facts(symbols: Symbols) -> Facts:
@@ -184,7 +194,8 @@ def _properties(symbols: Symbols, typer: Typer) -> None:
         symbols.properties[name] = Property(name, kind, (), frozenset(), named.pack, named.decl.name.span)
 
 
-def _property_values(symbols: Symbols, typer: Typer) -> None:
+def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Span]]:
+    """Fill in the properties' values; where elements' own values stand: property, id, place."""
     composition = symbols.composition
     given: dict[tuple[str, str], tuple[Syntax, str]] = {}
     sources = [(named.pack, name, named.decl.values) for name, named in composition.element_decls.items()]
@@ -230,6 +241,8 @@ def _property_values(symbols: Symbols, typer: Typer) -> None:
             symbols.properties[name] = replace(
                 prop, values=_values(prop, named.decl, named.pack, given, symbols, typer)
             )
+    ids = {name: element.id for name, element in composition.elements.items()}
+    return [(name, ids[of], value[0].span) for (name, of), value in given.items() if of in ids]
 
 
 def _values(
@@ -329,51 +342,6 @@ def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tu
                 helps=["rename one of them"],
             )
     return tuple(streams)
-
-
-def _check_use(composition: Composition, typer: Typer, produced: frozenset[int], reporter: Reporter) -> None:
-    for qualified, param in composition.params.items():
-        if qualified not in typer.used and not any(
-            qualified in map(str, p.values) for p in typer.symbols.properties.values()
-        ):
-            reporter.report(
-                "PD507",
-                f"the parameter `{qualified}` is never used",
-                param.decl.name.span,
-                "no rule reads it",
-                helps=["remove it"],
-            )
-    for name, named_set in composition.sets.items():
-        if name not in typer.used:
-            reporter.report(
-                "PD507",
-                f"the set `{name}` is never used",
-                named_set.decl[0].span,
-                "no rule reads it",
-                helps=["remove it"],
-            )
-        elif not typer.set_of(typer.symbols.constants[name], named_set.decl[0].span).ids:
-            reporter.report(
-                "PD505", f"the set `{name}` is empty", named_set.decl[1].span, "no element of the loaded packs is in it",
-                helps=["load a pack with such elements, or widen the set"],
-            )  # fmt: skip
-    for name, kernel in composition.kernels.items():
-        if name not in typer.used:
-            reporter.report(
-                "PD507",
-                f"the kernel `{name}` is never used",
-                kernel.decl.name.span,
-                "no rule reads it",
-                helps=["remove it"],
-            )
-    for element in composition.elements.values():
-        if element.id not in produced:
-            reporter.report(
-                "PD504",
-                f"no rule produces `{element.name}`",
-                element.span,
-                "it only comes from the start world, or by painting",
-            )
 
 
 def _matrix(composition: Composition, symbols: Symbols, reporter: Reporter) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from powderdsl.model.builtins import COORDINATES, FUNCTIONS
 from powderdsl.model.calls import CALLS
 from powderdsl.model.literals import read_bounds, read_number
 from powderdsl.model.membership import holds
+from powderdsl.model.needless import report_repeated
 from powderdsl.model.operands import (
     FALSE,
     TRUE,
@@ -280,6 +281,7 @@ class Typer(Coercer):
 
     def logic(self, syntax: Syntax, scope: Scope) -> Operand:
         operands = [self.evaluate(child, scope) for child in syntax.children]
+        report_repeated(syntax.children, self.reporter)
         if all(isinstance(operand, (SetOf, Absent)) for operand in operands):
             sets = [set(self.set_of(operand, syntax.span).ids) for operand in operands]
             ids = sets[0] | sets[1] if syntax.kind == "or_" else sets[0] & sets[1]
@@ -294,6 +296,7 @@ class Typer(Coercer):
 
     def compare(self, syntax: Syntax, scope: Scope) -> Operand:
         operands = [self.evaluate(child, scope) for child in syntax.children]
+        report_repeated(syntax.children, self.reporter)
         self._no_sets(operands, syntax)
         headings = any(isinstance(operand, Expr) and operand.kind == DIRECTION for operand in operands)
         values = [
@@ -328,6 +331,7 @@ class Typer(Coercer):
 
     def choose(self, syntax: Syntax, scope: Scope) -> Operand:
         yes, condition, no = syntax.children
+        report_repeated((yes, no), self.reporter)
         chosen = self.condition(condition, scope)
         if chosen in (TRUE, FALSE):
             return self.evaluate(yes if chosen == TRUE else no, scope)

@@ -21,6 +21,8 @@ def try_drawn(search: Search, examples: int) -> int:
 
     It makes nothing small: `shrink` tries hundreds of smaller worlds in one batch.
     """
+    if examples == 0:
+        return 0
     if "hypothesis" not in sys.modules:  # it would put a folder of its own into the working directory
         from hypothesis.configuration import set_hypothesis_home_dir
 

@@ -15,7 +15,6 @@ from powderdsl.model.operands import TRUE
 from powderdsl.model.state import slots
 from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
 from powderdsl.properties.samples import Array, Sample, State, full_state
-from powderdsl.simulator import compile
 
 MARK = "happened "
 """How the flags are called that lines of rules set. No rule file can have a name with a blank."""
@@ -30,6 +29,8 @@ class Runner:
         self.lines = rule_spans(ruleset)
         self.happened: set[Span] = set()
         self.worlds_run = 0
+        from powderdsl.simulator import compile  # brings torch, which `powderdsl check` does without
+
         self.sim = compile(marked(ruleset), backend=backend)
 
     def states(self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from powderdsl.ledgers.book import Ledger, NotProven, Proven
 from powderdsl.ledgers.book import ledger as make_ledger
+from powderdsl.ledgers.changes import RuleLine
 from powderdsl.model.operands import ELEMENT_HERE, member
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
@@ -19,6 +20,7 @@ from powderdsl.properties.breaks import (
     Alike,
     Breaks,
     KnownIds,
+    Runs,
     Tested,
     breaks,
     is_paired,
@@ -27,7 +29,6 @@ from powderdsl.properties.breaks import (
 )
 from powderdsl.properties.outcomes import Counterexample, Property, Result
 from powderdsl.properties.proofs import prove
-from powderdsl.properties.running import Runner
 from powderdsl.properties.samples import LARGE, Sample, random_samples
 from powderdsl.properties.shrink import shrink
 
@@ -58,6 +59,8 @@ class _Trial:
 
     prop: Property
     note: str
+    doubts: tuple[RuleLine, ...] = ()
+    """The lines that stand in the way of a proof."""
     worlds: int = 0
     batches: int = 0
     sample: Sample | None = None
@@ -72,16 +75,21 @@ class _Trial:
 class Search:
     """Tests the properties of one ruleset; worlds may be brought from outside too."""
 
-    runner: Runner
+    runner: Runs
     plan: Plan
     ledger: Ledger
     results: dict[str, Result] = field(default_factory=dict)
     trials: list[_Trial] = field(default_factory=list)
 
     @classmethod
-    def of(cls, runner: Runner, plan: Plan, declared_only: bool = False) -> Search:
-        """Everything that can be proven is; the rest is to be tried. `declared_only`: nothing that no pack says."""
-        ledger = make_ledger(runner.ruleset)
+    def of(
+        cls, runner: Runs, plan: Plan, declared_only: bool = False, ledger: Ledger | None = None
+    ) -> Search:
+        """Everything that can be proven is; the rest is to be tried. `declared_only`: nothing that no pack says.
+
+        `ledger`: that of the rules, if it is known already.
+        """
+        ledger = ledger or make_ledger(runner.ruleset)
         search = cls(runner, plan, ledger)
         for one in properties_of(runner.ruleset, ledger):
             declared = one.owner != AUTOMATIC
@@ -92,7 +100,7 @@ class Search:
                 given = f", given {verdict.given}" if verdict.given else ""
                 search.results[one.text] = Result(one, "proven", 0, verdict.reason + given)
             else:
-                search.trials.append(_Trial(one, ""))
+                search.trials.append(_Trial(one, "", verdict.rules))
         return search
 
     def only(self, text: str) -> Search:
@@ -168,12 +176,14 @@ class Search:
         return sorted(self.results.values(), key=lambda result: order.index(result.prop.text))
 
 
-def counterexample(claim: Tested, runner: Runner, sample: Sample, steps: int) -> Counterexample:
-    """A world that breaks a claim, made small."""
-    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps))
+def counterexample(
+    claim: Tested, runner: Runs, sample: Sample, steps: int, seconds: float = 10.0
+) -> Counterexample:
+    """A world that breaks a claim, made small for at most so many seconds."""
+    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps, seconds))
 
 
-def as_it_is(claim: Tested, runner: Runner, small: Sample, steps: int) -> Counterexample:
+def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Counterexample:
     """A world that breaks a claim, and the rules that did it."""
     cell = breaks(claim, runner, small, steps).cell[0]
     states = runner.states(small, steps)

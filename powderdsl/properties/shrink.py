@@ -42,6 +42,8 @@ def shrink(
         if smaller is sample:
             break
         sample = smaller
+    if not runs.ruleset.streams:
+        sample = replace(sample, seeds=np.zeros_like(sample.seeds))
     return sample, steps
 
 

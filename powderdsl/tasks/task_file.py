@@ -95,7 +95,7 @@ def _read_rules(
             )
         return None
     packs, decl = read(["+".join(names)], Reporter())
-    typer = resolve_names(packs, decl, Reporter())
+    typer, _ = resolve_names(packs, decl, Reporter())
     typer.reporter = typer.unknown.reporter = reader.reporter
     return ruleset, typer
 

@@ -153,3 +153,14 @@ def test_a_ledger_of_broken_rules(pack):
     result = powderdsl("check", pack("count(grit)", "count(grid)"), "--ledger")
     assert result.exit_code == 2
     assert "ledger of" not in result.stdout
+
+
+def test_an_invariant_that_is_easily_broken_is_an_error(pack):
+    rules = pack("passes:", "invariants: [count(grit) never falls]\npasses:")
+    result = powderdsl("check", rules)
+    assert result.exit_code == 2
+    assert "error[PD512]: this invariant is broken after 1 step" in result.stdout
+    assert "11 |     do: grit -> empty" in result.stdout  # the rule that breaks it
+    assert "= note: before   after" in result.stdout
+    data = json.loads(powderdsl("check", rules, "--format", "json").stdout)
+    assert [one["code"] for one in data] == ["PD512"]

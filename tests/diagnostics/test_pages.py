@@ -29,6 +29,8 @@ from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
+from powderdsl.ledgers.book import ledger
+from powderdsl.properties.refute import refuted
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.files import replacing
@@ -99,7 +101,8 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
         if "world" in one.info.split():
             read_ascii(one.text, paper_rules().elements, name="page.txt")
             return ()
-        return load_with_diagnostics(*one.packs, path)[1]
+        ruleset, remarks = load_with_diagnostics(*one.packs, path)
+        return (*remarks, *refuted(ruleset, ledger(ruleset)))  # what `powderdsl check` says
     except CompileError as error:
         return error.diagnostics
 

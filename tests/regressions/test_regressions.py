@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.backends.native_build import Building, NoCompiler, find_compiler
+from powderdsl.backends.native_build import Building
 from powderdsl.testing.case_files import read_case
 from powderdsl.testing.differential import check_case
+from tests.compilers import skip_without_compiler
 
 FOLDER = Path(__file__).parent
 FILES = sorted(FOLDER.glob("*.yaml"))
@@ -25,11 +26,7 @@ def cases() -> list:
 
 @pytest.mark.parametrize(("path", "backend"), cases())
 def test_backends_agree(path: Path, backend: str, tmp_path: Path) -> None:
-    if backend == "native":
-        try:
-            find_compiler()
-        except NoCompiler:
-            pytest.skip("no C++ compiler on this machine")
+    skip_without_compiler(backend)
     found = check_case(replace(read_case(path), backend=backend), Building("-O0", tmp_path))
     assert found is None, f"{found}\npowderdsl fuzz --replay {path.relative_to(FOLDER.parents[1])}"
 

@@ -12,10 +12,11 @@ import yaml
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
+from powderdsl.ledgers.book import ledger
+from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
 from powderdsl.pack_tests import run_examples
-from powderdsl.properties.running import Runner
-from powderdsl.properties.search import Plan, Search
+from powderdsl.properties.refute import broken_invariants
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "rules"
@@ -23,7 +24,10 @@ RULES = ROOT / "rules"
 
 @dataclass(frozen=True)
 class Mutation:
-    """One text of a pack replaced by another; `check` is the code or `test` the start of the item that notices it."""
+    """One text of a pack replaced by another, and what notices it.
+
+    `check` is a code, for PD512 with the invariant after a colon; `test` is how the name of a pack's test begins.
+    """
 
     pack: str
     mistake: str
@@ -40,13 +44,11 @@ class Mutation:
 
 @dataclass(frozen=True)
 class Caught:
-    """What noticed a mutation: `codes` of the checker, or `items` of the tests, with the counterexamples' sizes."""
+    """What noticed a mutation: `codes` of the checker, or `tests` of packs; (rows, columns, steps) of a world shown."""
 
     codes: tuple[str, ...] = ()
-    items: tuple[str, ...] = ()
-    sizes: tuple[tuple[int, int, int], ...] = ()
-    """(rows, columns, steps) of the counterexamples."""
-    seconds: float = 0.0
+    tests: tuple[str, ...] = ()
+    size: tuple[int, int, int] | None = None
 
 
 @cache
@@ -72,28 +74,31 @@ def diagnosed(path: Path) -> tuple[Ruleset | None, tuple[Diagnostic, ...]]:
 
 
 def try_mutation(mutation: Mutation, folder: Path) -> Caught:
-    """Check the mutated rules, and test them if the checker finds nothing."""
+    """Load the mutated rules, then try their invariants as `powderdsl check` does, or run their tests.
+
+    Of the invariants and tests only those run that are expected to notice, for they take most of the time.
+    """
+    ruleset, remarks = diagnosed(mutated(mutation, folder) / f"{mutation.rules}.yaml")
+    codes = tuple(sorted({one.code for one in remarks if one.severity is not Severity.NOTE}))
+    statement = mutation.check.partition(": ")[2]
+    if codes or ruleset is None:
+        return Caught(codes)
+    if mutation.test:
+        named = tuple(one for one in ruleset.tests if one.name.startswith(mutation.test))
+        results = run_examples(replace(ruleset, tests=named))
+        return Caught((), tuple(result.example.name for result in results if not result.passed))
+    some = tuple(one for one in ruleset.invariants if not statement or one_line(one.span) == statement)
+    broken = broken_invariants(replace(ruleset, invariants=some), ledger(ruleset), seconds=60.0)
+    sizes = [(*one.found.before.shape, one.found.steps) for one in broken]
+    return Caught(("PD512",), (), sizes[0]) if sizes else Caught()
+
+
+def mutated(mutation: Mutation, folder: Path) -> Path:
+    """A copy of the shipped rules with the mistake in it."""
     rules = folder / "rules"
     shutil.copytree(RULES, rules)
     path = rules / f"{mutation.pack}.yaml"
     text = path.read_text(encoding="utf-8")
     assert text.count(mutation.before) == 1, f"{mutation.mistake}: {text.count(mutation.before)} places"
     path.write_text(text.replace(mutation.before, mutation.after), encoding="utf-8")
-    ruleset, remarks = diagnosed(rules / f"{mutation.rules}.yaml")
-    codes = tuple(sorted({one.code for one in remarks if one.severity is not Severity.NOTE}))
-    if codes or ruleset is None:
-        return Caught(codes)
-    runner = Runner(ruleset)
-    search = Search.of(runner, Plan(examples=400, seconds=20.0), declared_only=True)
-    search.try_random()
-    broken = [trial for trial in search.trials if trial.sample is not None]
-    items = [trial.prop.text for trial in broken]
-    # One world is enough to look at: the one that was expected, if it is there.
-    search.trials = sorted(broken, key=lambda trial: not trial.prop.text.startswith(mutation.test))[:1]
-    found = [result.counterexample for result in search.finish() if result.counterexample is not None]
-    sizes = [(*one.before.shape, one.steps) for one in found]
-    if not items:  # the pack's own tests; what all packs share is tested by all
-        own = [one for one in ruleset.tests if mutation.pack in (one.pack, "core")]
-        results = run_examples(replace(ruleset, tests=tuple(own)))
-        items = [result.example.name for result in results if not result.passed]
-    return Caught((), tuple(items), tuple(sizes))
+    return rules

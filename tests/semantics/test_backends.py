@@ -9,8 +9,8 @@ from powderdsl.backends import array_draws, array_kernels, torch_arrays
 from powderdsl.backends.torch_mixed import packed_program
 from powderdsl.backends.torch_planes import PlanesProgram
 from powderdsl.compiler import lower, shipped_rules
-from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
+from tests.compilers import skip_without_compiler
 
 SIZES = [(1, 1), (1, 7), (5, 1), (2, 2), (3, 33), (7, 64), (4, 65), (9, 130)]
 PACKS_ALONE = {"acid", "cloner", "core", "fire", "gas", "lava", "plant", "sand", "stone", "water", "wind"}
@@ -20,12 +20,8 @@ RULESETS = [name for name in shipped_rules() if name not in PACKS_ALONE]
 def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:
     if backend == "tensors":  # what `planes` is on a device: here on the CPU, to be compared
         return on_tensors(rules)
-    try:
-        return powderdsl.compile(rules, backend=backend)
-    except CompileError as error:
-        if backend == "native" and error.diagnostics[0].code == "PD701":
-            pytest.skip("no C++ compiler on this machine")
-        raise
+    skip_without_compiler(backend)
+    return powderdsl.compile(rules, backend=backend)
 
 
 def on_tensors(rules: Ruleset) -> powderdsl.Simulator:

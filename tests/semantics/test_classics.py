@@ -15,20 +15,16 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl.backends.native_compilers import NoCompiler, find_compiler
 from powderdsl.simulator import Simulator, World
 from powderdsl.worlds.ascii import read_ascii, write_ascii
+from tests.compilers import skip_without_compiler
 
 Cells = set[tuple[int, int]]
 
 
 @pytest.fixture(params=["reference", "torch", "dense", "native"])
 def backend(request: pytest.FixtureRequest) -> str:
-    if request.param == "native":
-        try:
-            find_compiler()
-        except NoCompiler:
-            pytest.skip("no C++ compiler")
+    skip_without_compiler(request.param)
     return str(request.param)
 
 

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from powderdsl.backends.native_build import Building, NoCompiler, find_compiler
+from powderdsl.backends.native_build import Building
 from powderdsl.compiler import load, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
@@ -30,6 +30,7 @@ from powderdsl.testing.differential import Outcome, Plan, run_seed
 from powderdsl.testing.exercised import constructs, missing, operations
 from powderdsl.testing.rulemaker import random_ruleset_text
 from powderdsl.testing.strategies import rulesets, worlds
+from tests.compilers import skip_without_compiler
 
 BACKENDS = ("reference", "dense", "planes")
 FIRST, LAST = (int(seed) for seed in os.environ.get("POWDERDSL_SEEDS", "0..250").split(".."))
@@ -106,16 +107,9 @@ def test_random_rulesets(first: int) -> None:
 )
 def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path) -> None:
     """Few, since each takes seconds to compile; the level of optimisation changes nothing."""
-    needs_compiler()
+    skip_without_compiler()
     plan = Plan(("native",), worlds=4, steps=3, building=Building(level, tmp_path))
     assert agreed(run_seed(seed, plan) for seed in seeds) >= 4
-
-
-def needs_compiler() -> None:
-    try:
-        find_compiler()
-    except NoCompiler:
-        pytest.skip("no C++ compiler on this machine")
 
 
 @settings(

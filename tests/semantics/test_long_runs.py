@@ -20,6 +20,7 @@ from powderdsl.simulator import compile as compile_ruleset
 from powderdsl.testing.cases import random_start
 from powderdsl.testing.choices import Choices
 from powderdsl.testing.compare import find_difference
+from tests.compilers import skip_without_compiler
 
 LAST = int(os.environ.get("POWDERDSL_LONG_STEPS", "100"))
 MOMENTS = [step for step in (1, 2, 5, 10, 100, 1000) if step <= LAST]
@@ -66,12 +67,8 @@ def states(world: World) -> Iterator[tuple[int, Mapping[str, Any]]]:
 
 
 def compiled(ruleset: Any, backend: str) -> Simulator:
-    try:
-        return compile_ruleset(ruleset, backend=backend)
-    except CompileError as error:
-        if backend == "native" and error.diagnostics[0].code == "PD701":
-            pytest.skip("no C++ compiler on this machine")
-        raise
+    skip_without_compiler(backend)
+    return compile_ruleset(ruleset, backend=backend)
 
 
 def test_every_shipped_ruleset_is_among_them() -> None:

@@ -8,7 +8,6 @@ import powderdsl
 from powderdsl.backends.torch_mixed import MixedProgram, mixed_program
 from powderdsl.backends.torch_planes import PlanesProgram
 from powderdsl.compiler import lower
-from powderdsl.diagnostics import CompileError
 from powderdsl.ir import bits
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, whole
@@ -18,6 +17,7 @@ from powderdsl.simulator import Simulator, World
 from powderdsl.testing.cases import load_text, random_start
 from powderdsl.testing.choices import Choices
 from powderdsl.testing.compare import assert_same, find_difference
+from tests.compilers import skip_without_compiler
 
 ROWS = "\n".join("      - " + " ".join(str(1 + (5 * i + 3 * j) % 7) for j in range(21)) for i in range(21))
 
@@ -80,13 +80,8 @@ def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
 def test_the_oracles_worlds(backend: str) -> None:
     """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one by one."""
     rules = spread("heavy")
-    try:
-        sims = [powderdsl.compile(rules, backend=name) for name in ("reference", "dense", backend)]
-    except CompileError as error:
-        notes = [note for diagnostic in error.diagnostics for note in diagnostic.notes]
-        if any("no C++ compiler found" in note for note in notes):
-            pytest.skip("no C++ compiler on this machine")
-        raise
+    skip_without_compiler(backend)
+    sims = [powderdsl.compile(rules, backend=name) for name in ("reference", "dense", backend)]
     for number, shape in enumerate([(2, 3, 5), (9, 4, 33), (1, 2, 65)]):
         assert_same(rules, random_start(rules, Choices.seeded(number), shape), steps=3, simulators=sims)
 

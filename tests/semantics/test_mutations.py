@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import powderdsl
 from tests.semantics.mutations import Mutation, mutations, try_mutation
 
 ALL = mutations()
@@ -19,21 +20,23 @@ def named(found: list[Mutation]) -> list:  # type: ignore[type-arg]
 
 @pytest.mark.parametrize("mutation", named([one for one in ALL if one.check]))
 def test_the_checker_notices(mutation: Mutation, tmp_path: Path) -> None:
-    assert mutation.check in try_mutation(mutation, tmp_path).codes
+    caught = try_mutation(mutation, tmp_path)
+    assert mutation.check.partition(":")[0] in caught.codes
+    if caught.size is not None:
+        rows, columns, steps = caught.size
+        assert rows * columns <= MAX_CELLS
+        assert steps <= MAX_STEPS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mutation", named([one for one in ALL if one.test]))
 def test_worlds_show(mutation: Mutation, tmp_path: Path) -> None:
     caught = try_mutation(mutation, tmp_path)
-    assert not caught.codes
-    assert any(item.startswith(mutation.test) for item in caught.items), caught.items
-    for rows, columns, steps in caught.sizes:
-        assert rows * columns <= MAX_CELLS
-        assert steps <= MAX_STEPS
+    assert caught.codes == ()
+    assert any(name.startswith(mutation.test) for name in caught.tests)
 
 
 def test_there_are_enough_of_them() -> None:
     assert len(ALL) >= 30
     assert len({(one.pack, one.before, one.after) for one in ALL}) == len(ALL)
-    assert len({one.pack for one in ALL}) >= 15
+    assert {one.pack for one in ALL} >= {*powderdsl.load("powderworld").packs}
+    assert sum(bool(one.check) for one in ALL) > len(ALL) / 2

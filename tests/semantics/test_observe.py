@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.diagnostics import CompileError
 from powderdsl.draw import palette, rgb
 from powderdsl.model.types import Ruleset
 from powderdsl.observe import Observer
 from powderdsl.simulator import Simulator, World
 from powderdsl.testing.cases import load_text, random_start
 from powderdsl.testing.choices import Choices
+from tests.compilers import skip_without_compiler
 
 BACKENDS = ["reference", "dense", "planes", "native"]
 SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
@@ -61,13 +61,8 @@ def simulator(name: str, backend: str) -> Simulator:
 
 
 def simulator_or_skip(name: str, backend: str) -> Simulator:
-    try:
-        return simulator(name, backend)
-    except CompileError as error:
-        notes = [note for diagnostic in error.diagnostics for note in diagnostic.notes]
-        if backend == "native" and any("no C++ compiler found" in note for note in notes):
-            pytest.skip("no C++ compiler on this machine")
-        raise
+    skip_without_compiler(backend)
+    return simulator(name, backend)
 
 
 def ways_out(world: World) -> dict[str, object]:

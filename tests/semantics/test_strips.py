@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.backends.native_build import Building, NoCompiler, building, find_compiler
+from powderdsl.backends.native_build import Building, building
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulator import compile as compile_ruleset
@@ -14,6 +14,7 @@ from powderdsl.testing.cases import load_text, random_start
 from powderdsl.testing.choices import Choices
 from powderdsl.testing.compare import assert_same
 from powderdsl.testing.rulemaker import random_ruleset_text
+from tests.compilers import skip_without_compiler
 
 STRIPS = [(1, 8, 8), (2, 16, 70), (1, 64, 64), (3, 128, 65), (1, 256, 256), (9, 520, 20), (2, 8, 1)]
 """Strips of one row, of more rows than one list of active rows has, of words that are not full; large and many."""
@@ -24,10 +25,7 @@ SEEDS = range(60, 66)
 
 @pytest.fixture(autouse=True)
 def needs_compiler() -> None:
-    try:
-        find_compiler()
-    except NoCompiler:
-        pytest.skip("no C++ compiler on this machine")
+    skip_without_compiler()
 
 
 @pytest.mark.parametrize("name", ["powderworld", "forest_fire", "langtons_ant", "margolus", "wireworld"])

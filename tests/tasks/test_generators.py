@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
-from powderdsl.tasks.shipped_tasks import load_task, shipped_tasks
+from powderdsl.tasks.shipped_tasks import load_task
 from powderdsl.tasks.task_file import read_task
+from powderdsl.tasks.task_names import shipped_tasks
 from powderdsl.worlds.raster import mask
 from powderdsl.worlds.scene import load_scenes
 from powderdsl.worlds.scene.fixed import shape_of
