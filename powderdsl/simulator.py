@@ -52,7 +52,7 @@ class World:
         return batch, height, width
 
     def __len__(self) -> int:
-        return self.shape[0]
+        return len(self.seed)  # without unpacking anything
 
     def __getitem__(self, name: str) -> Tensor:
         """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""

@@ -76,6 +76,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return near.all(-1).astype(np.float32) - 1
 
     def _with_goals(self, observed: Any) -> dict[str, Array]:
-        episodes = self.env.unwrapped.tensors.episodes  # type: ignore[attr-defined]
-        achieved = episodes.before[0].cpu().numpy().astype(np.float32)
+        tensors = self.env.unwrapped.tensors  # type: ignore[attr-defined]
+        measured = tensors.program.measured(tensors.episodes, tensors.params)
+        achieved = measured[0].cpu().numpy().astype(np.float32)
         return {"observation": observed, "achieved_goal": achieved, "desired_goal": self.goal.copy()}
