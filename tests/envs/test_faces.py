@@ -27,7 +27,7 @@ from powderdsl.envs.vector import PowderVectorEnv
 from powderdsl.simulator import Simulator
 from powderdsl.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import TaskProgram, load_task
-from powderdsl.tasks.shipped_tasks import shipped_tasks
+from powderdsl.tasks.task_names import shipped_tasks
 
 
 @pytest.fixture(scope="module")
