@@ -15,10 +15,12 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.simulator import Simulator
 from powderdsl.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import TaskProgram, load_task
+from tests.compilers import skip_without_compiler
 
 
 @pytest.fixture(scope="module")
 def native(small: TaskProgram, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Simulator]:
+    skip_without_compiler("native")
     with building(Building("-O0", tmp_path_factory.mktemp("native"))):
         yield compile_rules(small.task.ruleset, "native")
 
