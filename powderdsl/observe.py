@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
@@ -13,8 +14,10 @@ from powderdsl.backends.torch_views import (
     Channel,
     PlaneName,
     State,
+    code_values,
     shape_of,
     write_channels,
+    write_codes,
     write_planes,
     write_rgb,
     write_slot,
@@ -84,6 +87,73 @@ class Observer:
         with torch.no_grad():
             write_channels(state, channels, tables, out)
         return out
+
+    def compact(self, state: State, out: Any = None) -> Tensor:
+        """Everything that lasts from step to step, in small numbers: uint8 [B, C, H, W], C those of `compact_names`."""
+        batch, height, width = shape_of(state)
+        out = self._buffer(out, (batch, len(self.compact_names), height, width), torch.uint8)
+        with torch.no_grad():
+            at = 0
+            for slot in self._lasting:
+                for part in _parts(slot):
+                    write_codes(state, slot, part, self._floor(slot), out[:, at])
+                    at += 1
+        return out
+
+    @cached_property
+    def compact_names(self) -> tuple[str, ...]:
+        """What the channels of `compact` are: ``element``, fields by name, ``name.row`` and ``name.column``."""
+        return tuple(
+            f"{slot.name}.{part}" if part else slot.name for slot in self._lasting for part in _parts(slot)
+        )
+
+    @cached_property
+    def compact_values(self) -> Tensor:
+        """What the numbers of `compact` stand for: float32 [C, 256]."""
+        rows = [code_values(slot, self._floor(slot)) for slot in self._lasting for _ in _parts(slot)]
+        return torch.stack(rows).to(self.device)
+
+    @cached_property
+    def matrix_names(self) -> tuple[str, ...]:
+        """What the channels of `matrix` are: elements, properties and fields by name; ``name.row`` of vectors."""
+        elements = {element.id: element.name for element in self.ruleset.elements}
+        names: list[str] = []
+        for name in self.ruleset.matrix:
+            if name == "elements":
+                names.extend(elements.get(number, "") for number in range(self.ruleset.slots))
+            elif name in self.slots and self.slots[name].planes == 2:
+                names.extend(f"{name}.{part}" for part in ("row", "column"))
+            else:
+                names.append(name)
+        return tuple(names)
+
+    @cached_property
+    def matrix_tables(self) -> tuple[tuple[int, ...], Tensor]:
+        """The channels of `matrix` from those of `compact`: the channel that each is read from, and float32 [n, 256],
+        what it is where that channel has a number. Fields that do not last read as 0."""
+        channels, tables = self._channels
+        sources, rows = [], []
+        for channel in channels:
+            name = channel.slot if channel.slot in self.compact_names else "element"
+            sources.append(self.compact_names.index(name))
+            row = torch.zeros(256, device=self.device)
+            if channel.kind == "one_hot":
+                row[channel.value] = 1
+            elif channel.kind == "table":
+                row = tables[channel.value]
+            elif channel.kind == "slot" and channel.slot == name:
+                row = self.compact_values[sources[-1]]
+            rows.append(row)
+        return tuple(sources), torch.stack(rows)
+
+    @cached_property
+    def _lasting(self) -> tuple[Slot, ...]:
+        """The slots that a step does not begin anew."""
+        return tuple(slot for slot in self.slots.values() if not slot.resets)
+
+    def _floor(self, slot: Slot) -> float:
+        """Eight times the smallest step of a slot's codes: a power of two near 2⁻¹⁵ of its largest value."""
+        return 2.0 ** (math.ceil(math.log2(max(abs(slot.kind.lo), abs(slot.kind.hi), 1e-3))) - 15)
 
     def planes(self, state: State, out: Any = None) -> Tensor:
         """Packed planes int64 [B, P, H, ⌈W/64⌉], in the order of `plane_names`."""
@@ -172,6 +242,10 @@ class Observer:
             raise ValueError(
                 f"each world of out must be contiguous, and worlds apart; found the strides {list(out.stride())}"
             )
+
+
+def _parts(slot: Slot) -> tuple[str, ...]:
+    return ("row", "column") if slot.planes == 2 else ("",)
 
 
 def _bits(type: Type) -> int:

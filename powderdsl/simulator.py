@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import index
 from typing import Any
 
@@ -51,14 +52,10 @@ class World:
         return batch, height, width
 
     def __len__(self) -> int:
-        return self.shape[0]
+        return len(self.seed)  # without unpacking anything
 
     def __getitem__(self, name: str) -> Tensor:
-        """A field or property by name: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) for vectors.
-
-        Raises:
-            KeyError: for a name that the ruleset does not have.
-        """
+        """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""
         return self.sim.read(self, name)
 
     def select(self, worlds: int | slice | Sequence[int] | Tensor) -> World:
@@ -79,6 +76,10 @@ class World:
         """Pictures, a pixel a cell: uint8 [B, H, W, 3]."""
         return self.sim.rgb(self, out)
 
+    def compact(self, out: Tensor | None = None) -> Tensor:
+        """All that lasts, in small numbers: uint8 [B, C, H, W]; `sim.observer.compact_names` says what they are."""
+        return self.sim.observer.compact(self.state, out)
+
     def planes(self, out: Tensor | None = None) -> Tensor:
         """The packed planes int64 [B, P, H, ⌈W/64⌉]; `Simulator.plane_names` says what they are."""
         return self.sim.planes(self, out)
@@ -91,8 +92,8 @@ class Simulator:
         self.ruleset = ruleset
         self.backend = backend
         self.device = find_device(device)
-        self._observer = Observer(ruleset, self.device)
-        self._slots: dict[str, Slot] = self._observer.slots
+        self.observer = Observer(ruleset, self.device)
+        self._slots: dict[str, Slot] = self.observer.slots
         self._program = make_program(ruleset, backend, self.device, threads)
         self._defaults: tuple[int, dict[str, Tensor]] | None = None
         self._known = torch.zeros(256, dtype=torch.bool, device=self.device)
@@ -166,7 +167,7 @@ class Simulator:
         prop = self.ruleset.property(slot.name)
         dtype = getattr(torch, slot.dtype)
         if prop is not None:
-            return self._observer.table(prop.name)[ids.long()].to(dtype)
+            return self.observer.table(prop.name)[ids.long()].to(dtype)
         if slot.planes == 2:
             default = torch.tensor(slot.default, dtype=dtype, device=self.device)
             return default[None, :, None, None].expand(len(ids), 2, *ids.shape[1:]).clone()
@@ -218,15 +219,15 @@ class Simulator:
         Raises:
             KeyError: an unknown name. TypeError, ValueError: `out` is no tensor, or does not fit.
         """
-        return self._observer.read(world.state, name, out)
+        return self.observer.read(world.state, name, out)
 
     def matrix(self, world: World, out: Tensor | None = None) -> Tensor:
         """What `World.matrix` returns."""
-        return self._observer.matrix(world.state, out)
+        return self.observer.matrix(world.state, out)
 
     def rgb(self, world: World, out: Tensor | None = None) -> Tensor:
         """Pictures uint8 [B, H, W, 3] in the elements' colours, a pixel a cell."""
-        return self._observer.rgb(world.state, out)
+        return self.observer.rgb(world.state, out)
 
     def planes(self, world: World, out: Tensor | None = None) -> Tensor:
         """Flags and whole numbers in bits: int64 [B, P, H, ⌈W/64⌉].
@@ -234,12 +235,12 @@ class Simulator:
         Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of `plane_names`.
         Real fields have none: `read` them.
         """
-        return self._observer.planes(world.state, out)
+        return self.observer.planes(world.state, out)
 
     @property
     def plane_names(self) -> tuple[str, ...]:
         """What the planes are: a flag's name, or ``name:bit`` from bit 0; the last bit of a signed number is its sign."""
-        return self._observer.plane_names
+        return self.observer.plane_names
 
     def replace(self, world: World, **fields: Any) -> World:
         """The world with these fields set. New ids make fresh cells; other fields are set after that.
@@ -271,7 +272,7 @@ class Simulator:
                     self.read(world, name)
                 if not torch.equal(
                     self._shaped(value, name, world.shape, False).double(),
-                    self._observer.table(name)[state["element"].long()],
+                    self.observer.table(name)[state["element"].long()],
                 ):
                     raise ValueError(
                         f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
@@ -316,7 +317,7 @@ class Simulator:
         limited = prop.stored if prop is not None else slot.of
         if limited is not None:
             usual = (
-                self._observer.table(slot.name)[ids.long()].long()
+                self.observer.table(slot.name)[ids.long()].long()
                 if prop is not None
                 else torch.full_like(whole, int(slot.default))
             )
@@ -377,6 +378,7 @@ class Simulator:
         random: Mapping[str, Any] | None = None,
         passes: Sequence[str] | None = None,
         params: Mapping[str, Any] | None = None,
+        reuse: bool = False,
     ) -> World:
         """The world some steps later; the argument stays as it was.
 
@@ -386,6 +388,7 @@ class Simulator:
                 the stream's resolution that it falls into. The same draws serve every step.
             passes: run only these passes, in the ruleset's order.
             params: parameter values for this call, one number each or [B] values, one a world.
+            reuse: the memory of `world` may be written to, and it must not be used afterwards: saves a copy.
 
         Raises:
             KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
@@ -406,7 +409,7 @@ class Simulator:
         draws = self._draws(random or {}, world)
         chosen = None if passes is None else frozenset(passes)
         clock = (world.seed, world.index, world.step)
-        job = Job(world.state, clock, steps, self._params(params or {}, len(world)), draws, chosen)
+        job = Job(world.state, clock, steps, self.parameters(params or {}, len(world)), draws, chosen, reuse)
         state = self._program.run(job)
         return replace(world, sim=self, state=state, step=world.step + steps)
 
@@ -416,7 +419,7 @@ class Simulator:
         Native code counts processor time on one thread, and is compiled once more for it.
         """
         clock = (world.seed, world.index, world.step)
-        job = Job(world.state, clock, _whole(steps, "steps"), self._params({}, len(world)), {}, None)
+        job = Job(world.state, clock, _whole(steps, "steps"), self.parameters({}, len(world)), {}, None)
         seconds = profile_of(self._program, job)
         return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
@@ -436,17 +439,12 @@ class Simulator:
     def _default_params(self, batch: int) -> dict[str, Tensor]:
         """The defaults as [B] tensors; the same tensors for the same batch size, which programs may rely on."""
         if self._defaults is None or self._defaults[0] != batch:
-            values = {
-                param.name: torch.full(
-                    (batch,), float(param.default), dtype=torch.float64, device=self.device
-                )
-                for param in self.ruleset.params
-            }
-            self._defaults = (batch, values)
+            full = partial(torch.full, (batch,), dtype=torch.float64, device=self.device)
+            self._defaults = (batch, {p.name: full(float(p.default)) for p in self.ruleset.params})
         return self._defaults[1]
 
-    def _params(self, params: Mapping[str, Any], batch: int) -> dict[str, Tensor]:
-        """All parameters as float64 [B] tensors."""
+    def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Tensor]:
+        """All parameters as float64 [B], those given as they are. Raises KeyError, TypeError, ValueError."""
         known = {param.name: param for param in self.ruleset.params}
         values = dict(self._default_params(batch))
         for name, value in params.items():

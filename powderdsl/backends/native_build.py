@@ -226,6 +226,7 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_rgb": (None, [pointer, integer, integer, pointer, pointer, long]),
         "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
         "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
+        "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
         "pd_run": (None, [pointer, long, integer, pointer, pointer, pointer, pointer, pointer]),
     }
     for name, (result, arguments) in signatures.items():

@@ -339,8 +339,6 @@ template <class T> static void put_values(Batch& b, int slot, int bits, int coun
   in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
     for (int i = 0; i < bits; i++) {
       Plane* p = group.slot[slot + i];
-      if (p->zero) memset(p->data, 0, sizeof(V) * b.g.cells());
-      p->zero = false;
       p->around = p->beyond = 0;
       const T* cell = data + begin;
       for (int y = 0; y < b.g.height; y++)
@@ -349,6 +347,9 @@ template <class T> static void put_values(Batch& b, int slot, int bits, int coun
           u64 word = 0;
           for (int x = 0; x < many; x++) word |= (u64)((u64)cell[x] >> i & 1) << x;
           cell += many;
+          if (p->zero && !word) continue;  // a plane that holds nothing goes on being skipped
+          if (p->zero) memset(p->data, 0, sizeof(V) * b.g.cells());
+          p->zero = false;
           ((u64*)p->data)[((size_t)y * b.g.words + w) * LANES + lane] = word;
         }
     }

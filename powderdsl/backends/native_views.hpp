@@ -169,6 +169,33 @@ API void pd_store_real(const void* batch, int slot, float* data, int64_t apart) 
     store_real(b.g, b.groups[lane / LANES].real[slot], lane % LANES, data + b.at(lane, apart, b.g.width));
 }
 
+typedef uint8_t Bytes __attribute__((vector_size(16), may_alias));
+// Reals in eight bits: 128 is 0, further from it in steps that grow with the value. `floor` is a power of two.
+API void pd_codes(const void* batch, int slot, float floor, uint8_t* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  int32_t one;
+  memcpy(&one, &floor, 4);
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    const Field* f = b.groups[lane / LANES].real[slot];
+    uint8_t* out = data + b.at(lane, apart, b.g.width);
+    for (int y = 0; y < b.g.height; y++, out += b.g.width) {
+      size_t row = (size_t)(lane % LANES) * b.g.height + y;
+      if (!f->live[row]) {
+        memset(out, 128, b.g.width);
+        continue;
+      }
+      const float* in = f->data + row * b.g.stride + HALO;
+      for (int x = 0; x < b.g.width; x += CHUNK) {  // rows go on behind the last column
+        F value = (F)*(const Fu*)(in + x);
+        I bits = (I)value, sign = bits >> 31;
+        I size = ((I)((F)(bits & 0x7fffffff) + floor) - one + (1 << 19)) >> 20;
+        Bytes codes = __builtin_convertvector(((size ^ sign) - sign) + 128, Bytes);
+        memcpy(out + x, &codes, std::min(CHUNK, b.g.width - x));
+      }
+    }
+  }
+}
+
 // Planes as they are: [plane][row][word] of each world.
 API void pd_planes(const void* batch, int count, const int* slots, u64* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;

@@ -15,7 +15,7 @@ Clock = tuple[Tensor, Tensor, Tensor]
 class Job:
     """Steps of a batch of worlds.
 
-    `state` has a tensor a slot, in storage dtypes, and is not changed. `params` are float64 [B]; `draws`, int64
+    `state` has a tensor a slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B]; `draws`, int64
     [B, H, W] below 2^bits, stand in for a stream's own numbers; `passes` names those that run, None all of them.
     """
 
@@ -25,3 +25,5 @@ class Job:
     params: Mapping[str, Tensor]
     draws: Mapping[str, Tensor]
     passes: frozenset[str] | None
+    reuse: bool = False
+    """Whether `state` may be written to: nobody reads it afterwards."""

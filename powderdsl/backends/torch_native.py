@@ -22,9 +22,26 @@ class PackedState(Mapping[str, Tensor]):
     def __init__(
         self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
     ):
-        self.program, self.handle, self.like = program, handle, like
+        self.program, self.like = program, like
+        self._handle: int | None = handle
         self._tensors: dict[str, Tensor] = {}
-        weakref.finalize(self, program.library.pd_free, handle)
+        self._free = weakref.finalize(self, program.library.pd_free, handle)
+
+    @property
+    def handle(self) -> int:
+        """The batch in native memory. Raises RuntimeError once it has been taken."""
+        if self._handle is None:
+            raise RuntimeError(
+                "these worlds were stepped with `reuse`: only those that came of it can be used"
+            )
+        return self._handle
+
+    def take(self) -> int:
+        """The batch, for another to own; this state must not be used afterwards."""
+        handle, self._handle = self.handle, None
+        self._free.detach()
+        self._tensors.clear()
+        return handle
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._tensors:
@@ -40,8 +57,7 @@ class PackedState(Mapping[str, Tensor]):
         """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
         program = self.program
         if out.dtype == torch.float32:
-            parts = (f"{name}.row", f"{name}.column") if out.ndim == 4 else (name,)
-            for i, part in enumerate(parts):
+            for i, part in enumerate(self._parts(name)):
                 first = out[:, i] if out.ndim == 4 else out
                 program.library.pd_store_real(
                     self.handle, program.layout.reals[part], address(first), out.stride(0)
@@ -52,6 +68,10 @@ class PackedState(Mapping[str, Tensor]):
                 self.handle, slot, bits, signed, out.element_size(), address(out), out.stride(0)
             )
         return out
+
+    def _parts(self, name: str) -> tuple[str, ...]:
+        """The reals of a slot: two of a vector."""
+        return (f"{name}.row", f"{name}.column") if len(self.like[name][1]) == 4 else (name,)
 
     def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
         """The state with one box of cells in each world filled, without unpacking the rest.
@@ -135,7 +155,7 @@ class NativeProgram:
         seed, index, start = (part.contiguous() for part in job.clock)
         batch = len(seed)
         if isinstance(job.state, PackedState) and job.state.program is self:
-            handle = self.library.pd_copy(job.state.handle)
+            handle = job.state.take() if job.reuse else self.library.pd_copy(job.state.handle)
             like = job.state.like
         else:
             handle, like = self._pack(job.state)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -105,6 +106,60 @@ def _native_channel(channel: Channel, state: PackedState) -> tuple[int, int, int
     if channel.kind == "slot":
         return 3, slot, bits, int(signed)
     return (1 if channel.kind == "one_hot" else 2), slot, bits, channel.value
+
+
+class CodedSlot(Protocol):
+    """What codes are made from: a slot's name, its dtype, and the kind with its range."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def dtype(self) -> str: ...
+    @property
+    def kind(self) -> Any: ...
+
+
+def write_codes(state: State, slot: CodedSlot, part: str, floor: float, out: Tensor) -> None:
+    """Codes uint8 [B, H, W] of one slot, or one part of a vector; `code_values` says what they stand for."""
+    if _is_small(slot):
+        write_slot(state, slot.name, out.view(getattr(torch, slot.dtype)))
+        if slot.kind.lo:
+            out -= int(slot.kind.lo) & 255  # in eight bits, that is +
+    elif isinstance(state, PackedState) and slot.dtype == "float32" and not state.has(slot.name):
+        program = state.program
+        real = program.layout.reals[f"{slot.name}.{part}" if part else slot.name]
+        program.library.pd_codes(state.handle, real, floor, address(out), out.stride(0))
+    else:
+        value = _part(state, f"{slot.name}.{part}") if part else state[slot.name]
+        value = value.to(torch.float32)
+        one = torch.tensor(floor, device=out.device).view(torch.int32)
+        size = ((value.abs() + floor).view(torch.int32) - one + ROUND) >> SHIFT
+        out.copy_(128 + torch.where(value < 0, -size, size))
+
+
+SHIFT = 20
+"""Bits of a float32 below those that a code keeps: three of the mantissa are left."""
+ROUND = 1 << (SHIFT - 1)
+
+
+def code_values(slot: CodedSlot, floor: float) -> Tensor:
+    """What each of the 256 codes of a slot stands for: float32 [256].
+
+    Whole numbers in a range of at most 256 are counted from the lowest. Others have a sign and a size: code 128 is 0,
+    and 128 ± n is ±(x − `floor`), where x grows by an eighth of a power of two with each n: steps of ``floor / 8`` near
+    0, and of an eighth of the value, at most, far from it.
+    """
+    if _is_small(slot):
+        return torch.arange(256, dtype=torch.float32) + float(slot.kind.lo)
+    one = torch.tensor(floor).view(torch.int32)
+    signed = torch.arange(256, dtype=torch.int32) - 128
+    size = (one + (signed.abs() << SHIFT)).to(torch.int32).view(torch.float32) - floor
+    return torch.where(signed < 0, -size, size)
+
+
+def _is_small(slot: CodedSlot) -> bool:
+    """Whether eight bits hold every value."""
+    return slot.dtype in ("uint8", "int8")
 
 
 def write_planes(state: State, names: Sequence[PlaneName], out: Tensor) -> None:

@@ -28,7 +28,7 @@ class Episodes:
     `seed`, int64 [B], says which worlds they started as; `acted`, int64 [B], how many actions each has had;
     `failed`, bool [B], whether `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] where all
     worlds have the same; `targets` uint8 [B, H, W], 255 where there is none; `start` and `before`, float64 [B, n],
-    what rewards remember of the start and of the action before.
+    what rewards remember of the start and of the action before (not kept where only a last action is rewarded).
     """
 
     world: World
@@ -51,14 +51,19 @@ class TaskProgram:
         self.task, self.split, self.simulator = task, split, simulator
         device = simulator.device
         self._makers = [WorldMaker(one, task.size, device) for one in task.split(split).variants]
-        self._measures = measures_of(task.goal)
-        self._places = {measure: number for number, measure in enumerate(self._measures)}
+        self.measures = measures_of(task.goal)
+        self._places = {measure: number for number, measure in enumerate(self.measures)}
         fixed = self._makers[0].fixed_cells
         for maker in self._makers[1:]:
             same = maker.fixed_cells
             fixed = {n: v for n, v in fixed.items() if n in same and torch.equal(v, same[n])}
         self._fixed = fixed
-        self._meter = Meter(simulator.ruleset, self._measures, task.size, fixed, device)
+        self._meter = Meter(simulator.ruleset, self.measures, task.size, fixed, device)
+        goal = task.goal
+        self._counts_always = (goal.each, goal.success, goal.failure) != (None, None, None) or any(
+            part.op == "before" for part in scalars_of(goal)
+        )
+        """Whether measures are needed after every action, and not only after the last."""
         counts = any(part.op == "action" and part.value == "painted" for part in scalars_of(task.goal))
         self._hands = Hands(simulator, task.agent, task.size, counts=counts)
         agent = task.agent
@@ -118,8 +123,11 @@ class TaskProgram:
         if len(places) == 0:
             return episodes
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
-        new = self.start(seeds[places])
-        if len(places) == len(mask):
+        return self.put(episodes, places, self.start(seeds[places]), reuse=reuse)
+
+    def put(self, episodes: Episodes, places: Tensor, new: Episodes, *, reuse: bool = False) -> Episodes:
+        """The episodes with those of numbers `places`, int64 [n], replaced by `new` ones, in order. `reuse` as above."""
+        if len(places) == len(episodes):
             return new
 
         def placed(old: Tensor, fresh: Tensor) -> Tensor:
@@ -171,12 +179,14 @@ class TaskProgram:
         """
         agent, goal = self.task.agent, self.task.goal
         done = self._hands.act(episodes.world, actions, reuse=reuse)
-        world = self.simulator.step(done.world, agent.steps_per_action, params=params)
+        world = self.simulator.step(done.world, agent.steps_per_action, params=params, reuse=reuse)
         acted = episodes.acted + 1
         last = acted >= agent.actions
         if agent.free_steps:
             world = self._free(world, last, params)
-        now = self._meter.take(self._given(world, episodes.regions, episodes.targets, params or {}))
+        now = episodes.before
+        if self._counts_always or bool(last.any()):
+            now = self._meter.take(self._given(world, episodes.regions, episodes.targets, params or {}))
         action = {
             "taken": acted,
             "left": agent.actions - acted,
@@ -196,6 +206,10 @@ class TaskProgram:
             reward = reward + torch.where(over, scalar_value(goal.final, facts), nothing)
         after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
         return after, reward.float(), success, over
+
+    def measured(self, episodes: Episodes, params: Mapping[str, Any] | None = None) -> Tensor:
+        """What `measures` are now: float64 [B, n]."""
+        return self._meter.take(self._given(episodes.world, episodes.regions, episodes.targets, params or {}))
 
     def _free(self, world: World, last: Tensor, params: Mapping[str, Any] | None) -> World:
         """The steps after the last action, in the worlds that had it."""

@@ -99,9 +99,8 @@ class Meter:
         if measure.region is not None:
             mask = _cut(given.regions[measure.region], window)
             cells = cells & mask if cells.dtype == torch.bool else cells * mask
-        total = cells.sum(
-            (1, 2), dtype=torch.float64 if cells.dtype.is_floating_point else torch.int64
-        ).double()
+        exact = torch.int32 if cells.dtype == torch.bool else torch.int64  # counts: half the time
+        total = cells.sum((1, 2), dtype=torch.float64 if cells.dtype.is_floating_point else exact).double()
         match measure.how:
             case "share" | "mean":
                 count = self.size[0] * self.size[1] if mask is None else mask.sum((1, 2))

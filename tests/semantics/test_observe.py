@@ -71,7 +71,7 @@ def ways_out(world: World) -> dict[str, object]:
     ways: dict[str, object] = {
         f"read {name}": lambda out=None, name=name: world.read(name, out) for name in names
     }
-    return ways | {"matrix": world.matrix, "rgb": world.rgb, "planes": world.planes}
+    return ways | {"matrix": world.matrix, "rgb": world.rgb, "planes": world.planes, "compact": world.compact}
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -138,6 +138,32 @@ def test_meaning(torch) -> None:  # type: ignore[no-untyped-def]
             assert torch.equal(value, wrapped), slot.name
 
 
+@pytest.mark.parametrize("name", ["kinds", "powderworld"])
+def test_bytes_stand_for_all_that_lasts(name: str, torch) -> None:  # type: ignore[no-untyped-def]
+    """Exactly where 256 numbers suffice, else within a sixteenth of the value, and the matrix follows from them."""
+    sim = simulator(name, "dense")
+    world = sim.step(random_start(sim.ruleset, Choices.seeded(8), (2, 16, 70)).world(sim), 1)
+    codes, values = world.compact(), sim.observer.compact_values
+    assert codes.shape[1] == len(sim.observer.compact_names)
+    for at, channel in enumerate(sim.observer.compact_names):
+        base, _, part = channel.partition(".")
+        wanted = world[base][:, ("row", "column").index(part)] if part else world[base]
+        slot = next(one for one in sim.slots if one.name == base)
+        found = values[at][codes[:, at].long()]
+        if slot.dtype in ("uint8", "int8"):
+            assert torch.equal(found, wanted.float()), channel
+        else:
+            least = max(abs(slot.kind.lo), abs(slot.kind.hi)) * 2.0**-17
+            assert ((found - wanted).abs() <= wanted.abs() / 16 + least).all(), channel
+            assert (values[at][128], values[at].diff().min() > 0) == (0, True)
+    sources, tables = sim.observer.matrix_tables
+    matrix = torch.stack([table[codes[:, at].long()] for at, table in zip(sources, tables, strict=True)], 1)
+    assert len(sim.observer.matrix_names) == matrix.shape[1]
+    wanted = world.matrix()
+    assert ((matrix - wanted).abs() <= wanted.abs() / 16 + 2).all()
+    assert torch.equal(matrix[:, : sim.ruleset.slots], wanted[:, : sim.ruleset.slots])
+
+
 @pytest.mark.parametrize("backend", ["dense", "native"])
 def test_buffers_that_do_not_fit(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     sim = simulator_or_skip("kinds", backend)
@@ -173,6 +199,7 @@ def test_no_value_is_asked_for(torch) -> None:  # type: ignore[no-untyped-def]
         (observer.rgb, world.rgb),
         (observer.matrix, world.matrix),
         (observer.planes, world.planes),
+        (observer.compact, world.compact),
     ):
         found, wanted = look(state), real()
         assert (found.shape, found.dtype, found.device.type) == (wanted.shape, wanted.dtype, "meta")

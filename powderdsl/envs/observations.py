@@ -1,0 +1,75 @@
+"""What an agent sees of a world: the kinds of observations, each a Gymnasium space and a function on tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+from powderdsl.diagnostics import suggest
+from powderdsl.simulator import Simulator, World
+from powderdsl.worlds.raster import Size
+
+KINDS = ("ids", "compact", "matrix", "rgb")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One kind of observation of worlds of one ruleset and size. Channels come first, but in pictures.
+
+    ``ids``: uint8 [1, H, W], element ids. ``compact``: uint8 [C, H, W], all that lasts from step to step, as
+    `Observer.compact` codes it. ``matrix``: float32 [C, H, W], as the ruleset's `matrix:` names its channels (the
+    paper's 20). ``rgb``: uint8 [H, W, 3].
+    """
+
+    kind: str
+    space: Box
+    """Of one world."""
+    channels: tuple[str, ...]
+    """What the channels are."""
+
+    def of(self, world: World) -> Tensor:
+        """The observations of a batch, in memory of their own: [B, *space.shape]."""
+        shape = (len(world.seed), *self.space.shape)
+        out = torch.empty(shape, dtype=_DTYPES[self.space.dtype.name], device=world.seed.device)
+        if self.kind == "ids":
+            world.read("element", out[:, 0])
+        elif self.kind == "compact":
+            world.compact(out)
+        elif self.kind == "matrix":
+            world.matrix(out)
+        else:
+            world.rgb(out)
+        return out
+
+
+_DTYPES = {"uint8": torch.uint8, "float32": torch.float32}
+
+
+def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
+    """The observation of a kind. Raises ValueError for one that there is not."""
+    observer = simulator.observer
+    if kind == "ids":
+        return Observation(kind, _bytes((1, *size)), ("element",))
+    if kind == "compact":
+        names = observer.compact_names
+        return Observation(kind, _bytes((len(names), *size)), names)
+    if kind == "rgb":
+        return Observation(kind, _bytes((*size, 3)), ("red", "green", "blue"))
+    if kind != "matrix":
+        helps = suggest(str(kind), KINDS, "kinds") or ("kinds: " + ", ".join(KINDS),)
+        raise ValueError(f"no observation {kind!r}; {'; '.join(helps)}")
+    ruleset = simulator.ruleset
+    bounds = [abs(one) for slot in observer.slots.values() for one in (slot.kind.lo, slot.kind.hi)]
+    bounds += [float(observer.table(prop.name).abs().max()) for prop in ruleset.properties]
+    limit = max(ruleset.slots, *bounds)
+    box = Box(-limit, limit, (len(observer.matrix_names), *size), np.float32)
+    return Observation(kind, box, observer.matrix_names)
+
+
+def _bytes(shape: tuple[int, ...]) -> Box:
+    """Bytes, 0..255 whatever occurs: what Stable-Baselines3 takes for pictures, and stores as such."""
+    return Box(0, 255, shape, np.uint8)

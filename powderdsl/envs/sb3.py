@@ -1,0 +1,144 @@
+"""`TensorEnv` as a vectorised environment of Stable-Baselines3's."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import MultiDiscrete
+from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+
+from powderdsl.envs.frames import check_render_mode, frames
+from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.envs.vector import array
+from powderdsl.tasks.episodes import TaskProgram
+from powderdsl.tasks.task import Task
+
+Array = NDArray[Any]
+
+
+class PowderVecEnv(VecEnv):
+    """Many worlds of a task, stepped together: ``PPO("CnnPolicy", PowderVecEnv("some-task", 32))``.
+
+    Infos are made for worlds whose episode ended, and empty for others: ``terminal_observation``,
+    ``TimeLimit.truncated``, ``is_success`` where the task says what success is, and ``episode`` as `Monitor` gives it,
+    which is therefore not needed.
+
+    Args:
+        task, num_envs, and all others: those of `TensorEnv`, without `autoreset_mode`.
+        render_mode: ``rgb_array`` or ``ansi``. render_scale: pixels along a cell's side.
+    """
+
+    def __init__(
+        self,
+        task: str | Path | Task | TaskProgram,
+        num_envs: int = 1,
+        *,
+        render_mode: str | None = None,
+        render_scale: int = 8,
+        **how: Any,
+    ):
+        self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
+        self.tensors = TensorEnv(task, num_envs, autoreset_mode="same_step", **how)
+        """The same environment for tensors."""
+        self._actions: Any = None
+        self._began = time.time()
+        space = MultiDiscrete(np.array(self.tensors.action_nvec))
+        super().__init__(num_envs, self.tensors.observation.space, space)
+
+    def reset(self) -> Array:
+        """Begin all episodes with the seeds and options that `seed` and `set_options` have left; they count once."""
+        seeds = None if all(one is None for one in self._seeds) else self._seeds
+        observed, info = self.tensors.reset(seed=seeds, options=_merged(self._options))
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{"world": world} for world in info["world"].tolist()]
+        return array(observed)
+
+    def step_async(self, actions: Any) -> None:
+        """Keep the actions, [B, 5], for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+        """Observations, rewards float32 [B], whether episodes ended bool [B], and infos."""
+        observed, reward, terminated, truncated, info = self.tensors.step(self._actions)
+        done = array(terminated | truncated)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if "final_obs" in info:
+            self._last_infos(infos, info, np.flatnonzero(done), array(truncated))
+        return array(observed), array(reward), done, infos
+
+    def _last_infos(
+        self, infos: list[dict[str, Any]], info: dict[str, Any], places: Array, truncated: Array
+    ) -> None:
+        """The infos of episodes that ended."""
+        last, final = array(info["final_obs"]), info["final_info"]
+        returned, length, success = (
+            array(final[name]) for name in ("episode_return", "episode_length", "success")
+        )
+        passed = round(time.time() - self._began, 6)
+        for number, place in enumerate(places):
+            infos[place] = {
+                "terminal_observation": last[number],
+                "TimeLimit.truncated": bool(truncated[place]),
+                "episode": {"r": float(returned[place]), "l": int(length[place]), "t": passed},
+            }
+            if self.tensors.task.goal.success is not None:
+                infos[place]["is_success"] = bool(success[place])
+
+    def close(self) -> None:
+        """Nothing is left to close."""
+
+    def get_images(self) -> Sequence[Array | None]:
+        """A picture of each world, uint8 [H, W, 3]."""
+        return frames(self.tensors, "rgb_array", self.render_scale)
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute, once a world: of this, or of its `TensorEnv`."""
+        owner = self if hasattr(self, attr_name) else self.tensors
+        return [getattr(owner, attr_name)] * len(self._chosen(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute for all worlds. Raises ValueError for some of them: they share one environment."""
+        if len(self._chosen(indices)) != self.num_envs:
+            raise ValueError("all worlds share one environment: an attribute is set for all of them")
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method once; the result for each world."""
+        owner = self if hasattr(self, method_name) else self.tensors
+        result = getattr(owner, method_name)(*method_args, **method_kwargs)
+        return [result] * len(self._chosen(indices))
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Whether infos are those of a wrapper: true for `Monitor`."""
+        return [wrapper_class is Monitor] * len(self._chosen(indices))
+
+    def _chosen(self, indices: Any) -> list[int]:
+        return list(self._get_indices(indices))
+
+
+def _merged(options: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Options of each world as options of the batch."""
+    first = options[0]
+    if all(one is first or one == first for one in options):
+        return dict(first)
+    if any(one.keys() != first.keys() for one in options):
+        raise ValueError("all worlds must be given the same options, with values of their own")
+    found: dict[str, Any] = {}
+    for name in first:
+        values = [one[name] for one in options]
+        if name == "params":
+            if any(one.keys() != values[0].keys() for one in values):
+                raise ValueError("all worlds must be given the same parameters, with values of their own")
+            found[name] = {param: [one[param] for one in values] for param in values[0]}
+        else:
+            found[name] = values
+    return found

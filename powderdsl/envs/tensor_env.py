@@ -1,0 +1,324 @@
+"""Batches of episodes that start anew by themselves: torch in, torch out, on the simulator's device."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from powderdsl.backends.torch_random import MASK, mix
+from powderdsl.envs.observations import observation_of
+from powderdsl.tasks.episodes import Episodes, TaskProgram, check_actions, compile_task, load_task
+from powderdsl.tasks.task import Task
+
+Info = dict[str, Any]
+"""Of tensors [B]; where a key says something of some worlds only, ``_key``, bool [B], says of which."""
+
+OPTIONS = ("params", "worlds", "reset_mask")
+LAST_ACTIONS = ("auto", "truncates", "terminates")
+
+
+def world_seeds(base: Tensor, episode: Tensor, worlds: int) -> Tensor:
+    """Which world each slot plays: int64 [B].
+
+    Episode 0 of a slot whose seed is `base` plays world `base`. Later ones play worlds below `worlds`, drawn by a hash
+    of `base` and `episode` (both int64 [B]), so that no slot hangs on what happens in others.
+    """
+    key = mix(mix(base & MASK) ^ ((base >> 32) & MASK))
+    high, low = mix((key + episode) & MASK), mix((key ^ mix(episode & MASK)) & MASK)
+    drawn = ((high << 31) | (low >> 1)) % worlds
+    return torch.where(episode == 0, base, drawn)
+
+
+class TensorEnv:
+    """`num_envs` episodes of a task at once. Nothing that it returns is written to later.
+
+    Args:
+        task: name of a shipped task, path of a file, a task, or a program of one, which several environments can share;
+            a program has its split, knobs, parameters, backend and device already.
+        split: which worlds: ``train``, ``test``, or another of the task's.
+        observation: a kind of `observations.KINDS`.
+        knobs: values for the task's knobs. params: for parameters of its rules, for good; `reset` sets them for a while.
+        worlds: how many worlds there are to draw from: numbers 0 … worlds − 1 of the split.
+        autoreset_mode: what happens after an episode's last step, as Gymnasium defines it: ``SAME_STEP`` returns the
+            next episode's first observation, and the last one in the infos; ``NEXT_STEP`` starts it with the following
+            call, whose action is ignored; ``DISABLED`` leaves it to `reset`.
+        last_action: what running out of actions is: it ``truncates``, or ``terminates``. ``auto``: it terminates where
+            the task has a `final` reward, which has then been given, and truncates where rewards would go on.
+        max_episode_steps: truncates earlier than the task does.
+        backend, device, threads: those of `powderdsl.compile`.
+
+    Raises:
+        CompileError: a task, split, knob or parameter that there is not. ValueError: another argument that is wrong.
+    """
+
+    def __init__(
+        self,
+        task: str | Path | Task | TaskProgram,
+        num_envs: int = 1,
+        *,
+        split: str = "train",
+        observation: str = "ids",
+        knobs: Mapping[str, int] | None = None,
+        params: Mapping[str, Any] | None = None,
+        worlds: int = 1_000_000,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        last_action: str = "auto",
+        max_episode_steps: int | None = None,
+        backend: str = "auto",
+        device: str | torch.device = "cpu",
+        threads: int | None = None,
+    ):
+        _check_count("num_envs", num_envs)
+        _check_count("worlds", worlds)
+        _check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps)
+        if last_action not in LAST_ACTIONS:
+            raise ValueError(f"last_action is one of {', '.join(LAST_ACTIONS)}; found {last_action!r}")
+        if not isinstance(task, TaskProgram):
+            if isinstance(task, Task) and (knobs or params):
+                raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
+            found = task if isinstance(task, Task) else load_task(task, knobs=knobs, params=params)
+            task = compile_task(found, split=split, backend=backend, device=device, threads=threads)
+        self.program, self.task, self.split = task, task.task, task.split
+        self.num_envs, self.worlds = num_envs, worlds
+        self.simulator = self.program.simulator
+        self.device = self.simulator.device
+        self.autoreset_mode = _mode(autoreset_mode)
+        self.observation = observation_of(observation, self.simulator, self.task.size)
+        self.single_action_shape, self.action_nvec = (5,), self.program.action_nvec
+        self.last_action_terminates = last_action == "terminates" or (
+            last_action == "auto" and self.task.goal.final is not None
+        )
+        self.actions = min(self.task.agent.actions, max_episode_steps or self.task.agent.actions)
+        self.episodes: Episodes | None = None
+        """The worlds as they are: to look at; their tensors are written to by the next call."""
+        self.params: dict[str, Tensor] = {}
+        """Parameters that `reset` has set: float64 [B] each."""
+        self._base: Tensor | None = None
+        self._episode = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
+        self._returned = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
+        self._ended = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+
+    # Beginning
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[Tensor, Info]:
+        """Begin all episodes, or those of a mask.
+
+        Args:
+            seed: s gives slot i the seed s + i; a list gives one each, None to go on as without. A seed decides the
+                worlds of this and all later episodes of a slot: see `world_seeds`. Without one, every slot goes on
+                with its next episode.
+            options: ``params``: parameters of the rules from now on, a number each or [B]; they stay until others are
+                given, ``{}`` brings back the defaults. ``worlds``: which worlds to play in these episodes, a number
+                or [B]. ``reset_mask``: bool [B], which slots; the others go on where they were.
+
+        Returns:
+            observations [B, …], and infos: ``world``, int64 [B], which worlds they play.
+
+        Raises:
+            TypeError, ValueError, KeyError: something is wrong with a seed or an option. Nothing has changed then.
+        """
+        given = dict(options or {})
+        unknown = [name for name in given if name not in OPTIONS]
+        if unknown:
+            raise KeyError(f"no option `{unknown[0]}`: there are {', '.join(OPTIONS)}")
+        mask = self._mask(given.get("reset_mask"))
+        base, seeded = self._bases(seed)
+        params = self._new_params(given.get("params"), mask)
+        episode = torch.where(mask, torch.where(seeded, 0, self._episode + 1), self._episode)
+        if self._base is None:
+            episode = torch.zeros_like(episode)
+        base = torch.where(mask, base, base if self._base is None else self._base)
+        worlds = world_seeds(base, episode, self.worlds)
+        if "worlds" in given:
+            worlds = self._numbers(given["worlds"], "worlds")
+        if self.episodes is None:
+            self.episodes = self.program.start(worlds)
+        else:
+            places = mask.nonzero()[:, 0]
+            self.episodes = self.program.put(
+                self.episodes, places, self.program.start(worlds[places]), reuse=True
+            )
+        self._base, self._episode, self.params = base, episode, params
+        self._returned = self._returned.masked_fill(mask, 0)
+        self._ended = self._ended & ~mask
+        return self.observation.of(self.episodes.world), {
+            "world": self.episodes.seed.clone(),
+            "_world": mask.clone(),
+        }
+
+    def _bases(self, seed: Any) -> tuple[Tensor, Tensor]:
+        """The seed of each slot, and whether it is a new one."""
+        old = self._base
+        if old is None:
+            first = int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
+            old = torch.arange(first, first + self.num_envs, device=self.device)
+        if seed is None:
+            return old, torch.zeros_like(self._ended)
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+            seeds: list[int | None] = [int(seed) + i for i in range(self.num_envs)]
+        elif isinstance(seed, Sequence) and not isinstance(seed, str):
+            seeds = list(seed)
+        else:
+            raise TypeError(f"seed takes a whole number, a list of them, or None; found {seed!r}")
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
+        for one in seeds:
+            if one is not None and (isinstance(one, bool) or not isinstance(one, int | np.integer)):
+                raise TypeError(f"a seed is a whole number, found {one!r}")
+            if one is not None and not 0 <= one < 1 << 62:
+                raise ValueError(f"a seed lies in 0..2⁶²−1, found {one}")
+        new = torch.tensor([0 if one is None else int(one) for one in seeds], device=self.device)
+        given = torch.tensor([one is not None for one in seeds], device=self.device)
+        return torch.where(given, new, old), given
+
+    def _mask(self, value: Any) -> Tensor:
+        if value is None:
+            return torch.ones_like(self._ended)
+        mask = torch.as_tensor(value, device=self.device)
+        if mask.dtype != torch.bool:
+            raise TypeError(f"reset_mask must be a bool array, found {mask.dtype}")
+        if mask.shape != self._ended.shape:
+            raise ValueError(f"reset_mask must have the shape [{self.num_envs}], found {list(mask.shape)}")
+        if not bool(mask.any()):
+            raise ValueError("reset_mask is False everywhere")
+        if self.episodes is None and not bool(mask.all()):
+            raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
+        return mask
+
+    def _numbers(self, value: Any, name: str) -> Tensor:
+        tensor = torch.as_tensor(value, device=self.device)
+        if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
+            raise TypeError(f"{name} must be whole numbers, found {tensor.dtype}")
+        if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) != self.num_envs):
+            raise ValueError(f"{name} takes one number or {self.num_envs}, found shape {list(tensor.shape)}")
+        if bool((tensor < 0).any()):
+            raise ValueError(f"{name} must be 0 or more")
+        return tensor.to(torch.int64).expand(self.num_envs).clone()
+
+    def _new_params(self, given: Any, mask: Tensor) -> dict[str, Tensor]:
+        """The parameters after a reset of `mask`."""
+        if given is None:
+            return self.params
+        if not isinstance(given, Mapping):
+            raise TypeError(f"params takes a mapping from names to values, found {type(given).__name__}")
+        whole = self.simulator.parameters(given, self.num_envs)
+        names = given.keys() if bool(mask.all()) else given.keys() | self.params.keys()
+        usual = self.simulator.parameters({}, self.num_envs)
+        return {name: torch.where(mask, whole[name], self.params.get(name, usual[name])) for name in names}
+
+    # Stepping
+
+    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:
+        """One action in every episode.
+
+        Args:
+            actions: whole numbers [B, 5]: x, y, choice, vx, vy, each from 0 to ``action_nvec − 1``.
+
+        Returns:
+            observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; infos: ``success``, whether
+            the task's condition for it holds; ``world``, which worlds are shown; where episodes ended
+            ``episode_return`` and ``episode_length`` (zero elsewhere) and, under SAME_STEP, ``final_obs`` (their last
+            observations, [n, …] in the order of the slots) and ``final_info``.
+
+        Raises:
+            ResetNeeded: before the first reset, or under DISABLED in an episode that has ended. TypeError, ValueError:
+            actions that are none. Nothing has changed then.
+        """
+        if self.episodes is None:
+            raise ResetNeeded("reset the environment before its first step")
+        checked = check_actions(self.program, actions)
+        if len(checked) != self.num_envs:
+            raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
+        waiting = self._ended
+        disabled = self.autoreset_mode is AutoresetMode.DISABLED
+        if disabled and bool(waiting.any()):
+            slots = waiting.nonzero()[:, 0].tolist()
+            raise ResetNeeded(f"the episodes of slots {slots[:8]} are over: reset them with a reset_mask")
+        after, reward, success, _ = self.program.act(
+            self.episodes, checked, reuse=True, params=self.params or None
+        )
+        self.episodes = after
+        failed, last = after.failed, after.acted >= self.task.agent.actions
+        terminated = (success | failed | last) if self.last_action_terminates else success | failed
+        truncated = (last | (after.acted >= self.actions)) & ~terminated
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            reward = reward.masked_fill(waiting, 0)
+            terminated, truncated, success = (one & ~waiting for one in (terminated, truncated, success))
+        self._returned = self._returned + reward
+        ended = terminated | truncated
+        info: Info = {"success": success, "_success": ~waiting}
+        over = ended.nonzero()[:, 0]
+        if len(over):
+            info["episode_return"] = (self._returned * ended).float()
+            info["episode_length"] = after.acted * ended
+            info["_episode_return"], info["_episode_length"] = ended.clone(), ended.clone()
+        self._ended = ended
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            observed = self._begin_same_step(over, ended, info)
+        else:
+            if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+                self._begin(waiting.nonzero()[:, 0], waiting)
+            observed = self.observation.of(self.episodes.world)
+        info["world"], info["_world"] = self.episodes.seed.clone(), torch.ones_like(ended)
+        return observed, reward, terminated, truncated, info
+
+    def _begin_same_step(self, over: Tensor, ended: Tensor, info: Info) -> Tensor:
+        """Begin what is over; the observations after that, the last ones and last infos in `info`."""
+        assert self.episodes is not None
+        observed = self.observation.of(self.episodes.world)
+        if not len(over):
+            return observed
+        last = {"world": self.episodes.seed.clone(), "success": info["success"].clone()}
+        last |= {name: info[name].clone() for name in ("episode_return", "episode_length")}
+        info["final_info"] = last | {f"_{name}": ended.clone() for name in last}
+        info["final_obs"], info["_final_obs"], info["_final_info"] = (
+            observed[over],
+            ended.clone(),
+            ended.clone(),
+        )
+        fresh = self._begin(over, ended)
+        assert fresh is not None
+        observed[over] = self.observation.of(fresh.world)
+        self._ended = torch.zeros_like(ended)
+        return observed
+
+    def _begin(self, places: Tensor, mask: Tensor) -> Episodes | None:
+        """The next episodes of some slots, numbers `places`: int64 [n], and the same as bool [B]."""
+        assert self.episodes is not None
+        assert self._base is not None
+        if not len(places):
+            return None
+        self._episode = self._episode + mask
+        self._returned = self._returned.masked_fill(mask, 0)
+        fresh = self.program.start(world_seeds(self._base, self._episode, self.worlds)[places])
+        self.episodes = self.program.put(self.episodes, places, fresh, reuse=True)
+        return fresh
+
+
+def _check_count(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be a whole number from 1, found {value!r}")
+
+
+def _mode(value: AutoresetMode | str) -> AutoresetMode:
+    """A mode of Gymnasium's, by its name in any way of writing."""
+    if isinstance(value, AutoresetMode):
+        return value
+    for mode in AutoresetMode:
+        if str(value).lower().replace("_", "") == mode.value.lower():
+            return mode
+    raise ValueError(
+        f"autoreset_mode is one of {', '.join(mode.name for mode in AutoresetMode)}; found {value!r}"
+    )

@@ -1,0 +1,360 @@
+"""The contract of the batched environment: autoreset by hand, copies, seeds, options, bad input, memory."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.envs.single import PowderEnv
+from powderdsl.envs.tensor_env import TensorEnv, world_seeds
+from powderdsl.envs.vector import PowderVectorEnv
+from powderdsl.tasks.episodes import TaskProgram, compile_task, load_task
+
+ENVS, STEPS = 5, 16
+MODES = tuple(AutoresetMode)
+
+
+def actions_of(program: TaskProgram, steps: int = STEPS, envs: int = ENVS) -> np.ndarray:
+    """Random actions [steps, envs, 5]."""
+    return np.random.default_rng(7).integers(0, program.action_nvec, (steps, envs, 5))
+
+
+class ByHand:
+    """One slot as a loop over the functional core, which never reuses memory."""
+
+    def __init__(self, program: TaskProgram, seed: int):
+        self.program, self.base, self.number = program, seed, -1
+        self.over = False
+        self.begin()
+
+    def begin(self) -> None:
+        self.number += 1
+        base, number = torch.tensor([self.base]), torch.tensor([self.number])
+        self.episodes = self.program.start(world_seeds(base, number, 1_000_000))
+        self.over, self.returned = False, 0.0
+
+    def act(self, action: np.ndarray) -> tuple[float, bool, bool]:
+        self.episodes, reward, success, over = self.program.act(self.episodes, torch.from_numpy(action)[None])
+        terminated = bool(success[0]) or bool(self.episodes.failed[0])
+        self.over = bool(over[0])
+        self.returned += float(reward[0])
+        return float(reward[0]), terminated, self.over and not terminated
+
+    def ids(self) -> np.ndarray:
+        return self.episodes.world.ids.clone().numpy()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_autoreset_is_a_loop_by_hand(small: TaskProgram, mode: AutoresetMode) -> None:
+    env = PowderVectorEnv(small, ENVS, autoreset_mode=mode)
+    slots = [ByHand(small, 30 + i) for i in range(ENVS)]
+    observed, info = env.reset(seed=30)
+    assert info["world"].tolist() == [30, 31, 32, 33, 34]
+    ended, early = 0, 0
+    for actions in actions_of(small):
+        observed, reward, terminated, truncated, info = env.step(actions)
+        reset = np.zeros(ENVS, bool)
+        for i, slot in enumerate(slots):
+            if mode is AutoresetMode.NEXT_STEP and slot.over:
+                slot.begin()
+                wanted = (0.0, False, False)
+            else:
+                wanted = slot.act(actions[i])
+            assert (reward[i], terminated[i], truncated[i]) == pytest.approx(wanted)
+            if slot.over:
+                ended, early = ended + 1, early + int(terminated[i])
+                assert info["_episode_return"][i]
+                assert info["episode_return"][i] == pytest.approx(slot.returned, abs=1e-5)
+                assert info["episode_length"][i] == int(slot.episodes.acted[0])
+                if mode is AutoresetMode.SAME_STEP:
+                    assert info["_final_obs"][i]
+                    assert np.array_equal(info["final_obs"][i], slot.ids())
+                    assert info["final_info"]["episode_length"][i] == int(slot.episodes.acted[0])
+                    slot.begin()
+                reset[i] = slot.over
+            elif "final_obs" in info:
+                assert info["final_obs"][i] is None
+            assert np.array_equal(observed[i], slot.ids())
+            assert info["world"][i] == int(slot.episodes.seed[0])
+        if mode is AutoresetMode.DISABLED and reset.any():
+            with pytest.raises(ResetNeeded, match="are over"):
+                env.step(actions)
+            observed, _ = env.reset(options={"reset_mask": reset})
+            for i in np.flatnonzero(reset):
+                slots[i].begin()
+            assert np.array_equal(observed, np.stack([slot.ids() for slot in slots]))
+    assert ended > ENVS
+    assert 0 < early < ended, "episodes end in one way only: this shows less than it should"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_is_what_gymnasium_makes_of_single_worlds(small: TaskProgram, mode: AutoresetMode) -> None:
+    ours = PowderVectorEnv(small, ENVS, autoreset_mode=mode, observation="compact")
+    theirs = SyncVectorEnv([lambda: PowderEnv(small, observation="compact")] * ENVS, autoreset_mode=mode)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert np.array_equal(ours.reset(seed=3)[0], theirs.reset(seed=3)[0])
+    for actions in actions_of(small):
+        a, b = ours.step(actions), theirs.step(actions)
+        for one, other in zip(a[:4], b[:4], strict=True):
+            assert np.allclose(one, other)
+        if "final_obs" in b[4]:
+            for one, other in zip(a[4]["final_obs"], b[4]["final_obs"], strict=True):
+                assert np.array_equal(one, other)
+            wanted = b[4]["final_info"]["episode_return"]
+            assert np.allclose(a[4]["final_info"]["episode_return"], wanted)
+        over = a[2] | a[3]
+        if mode is AutoresetMode.DISABLED and over.any():
+            one, _ = ours.reset(options={"reset_mask": over})
+            other, _ = theirs.reset(options={"reset_mask": over})
+            assert np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("kind", ["ids", "compact", "matrix", "rgb"])
+def test_nothing_returned_is_written_to_later(small: TaskProgram, kind: str) -> None:
+    """And writing to what was returned changes no world: a second environment, left alone, agrees."""
+    spoiled, alone = (PowderVectorEnv(small, ENVS, observation=kind) for _ in range(2))
+    kept: list[tuple[Any, Any]] = []
+    found, wanted = spoiled.reset(seed=0)[0], alone.reset(seed=0)[0]
+    for actions in actions_of(small):
+        assert np.array_equal(found, wanted)
+        assert wanted in alone.observation_space
+        found[:] = 1
+        result = alone.step(actions)
+        kept.append((result, copy.deepcopy(result)))
+        found, wanted = spoiled.step(actions)[0], result[0]
+    for before, after in kept:
+        assert data_equivalence(before, after, exact=True)
+
+
+def test_seeds_are_those_of_slots(small: TaskProgram) -> None:
+    env = PowderVectorEnv(small, 3, worlds=50)
+    assert env.reset(seed=9)[1]["world"].tolist() == [9, 10, 11]
+    second = env.reset()[1]["world"].tolist()
+    assert all(0 <= world < 50 for world in second)
+    assert len({*second}) > 1
+    assert env.reset(seed=[None, 4, None])[1]["world"][1] == 4
+    # What a slot plays hangs on its own seed and the number of its episode.
+    other = PowderVectorEnv(small, 1, worlds=50)
+    other.reset(seed=10)
+    assert other.reset()[1]["world"].tolist() == second[1:2]
+    # Without a seed, two environments differ.
+    worlds = [PowderVectorEnv(small, 1).reset()[1]["world"][0] for _ in range(4)]
+    assert len({*worlds}) > 1
+    drawn = world_seeds(torch.zeros(4000, dtype=torch.int64), torch.arange(1, 4001), 10)
+    assert torch.bincount(drawn, minlength=10).float().sub(400).abs().max() < 100
+
+
+def test_options_choose_worlds_and_parameters(small: TaskProgram) -> None:
+    env, usual = (PowderVectorEnv(small, 4, autoreset_mode="disabled") for _ in range(2))
+    still = np.tile([0, 0, 1, 1, 1], (4, 1))
+    _, info = env.reset(options={"worlds": [5, 6, 5, 6], "params": {"water.melt": [0.0, 0.0, 1.0, 1.0]}})
+    assert info["world"].tolist() == [5, 6, 5, 6]
+    usual.reset(options={"worlds": [5, 6, 5, 6]})
+
+    def ice() -> list[int]:
+        number = small.simulator.ruleset.element("ice").id
+        return (env.step(still)[0] == number).sum((1, 2, 3)).tolist()
+
+    left = ice()
+    assert left[0] > left[2]
+    assert left[1] > left[3]
+    # They stay, also where others are set for one slot, until they are given anew.
+    env.reset(options={"worlds": 5, "params": {"water.melt": 1}, "reset_mask": np.array([True, False] * 2)})
+    assert env.tensors.params["water.melt"].tolist() == [1, 0, 1, 1]
+    env.reset()
+    assert env.tensors.params["water.melt"].tolist() == [1, 0, 1, 1]
+    env.reset(options={"worlds": [5, 6, 5, 6], "params": {}})
+    assert np.array_equal(env.step(still)[0], usual.step(still)[0])
+
+
+def test_a_task_file_takes_splits_knobs_and_parameters(task_file: Path) -> None:
+    env = TensorEnv(
+        task_file, 2, split="test", knobs={"disks": 1}, params={"water.melt": 0.5}, backend="dense"
+    )
+    observed, _ = env.reset(seed=0)
+    assert observed[:, 0, 1:-1, 1:-1].sum() == 0  # the test split is an empty box
+    assert env.task.knobs[0].value == 1
+    assert env.simulator.ruleset.params[0].default == 0.5
+    for how in ({"split": "tset"}, {"params": {"water.mlet": 1}}, {"knobs": {"disk": 1}}):
+        with pytest.raises(CompileError):
+            TensorEnv(task_file, **how)  # type: ignore[arg-type]
+
+
+BAD_ACTIONS = [
+    np.full((2, 5), 99),
+    np.full((2, 5), -1),
+    np.zeros((2, 5), np.float32),
+    np.full((2, 5), np.nan),
+    np.zeros((2, 5), bool),
+    np.zeros((3, 5), np.int64),
+    np.zeros((2, 4), np.int64),
+    np.zeros(5, np.int64),
+    "up",
+    None,
+]
+BAD_RESETS: list[dict[str, Any]] = [
+    {"seed": -1},
+    {"seed": 1 << 70},
+    {"seed": 1.5},
+    {"seed": True},
+    {"seed": "one"},
+    {"seed": [1]},
+    {"seed": [1, "two"]},
+    {"options": {"param": {}}},
+    {"options": {"params": {"water.mlet": 1}}},
+    {"options": {"params": {"water.melt": 2}}},
+    {"options": {"params": {"water.melt": float("nan")}}},
+    {"options": {"params": {"water.melt": [1, 1, 1]}}},
+    {"options": {"params": 1}},
+    {"options": {"worlds": -1}},
+    {"options": {"worlds": [1, 2, 3]}},
+    {"options": {"worlds": 0.5}},
+    {"options": {"reset_mask": np.array([True])}},
+    {"options": {"reset_mask": np.array([0, 1])}},
+    {"options": {"reset_mask": np.array([False, False])}},
+]
+
+
+def test_bad_input_is_refused_and_changes_nothing(small: TaskProgram) -> None:
+    env, usual = PowderVectorEnv(small, 2), PowderVectorEnv(small, 2)
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros((2, 5), np.int64))
+    for one in (env, usual):
+        one.reset(seed=1)
+    for bad in BAD_ACTIONS:
+        with pytest.raises((TypeError, ValueError)):
+            env.step(bad)
+    for how in BAD_RESETS:
+        with pytest.raises((TypeError, ValueError, KeyError)):
+            env.reset(**how)
+    for actions in actions_of(small, 8, 2):
+        for found, wanted in zip(env.step(actions)[:4], usual.step(actions)[:4], strict=True):
+            assert np.array_equal(found, wanted)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"num_envs": 0},
+        {"num_envs": True},
+        {"worlds": 0},
+        {"max_episode_steps": 0},
+        {"observation": "idz"},
+        {"autoreset_mode": "sometimes"},
+        {"last_action": "end"},
+        {"render_mode": "human"},
+    ],
+)
+def test_bad_arguments_are_refused(small: TaskProgram, how: dict[str, Any]) -> None:
+    (name,) = how
+    with pytest.raises(ValueError, match=name):
+        PowderVectorEnv(small, **how)
+
+
+@pytest.mark.parametrize(
+    ("reward", "last_action", "truncates"),
+    [
+        ("{each: count(sand)}", "auto", True),
+        ("{final: count(sand)}", "auto", False),
+        ("{each: count(sand)}", "terminates", False),
+        ("{final: count(sand)}", "truncates", True),
+    ],
+)
+def test_running_out_of_actions(tmp_path: Path, reward: str, last_action: str, truncates: bool) -> None:
+    """A final reward is all there was to get, so the episode has come to its end; else more would have come."""
+    path = tmp_path / "short.yaml"
+    path.write_text(
+        "task: short\nrules: core+sand\nsize: [8, 8]\nfill: sand\ngenerate: [frame wall]\n"
+        f"agent: {{may: [sand], bins: 2, brush: 2, actions: 2}}\nreward: {reward}\n"
+    )
+    env = TensorEnv(path, 2, last_action=last_action, backend="dense")
+    env.reset(seed=0)
+    nothing = torch.zeros(2, 5, dtype=torch.int64)
+    assert not torch.stack(env.step(nothing)[2:4]).any()
+    terminated, truncated = env.step(nothing)[2:4]
+    assert truncated.tolist() == [truncates] * 2
+    assert terminated.tolist() == [not truncates] * 2
+
+
+def test_episodes_can_be_cut_short(small: TaskProgram) -> None:
+    env = PowderVectorEnv(small, 3, max_episode_steps=2)
+    env.reset(seed=0)
+    far = np.zeros((3, 5), np.int64)
+    env.step(far)
+    _, _, terminated, truncated, info = env.step(far)
+    assert (terminated | truncated).all()
+    assert truncated.any()
+    assert info["episode_length"].tolist() == [2, 2, 2]
+
+
+def test_it_renders(small: TaskProgram) -> None:
+    env = PowderVectorEnv(small, 2, render_mode="rgb_array", render_scale=3)
+    with pytest.raises(ResetNeeded):
+        env.render()
+    env.reset(seed=0)
+    pictures = env.render()
+    assert [one.shape for one in pictures] == [(48, 48, 3)] * 2
+    assert pictures[0].dtype == np.uint8
+    text = PowderEnv(small, render_mode="ansi")
+    text.reset(seed=0)
+    assert text.render().splitlines()[0] == "#" * 16
+    assert PowderEnv(small).render() is None
+
+
+@pytest.mark.parametrize("make", [PowderVectorEnv, TensorEnv])
+def test_two_copies_agree_step_by_step(small: TaskProgram, make: Callable[..., Any]) -> None:
+    first, second = make(small, ENVS, observation="matrix"), make(small, ENVS, observation="matrix")
+    for one, other in [(first.reset(seed=5)[0], second.reset(seed=5)[0])]:
+        assert (one == other).all()
+    for actions in actions_of(small):
+        a, b = first.step(actions), second.step(actions)
+        assert all((one == other).all() for one, other in zip(a[:4], b[:4], strict=True))
+    assert isinstance(a[0], torch.Tensor) == (make is TensorEnv)
+
+
+def test_every_shipped_task_is_registered_and_batched() -> None:
+    import powderdsl.envs  # noqa: F401
+    from powderdsl.envs.register import env_id
+    from powderdsl.tasks.task_names import shipped_tasks
+
+    assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())
+    env = gymnasium.make_vec("powderdsl/SandPushing-v0", num_envs=3, backend="dense", observation="compact")
+    assert isinstance(env.unwrapped, PowderVectorEnv)
+    assert env.metadata["autoreset_mode"] is env.unwrapped.autoreset_mode is AutoresetMode.SAME_STEP
+    observed, _ = env.reset(seed=0)
+    assert observed.shape == (3, 6, 64, 64)
+    assert load_task("sand-pushing").size == (64, 64)
+
+
+def test_gymnasiums_own_statistics_agree(small: TaskProgram) -> None:
+    env = RecordEpisodeStatistics(PowderVectorEnv(small, ENVS))
+    env.reset(seed=0)
+    seen = 0
+    for actions in actions_of(small):
+        info = env.step(actions)[4]
+        if "episode" in info:
+            over = info["_episode"]
+            seen += int(over.sum())
+            assert np.allclose(info["episode"]["r"][over], info["episode_return"][over])
+            assert np.array_equal(info["episode"]["l"][over], info["episode_length"][over])
+    assert seen > ENVS
+
+
+def test_programs_are_shared(task_file: Path) -> None:
+    program = compile_task(load_task(task_file), backend="dense")
+    assert TensorEnv(program).program is TensorEnv(program, 2).program is program
+    with pytest.raises(ValueError, match="load_task"):
+        TensorEnv(program.task, knobs={"disks": 1})
