@@ -158,6 +158,26 @@ def shipped() -> str:
     return table(("name", "", "what it is"), rows)
 
 
+def tasks() -> str:
+    """The tasks that come with powderdsl: what may be placed, how often, and their knobs."""
+    from powderdsl.tasks.shipped_tasks import load_task
+    from powderdsl.tasks.task import BLOW, NO_CHANGE
+    from powderdsl.tasks.task_names import shipped_tasks
+
+    rows = []
+    for name in shipped_tasks():
+        task = load_task(name)
+        names = {element.id: element.name for element in task.ruleset.elements}
+        every = set(names) <= set(task.agent.choices)
+        words = ["any"] if every else [names[one] for one in task.agent.choices if one >= 0]
+        words += ["blow"] if BLOW in task.agent.choices else []
+        words += ["nothing"] if NO_CHANGE in task.agent.choices else []
+        knobs = ", ".join(f"`{knob.name}`" for knob in task.knobs)
+        splits = ", ".join(f"`{split.name}`" for split in task.splits)
+        rows.append((f"`{name}`", task.about, ", ".join(words), str(task.agent.actions), knobs, splits))
+    return table(("task", "what is to be done", "with", "actions", "knobs", "splits"), rows)
+
+
 def stages() -> str:
     return table(("stage", "what it does"), [(f"`{stage.name}`", stage.about) for stage in PIPELINE])
 
@@ -193,6 +213,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "words": words,
     "limits": limits,
     "shipped": shipped,
+    "tasks": tasks,
     "stages": stages,
     "commands": commands,
     **{f"keys {context}": partial(keys, context) for context in (*KEYS, *TASK_KEYS)},

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import reduce
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.expressions import Typer
@@ -26,7 +27,9 @@ MEASURES = {
 """What can be taken of a whole world, and how it is written."""
 
 MEMORIES = {"start": "start(VALUE)", "change": "change(VALUE)"}
-ARITHMETIC = {"min": "min(A, B)", "max": "max(A, B)", "abs": "abs(A)"}
+ARITHMETIC = {"min": "min(A, B, …)", "max": "max(A, B, …)", "abs": "abs(A)"}
+MAX_VALUES = 8
+"""Numbers that `min` and `max` take, as in rules."""
 FUNCTIONS = {**MEASURES, **MEMORIES, **ARITHMETIC}
 
 ACTION_WORDS = ("taken", "left", "painted", "placed", "blown")
@@ -165,13 +168,17 @@ class GoalChecker:
         if name not in FUNCTIONS:
             helps = suggest(name, FUNCTIONS, "functions")
             raise self.typer.fail("PD301", f"unknown function `{name}`", span, "not a function", helps)
-        wanted = 2 if name in ("min", "max") else 1
-        if len(parts) != wanted:
-            message = f"`{name}` takes {wanted} value{'s' * (wanted > 1)}, found {len(parts)}"
+        least, most = (2, MAX_VALUES) if name in ("min", "max") else (1, 1)
+        if not least <= len(parts) <= most:
+            wanted = "1 value" if most == 1 else f"{least} to {most} values"
+            message = f"`{name}` takes {wanted}, found {len(parts)}"
             usage = (f"write `{FUNCTIONS[name]}`",)
             raise self.typer.fail("PD406", message, syntax.span, "", usage)
         if name in ARITHMETIC:
-            return Scalar(name, tuple(self.value(part) for part in parts))
+            values = [self.value(part) for part in parts]
+            if len(values) == 1:
+                return Scalar(name, (values[0],))
+            return reduce(lambda a, b: Scalar(name, (a, b)), values)
         if name in MEMORIES:
             inner = self.value(parts[0])
             if any(one.op in ("start", "before", "action") for one in parts_of(inner)):

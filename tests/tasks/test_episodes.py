@@ -175,6 +175,7 @@ EXPRESSIONS = {
     "count(sand) - start(count(sand)) * 2": lambda v: v.count(v.ids == 2) - 2 * (v.start == 2).sum(),
     "change(count(gas))": lambda v: float((v.ids == 4).sum()) - (v.before == 4).sum(),
     "1 if count(lava) > count(ice) else -1": lambda v: 1 if (v.ids == 10).sum() > (v.ids == 6).sum() else -1,
+    "min(count(sand), count(gas), 300)": lambda v: min((v.ids == 2).sum(), (v.ids == 4).sum(), 300),
     "min(count(sand), 9) + max(-3, -taken) + abs(left - 60)": lambda v: min((v.ids == 2).sum(), 9) - v.taken + abs(4 - v.taken),
     "(count(sand) mod 7) / (count(sand) * 0) + 2 * -taken": lambda v: -2 * v.taken,
     "1 if 1 <= taken < 3 and not (count(sand) == count(sand) + 1) or no else 5": lambda v: 1 if v.taken < 3 else 5,

@@ -157,6 +157,7 @@ MALFORMED = [
     ("count(sand in slot) / 10", "sum(velocity)", "PD401", "velocity"),
     ("count(sand in slot) / 10", "count(momentum)", "PD401", "momentum"),
     ("count(sand in slot) / 10", "match(wnated)", "PD802", "wnated"),
+    ("count(sand in slot) / 10", "min(taken)", "PD406", "min(taken)"),
     ("count(sand in slot) / 10", "change(taken)", "PD406", "taken"),
     ("count(sand in slot) / 10", "count(interact < 5%)", "PD406", "interact < 5%"),
     ("count(sand in slot) / 10", "1 if count(sand) else 2", "PD401", "count(sand)"),

@@ -1,0 +1,95 @@
+"""Tasks of our own can be solved: by a short script, hardly by chance, and never by doing nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.tasks.task_names import shipped_tasks
+from tests.tasks.conftest import RULES
+from tests.tasks.witnesses import WITNESSES, Act, Seen
+
+WORLDS = 8
+PLAYERS = ("witness", "chance", "nothing")
+OF_THE_PAPER = {"sand-pushing", "destroying", "path-building", "world-model"}
+
+
+@dataclass(frozen=True)
+class Played:
+    """How the worlds of one player ended: bool and float64 [WORLDS]."""
+
+    solved: NDArray[np.bool_]
+    returns: NDArray[np.float64]
+
+
+@cache
+def simulator():  # type: ignore[no-untyped-def]
+    import powderdsl
+
+    return powderdsl.compile(RULES, backend="torch")
+
+
+def play(name: str, split: str) -> dict[str, Played]:
+    """The same `WORLDS` worlds, three times side by side in one batch: once for each of `PLAYERS`."""
+    import torch
+
+    from powderdsl.tasks.episodes import TaskProgram, check_actions
+
+    program = TaskProgram(load_task(name), split, simulator())
+    agent = program.task.agent
+    words = [{-1: "blow", -2: "nothing"}.get(one) or simulator().elements[one] for one in agent.choices]
+    episodes = program.start(torch.arange(WORLDS).repeat(3))
+    random = np.random.default_rng(0)
+    solved, over = np.zeros(3 * WORLDS, dtype=bool), np.zeros(3 * WORLDS, dtype=bool)
+    returns = np.zeros(3 * WORLDS)
+
+    def numbers(act: Act) -> list[int]:
+        """An act as the five numbers of an action. What lies outside is done at the edge."""
+        word, row, column, down, right = (*act, 0, 0)[:5]
+        bins = (
+            int(np.clip(place, 0, 63)) * n // 64 for place, n in zip((row, column), agent.bins, strict=True)
+        )
+        y, x = bins
+        return [x, y, words.index(word), right + 1, down + 1]
+
+    for turn in range(agent.actions):
+        ids = episodes.world.ids.numpy()
+        regions = {key: value.expand(3 * WORLDS, -1, -1).numpy() for key, value in episodes.regions.items()}
+        actions = [
+            numbers(
+                WITNESSES[name](
+                    Seen(ids[i], {k: v[i] for k, v in regions.items()}, simulator().elements, turn)
+                )
+            )
+            for i in range(WORLDS)
+        ]
+        actions += random.integers(program.action_nvec, size=(WORLDS, 5)).tolist()
+        actions += [numbers(("nothing", 0, 0))] * WORLDS
+        episodes, reward, success, ended = program.act(episodes, check_actions(program, actions), reuse=True)
+        returns += np.where(over, 0, reward.numpy())
+        solved |= success.numpy() & ~over
+        over |= ended.numpy()
+        if over.all():
+            break
+    parts = (slice(i * WORLDS, (i + 1) * WORLDS) for i in range(3))
+    return {player: Played(solved[part], returns[part]) for player, part in zip(PLAYERS, parts, strict=True)}
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+@pytest.mark.parametrize("name", WITNESSES)
+def test_a_witness_solves_it_and_chance_does_not(torch, name, split):
+    played = play(name, split)
+    witness, chance, nothing = (played[player] for player in PLAYERS)
+    assert witness.solved.mean() >= 0.75
+    assert chance.solved.mean() <= 0.25
+    assert not nothing.solved.any()
+    assert witness.returns.mean() > max(chance.returns.mean(), nothing.returns.mean()) + 0.2
+
+
+def test_every_task_of_our_own_has_a_witness():
+    assert set(WITNESSES) == set(shipped_tasks()) - OF_THE_PAPER
