@@ -39,12 +39,19 @@ if TYPE_CHECKING:
 )
 @click.option("--notes", is_flag=True, help="Also list what is worth knowing, such as rules that are asleep.")
 @click.option("--warnings-as-errors", is_flag=True, help="Exit with 1 if there are warnings.")
+@click.option("--quick", is_flag=True, help="Do not try invariants: only what the rules themselves say.")
 @click.option("--cost", is_flag=True, help="Also say what each pass costs; in JSON as a second key.")
 @click.option(
     "--ledger", is_flag=True, help="Also say what rules create, destroy and move; in JSON as a key."
 )
 def command(
-    rules: tuple[str, ...], layout: str, notes: bool, warnings_as_errors: bool, cost: bool, ledger: bool
+    rules: tuple[str, ...],
+    layout: str,
+    notes: bool,
+    warnings_as_errors: bool,
+    quick: bool,
+    cost: bool,
+    ledger: bool,
 ) -> int:
     """Find the mistakes in rule files and tasks, all at once, and invariants that do not hold.
 
@@ -60,7 +67,9 @@ def command(
     errors = warnings = 0
     for name in rules:
         found_task = _check_task(name) if is_task(name) else None
-        ruleset, diagnostics, book = _check(name) if found_task is None else (None, found_task[1], None)
+        ruleset, diagnostics, book = (
+            _check(name, quick) if found_task is None else (None, found_task[1], None)
+        )
         counts = Counter(one.severity for one in diagnostics)
         errors += counts[Severity.ERROR]
         warnings += counts[Severity.WARNING]
@@ -96,13 +105,13 @@ def command(
     return FAILED if warnings and warnings_as_errors else OK
 
 
-def _check(name: str) -> tuple[Ruleset | None, tuple[Diagnostic, ...], Ledger | None]:
+def _check(name: str, quick: bool) -> tuple[Ruleset | None, tuple[Diagnostic, ...], Ledger | None]:
     """The rules if they can be loaded, all that is wrong with them, and their ledger if their invariants needed it."""
     try:
         ruleset, remarks = load_with_diagnostics(name)
     except CompileError as error:
         return None, error.diagnostics, None
-    if not ruleset.invariants:
+    if quick or not ruleset.invariants:
         return ruleset, remarks, None
     from powderdsl.properties.refute import refuted  # brings numpy
 

@@ -277,8 +277,10 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
             powderdsl.compile(rules, backend="native")
             assert start.read_bytes() == whole
             assert powderdsl.compile(rules).running == "native"
-        library.write_bytes(library.read_bytes()[:1000])
-        # In a process of its own: this one has the library in memory.
+        # Another file, tried in a process of its own: this one has the library in memory.
+        part = library.read_bytes()[:1000]
+        library.unlink()
+        library.write_bytes(part)
         program = (
             "import sys; from pathlib import Path\n"
             "from powderdsl.backends.native_build import Building, building\n"
