@@ -210,7 +210,6 @@ def load_source(source: str, name: str, constants: Mapping[str, object]) -> Call
     """The function of some generated source. It holds only names made up here, and constants passed beside it."""
     filename = f"<powderdsl {name} {abs(hash(source)):x}>"
     linecache.cache[filename] = (len(source), None, source.splitlines(True), filename)
-    namespace = dict(constants)
+    namespace: dict[str, Any] = dict(constants)
     exec(compile(source, filename, "exec"), namespace)
-    function: Callable[..., Any] = namespace[name]  # type: ignore[assignment]
-    return function
+    return namespace[name]

@@ -54,19 +54,18 @@ class Block:
         result: list[str] = []
         i = 0
         while i < len(self.statements):
+            statement = self.statements[i]
+            if isinstance(statement, str):
+                result.append(statement)
+                i += 1
+                continue
             run: list[Lanes] = []
             while i < len(self.statements) and isinstance(item := self.statements[i], Lanes):
                 run.append(item)
                 i += 1
-            if run:
-                outside = " ".join(
-                    _all_text(s) for s in (*self.statements[: i - len(run)], *self.statements[i:])
-                )
-                seen_outside = set(_VARIABLE.findall(outside))
-                result.append(lane_loop(run, seen_outside))
-            else:
-                result.append(self.statements[i])  # type: ignore[arg-type]
-                i += 1
+            outside = " ".join(_all_text(s) for s in (*self.statements[: i - len(run)], *self.statements[i:]))
+            seen_outside = set(_VARIABLE.findall(outside))
+            result.append(lane_loop(run, seen_outside))
         return result
 
 

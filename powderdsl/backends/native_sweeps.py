@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -329,7 +330,7 @@ def quiet(
     masks: dict[int, Node] = {}
     sources: dict[int, Node] = {}
 
-    def visit(node: Node):  # type: ignore[no-untyped-def]
+    def visit(node: Node) -> Any:
         if id(node) in memo:
             return memo[id(node)]
         if node.type == REAL and have(node) and node not in nodes:

@@ -27,9 +27,8 @@ class ValueWriter:
         nodes = list({id(n): n for _, root in pass_.outputs for n in walk(root)}.values())
         self.alive = {id(n) for n in nodes}
         self.all_comparisons = [n for n in nodes if n.op in ("eq", "lt", "le")]
-        nothing = lambda node: node.op == "input"  # noqa: E731
         shifts = [n for n in nodes if n.op == "shift" and n.type == REAL]
-        sources = [p for n in shifts for p in (stored_parts(n.args[0], nothing) if n.attr[2] else n.args)]
+        sources = [p for n in shifts for p in (stored_parts(n.args[0], _is_input) if n.attr[2] else n.args)]
         self.stored = {id(part) for part in sources if part.op != "input"}
         self.leaders = {
             id(n): leader for n in self.all_comparisons if (leader := leading(n, self.all_comparisons, pass_))
@@ -236,9 +235,9 @@ class ValueWriter:
                 outputs.append((node, name, sweep.comparison(node, self.leaders)))
         sweep.close()
         lanes = sweep_lanes(outputs, sweep, values, masks)
-        kept = [unchanged(node) for node in nodes]
-        if all(kept) and all(self.have(base) for base, _ in kept):  # type: ignore[misc]
-            self.changed_rows(outputs, kept, lanes)  # type: ignore[arg-type]
+        kept = [found for node in nodes if (found := unchanged(node)) is not None]
+        if len(kept) == len(nodes) and all(self.have(base) for base, _ in kept):
+            self.changed_rows(outputs, kept, lanes)
         else:
             self.block.statements.append(lanes)
         for node, name, _ in outputs:
@@ -273,3 +272,7 @@ class ValueWriter:
         self.block.statements.append(
             lane_loop([replace(sweep, rows=still + sweep.rows, asked=None)], sweep.fields)
         )
+
+
+def _is_input(node: Node) -> bool:
+    return node.op == "input"

@@ -34,7 +34,7 @@ class PlaneKernels:
     valid: Tensor = field(init=False)
     zero: Tensor = field(init=False)
     _planes: dict[tuple[str, int], list[Tensor]] = field(default_factory=dict)
-    _cache: dict[object, Tensor] = field(default_factory=dict)
+    _cache: dict[tuple[str | int, ...], Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _, _, self.width = self.dense.shape
@@ -44,7 +44,7 @@ class PlaneKernels:
     def begin(self, step: Tensor) -> None:
         self.dense.begin(step)
         self._planes.clear()
-        self._cache = {key: value for key, value in self._cache.items() if key[0] != "step"}  # type: ignore[index]
+        self._cache = {key: value for key, value in self._cache.items() if key[0] != "step"}
 
     def full(self, x: Tensor) -> Tensor:
         batch, height, _ = self.dense.shape

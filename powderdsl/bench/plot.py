@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def require_matplotlib() -> None:
     """Raises CompileError (PD612) if matplotlib is not installed: before long work, not after it."""
     try:
-        import matplotlib.figure  # noqa: F401
+        import matplotlib.figure  # noqa: F401  only whether it is there
     except ImportError:
         raise failure(
             "PD612",

@@ -184,7 +184,7 @@ def _campaign(
         except KeyboardInterrupt:
             interrupted = True
         finally:
-            events.close()  # type: ignore[attr-defined]  # a generator: its processes end, its state is saved
+            events.close()  # its processes end, its state is saved
     _report(plan, tally, folder, time.monotonic() - began, interrupted)
     return FAILED if tally.files else OK
 
@@ -237,7 +237,7 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
         except KeyboardInterrupt:
             click.echo("interrupted")
         finally:
-            trials.close()  # type: ignore[attr-defined]  # a generator: its processes end
+            trials.close()  # its processes end
     click.echo(
         f"{kinds.total():,} inputs loaded in {time.monotonic() - began:.0f} s, {accepted:,} of them good rules"
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -76,7 +76,8 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return near.all(-1).astype(np.float32) - 1
 
     def _with_goals(self, observed: Any) -> dict[str, Array]:
-        tensors = self.env.unwrapped.tensors  # type: ignore[attr-defined]
+        tensors = cast(PowderEnv, self.env.unwrapped).tensors
+        assert tensors.episodes is not None  # reset and step have begun them
         measured = tensors.program.measured(tensors.episodes, tensors.params)
         achieved = measured[0].cpu().numpy().astype(np.float32)
         return {"observation": observed, "achieved_goal": achieved, "desired_goal": self.goal.copy()}

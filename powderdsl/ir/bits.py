@@ -6,6 +6,7 @@ a plane, ``element:0`` the lowest.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from powderdsl.ir.build import Builder
@@ -221,7 +222,7 @@ class _PassBits:
         assert isinstance(members, frozenset)
         return self._function(value, lo, hi, lambda v: v in members)
 
-    def _function(self, value: Bits, lo: int, hi: int, function) -> Node:  # type: ignore[no-untyped-def]
+    def _function(self, value: Bits, lo: int, hi: int, function: Callable[..., int]) -> Node:
         """A flag that depends on a small whole number only."""
         count = len(value.planes)
         if count > MAX_TABLE_BITS:

@@ -41,7 +41,8 @@ class Planes:
                 elif prop.kind.name == "flag":
                     numbers.append(build.flag(bool(value)))
                 else:
-                    numbers.append(build.whole(int(value)))  # type: ignore[arg-type]
+                    assert not isinstance(value, tuple)
+                    numbers.append(build.whole(int(value)))
             return self.by_element(element, numbers)
         if prop.kind.name == "flag":
             return build.in_set(element, frozenset(i for i, v in enumerate(prop.values) if v))

@@ -14,11 +14,12 @@ from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
 from powderdsl.properties.outcomes import Counterexample, Property
-from powderdsl.properties.samples import Array, Sample
+from powderdsl.properties.samples import Sample
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.reducer import to_tree
 from powderdsl.testing.rulemaker import write_yaml
 from powderdsl.testing.vocabulary import Tree
+from powderdsl.testing.written_arrays import entries_of, line_of, read_array, write_array
 from powderdsl.worlds.files import failure, read_source, replacing
 
 FOLDER = ".powderdsl"
@@ -50,10 +51,10 @@ def write_example(path: Path, rules: str, prop: Property, found: Counterexample)
         "steps": str(found.steps),
         "seed": str(int(sample.seeds[0])),
         "clock": str(int(sample.clock[0])),
-        "world": _rows(sample.ids[0]),
+        "world": write_array(sample.ids[0]),
     }
     if sample.fields:
-        tree["fields"] = {name: _rows(values[0]) for name, values in sample.fields.items()}
+        tree["fields"] = {name: write_array(values[0]) for name, values in sample.fields.items()}
     if sample.params:
         tree["params"] = {name: repr(float(values[0])) for name, values in sample.params.items()}
     head = f"# Breaks `{prop.text}` ({prop.place or prop.owner})\n"
@@ -77,25 +78,25 @@ def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Sample, int]:
     try:
         assert isinstance(tree, dict)
         dtypes = {slot.name: slot.dtype for slot in slots(ruleset)}
-        ids = _array(tree["world"], "uint8")
+        ids = read_array(tree["world"], "uint8")
         known = [element.id for element in ruleset.elements]
         if ids.ndim != 2 or not ids.size or not np.isin(ids, known).all():
             raise ValueError("cells of elements that the rules do not have")
-        fields = {name: _array(rows, dtypes[name])[None] for name, rows in _entries(tree.get("fields"))}
+        fields = {name: read_array(rows, dtypes[name])[None] for name, rows in entries_of(tree.get("fields"))}
         if any(values.shape[-2:] != ids.shape for values in fields.values()):
             raise ValueError("a field of another size than the world")
         names = {param.name for param in ruleset.params}
         params = {
-            name: np.array([float(_line(text))])
-            for name, text in _entries(tree.get("params"))
+            name: np.array([float(line_of(text))])
+            for name, text in entries_of(tree.get("params"))
             if name in names
         }
-        numbers = [int(_line(tree[key])) for key in ("steps", "seed", "clock")]
+        numbers = [int(line_of(tree[key])) for key in ("steps", "seed", "clock")]
         steps, seed, clock = numbers
         if not 1 <= steps <= 100_000 or min(seed, clock) < 0:
             raise ValueError("a number of steps that no test has")
         sample = Sample(ids[None], np.array([seed], np.int64), np.array([clock], np.int64), fields, params)
-        return _line(tree["property"]), sample, steps
+        return line_of(tree["property"]), sample, steps
     except CompileError:
         raise
     except (AssertionError, KeyError, ValueError, TypeError, OverflowError) as error:
@@ -121,29 +122,3 @@ def kept_examples(
                 continue
             if text == prop.text:
                 yield prop, sample, steps
-
-
-def _rows(values: Array) -> Tree:
-    if values.ndim == 1:
-        return " ".join(str(value) for value in values)
-    return [_rows(part) for part in values]
-
-
-def _array(tree: Tree, dtype: str) -> Array:
-    def nested(part: Tree) -> list:
-        if isinstance(part, str):
-            return [np.dtype(dtype).type(word) for word in part.split()]
-        assert isinstance(part, list)
-        return [nested(item) for item in part]
-
-    return np.asarray(nested(tree), dtype)
-
-
-def _line(tree: Tree) -> str:
-    assert isinstance(tree, str)
-    return tree
-
-
-def _entries(tree: Tree | None) -> list[tuple[str, Tree]]:
-    assert tree is None or isinstance(tree, dict)
-    return list((tree or {}).items())

@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
@@ -97,7 +97,7 @@ def load_tally(folder: Path, plan: Plan) -> Tally:
 
 def run_campaign(
     plan: Plan, tally: Tally, seeds: Iterator[int], jobs: int, folder: Path, until: float
-) -> Iterator[Outcome | Path]:
+) -> Generator[Outcome | Path, None, None]:
     """Compare on seeds until they or the time are over; each outcome of a seed, and each file with a finding.
 
     The state file is kept up to date, also when the caller stops early. Findings are saved as they are found, and

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.state import slots
 from powderdsl.syntax.yaml_tree import parse_yaml
@@ -13,6 +11,7 @@ from powderdsl.testing.cases import Case, Start, load_text
 from powderdsl.testing.reducer import to_tree
 from powderdsl.testing.rulemaker import write_yaml
 from powderdsl.testing.vocabulary import Tree
+from powderdsl.testing.written_arrays import entries_of, line_of, read_array, write_array
 from powderdsl.worlds.files import failure, read_source, replacing
 
 
@@ -29,10 +28,10 @@ def write_case(path: Path, case: Case, problem: str = "") -> None:
         "steps": str(case.steps),
         "seed": str(start.seed),
         "step": str(start.step),
-        "worlds": _rows(start.ids),
+        "worlds": write_array(start.ids),
     }
     if start.fields:
-        tree["fields"] = {name: _rows(values) for name, values in start.fields.items()}
+        tree["fields"] = {name: write_array(values) for name, values in start.fields.items()}
     if start.params:
         tree["params"] = {
             name: " ".join(repr(value) for value in values) for name, values in start.params.items()
@@ -56,20 +55,21 @@ def read_case(path: Path) -> Case:
     tree = to_tree(root) if root is not None else None
     try:
         assert isinstance(tree, dict)
-        text = _line(tree["rules"])
+        text = line_of(tree["rules"])
         types = {slot.name: slot.dtype for slot in slots(load_text(text, path.name))}
-        fields = {name: _array(rows, types[name]) for name, rows in _entries(tree.get("fields"))}
+        fields = {name: read_array(rows, types[name]) for name, rows in entries_of(tree.get("fields"))}
         params = {
-            name: [float(word) for word in _line(row).split()] for name, row in _entries(tree.get("params"))
+            name: [float(word) for word in line_of(row).split()]
+            for name, row in entries_of(tree.get("params"))
         }
         start = Start(
-            _array(tree["worlds"], "uint8"),
+            read_array(tree["worlds"], "uint8"),
             fields,
-            int(_line(tree["seed"])),
+            int(line_of(tree["seed"])),
             params,
-            int(_line(tree["step"])),
+            int(line_of(tree["step"])),
         )
-        return Case(text, start, int(_line(tree["steps"])), _line(tree["backend"]))
+        return Case(text, start, int(line_of(tree["steps"])), line_of(tree["backend"]))
     except CompileError:
         raise
     except (AssertionError, KeyError, ValueError, TypeError, OverflowError) as error:
@@ -78,30 +78,3 @@ def read_case(path: Path) -> Case:
         )
         helps = ("a case is written by `powderdsl fuzz`",)
         raise failure("PD602", f"{path} is no case of `powderdsl fuzz`", notes=(note,), helps=helps) from None
-
-
-def _rows(values: np.ndarray) -> Tree:
-    """Nested lists, the last axis a line of numbers; floats as the shortest text that means the same float32."""
-    if values.ndim == 1:
-        return " ".join(str(value) for value in values)
-    return [_rows(part) for part in values]
-
-
-def _array(tree: Tree, dtype: str) -> np.ndarray:
-    def nested(part: Tree) -> list:
-        if isinstance(part, str):
-            return [np.dtype(dtype).type(word) for word in part.split()]
-        assert isinstance(part, list)
-        return [nested(item) for item in part]
-
-    return np.asarray(nested(tree), dtype)
-
-
-def _line(tree: Tree) -> str:
-    assert isinstance(tree, str)
-    return tree
-
-
-def _entries(tree: Tree | None) -> list[tuple[str, Tree]]:
-    assert tree is None or isinstance(tree, dict)
-    return list((tree or {}).items())

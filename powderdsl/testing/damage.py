@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -247,7 +247,7 @@ def damaged_text(seed: int) -> tuple[str, str]:
     return kind, KINDS[kind][1](choices)
 
 
-def run_trials(seeds: Iterator[int], jobs: int, folder: Path, until: float) -> Iterator[Trial]:
+def run_trials(seeds: Iterator[int], jobs: int, folder: Path, until: float) -> Generator[Trial, None, None]:
     """Load the inputs of seeds in some processes until they or the time are over; what fails is saved in the folder.
 
     Args:
