@@ -182,7 +182,10 @@ def test_goals_pass_both_checkers_and_hindsight_replay(small: TaskProgram) -> No
     for _ in range(60):
         actions = rng.integers(0, small.action_nvec, (1, 5))
         after, reward, done, infos = env.step(actions)
-        buffer.add(observed, after, actions, reward, done, infos)
+        # As Stable-Baselines3 stores it: behind an episode's last step stands its own last observation.
+        last = infos[0].get("terminal_observation")
+        stored = after if last is None else {name: value[None] for name, value in last.items()}
+        buffer.add(observed, stored, actions, reward, done, infos)
         observed = after
     sample = buffer.sample(64)
     achieved = sample.next_observations["achieved_goal"].numpy()
