@@ -31,7 +31,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "web", "experiments", "cli")
+_AFTER = ("bench", "tasks", "envs", "datasets", "web", "experiments", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -66,6 +66,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "bench": _SCREEN,
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
+    "datasets": (*_SCREEN, "tasks", "envs"),
     "web": _SCREEN,
     "experiments": (*_SCREEN, "tasks", "envs", "web"),
     "cli": (*_EVERYTHING[:-1], "user_cache"),
@@ -83,7 +84,8 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", "experiments")
+_DATASETS = ("datasets.dataset", "datasets.recorder", "datasets.scripted")
+_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", *_DATASETS, "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),

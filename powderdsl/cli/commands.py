@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "test": ("test_command", "Run the tests of packs, and hold their invariants against the rules."),
     "trace": ("trace_command", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
     "fuzz": ("fuzz_command", "Compare all backends on random rules and worlds."),
+    "record": ("record_command", "Record episodes of a task: data for offline learning and world models."),
     "bench": ("bench_command", "Measure how fast rules run, on each backend, batch and size."),
     "cache": ("cache_command", "List or remove compiled code that is kept on this machine."),
     "new": ("new_command", "Write a first pack: an element, a rule and a test."),

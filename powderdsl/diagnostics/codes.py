@@ -94,6 +94,8 @@ _ROWS = (
     ("PD611", "ragged-rows", _ERROR),
     ("PD612", "missing-package", _ERROR),
     ("PD613", "file-not-writable", _ERROR),
+    ("PD630", "invalid-dataset", _ERROR),
+    ("PD631", "dataset-mismatch", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),
     # PD8xx: tasks
