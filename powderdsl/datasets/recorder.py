@@ -255,11 +255,11 @@ def _write(folder: Path, manifest: Manifest, number: int, finished: dict[int, di
     """Write a shard of finished episodes, which are dropped, and the manifest that has it."""
     recipe = manifest.recipe
     numbers = recipe.episodes_of(number)
-    parts = [finished.pop(episode) for episode in numbers]
-    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    arrays["length"] = np.array([len(part["action"]) for part in parts])
-    arrays["world"] = _worlds(recipe, np.array(numbers, np.int64))
-    row = write_shard(folder, number, arrays, compress=recipe.compress)
+    episodes = [finished.pop(episode) for episode in numbers]
+    parts = {name: [one[name] for one in episodes] for name in episodes[0]}
+    parts["length"] = [np.array([len(one) for one in parts["action"]])]
+    parts["world"] = [_worlds(recipe, np.array(numbers, np.int64))]
+    row = write_shard(folder, number, parts, compress=recipe.compress)
     rows = sorted((*manifest.shards, row), key=lambda one: one.number)
     manifest = replace(manifest, shards=tuple(rows))
     write_manifest(folder, manifest)

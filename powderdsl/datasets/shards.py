@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -50,8 +51,10 @@ def shapes(recipe: Recipe, number: int, transitions: int) -> dict[str, tuple[int
     }
 
 
-def write_shard(folder: Path, number: int, arrays: dict[str, Array], *, compress: bool) -> ShardRow:
-    """Write a shard and what the manifest says of it. Equal arrays make equal files.
+def write_shard(
+    folder: Path, number: int, parts: Mapping[str, Sequence[Array]], *, compress: bool
+) -> ShardRow:
+    """Write a shard, each array in parts one behind another. Equal arrays make equal files.
 
     Raises:
         CompileError: PD613 if the place cannot be written, or the disk is full.
@@ -65,16 +68,20 @@ def write_shard(folder: Path, number: int, arrays: dict[str, Array], *, compress
                     entry = zipfile.ZipInfo(f"{name}.npy")
                     entry.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
                     entry._compresslevel = LEVEL  # type: ignore[attr-defined]
-                    value = np.ascontiguousarray(arrays[name], dtype)
+                    values = [np.ascontiguousarray(part, dtype) for part in parts[name]]
+                    shape = (sum(map(len, values)), *values[0].shape[1:])
+                    header = {"descr": dtype, "fortran_order": False, "shape": shape}
                     with archive.open(entry, "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, value, version=(1, 0), allow_pickle=False)
+                        np.lib.format.write_array_header_1_0(member, header)
+                        for value in values:
+                            member.write(value.data)
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             size = temporary.stat().st_size
         except OSError as error:
             raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
-    return ShardRow(number, digest, size, len(arrays["action"]))
+    return ShardRow(number, digest, size, sum(map(len, parts["action"])))
 
 
 @dataclass(frozen=True)
