@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from math import prod
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
@@ -122,16 +123,15 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / FILE
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or str(error)
-        raise damaged(f"{folder} is no dataset", f"{FILE}: {reason}") from None
-    if len(text) > MAX_BYTES:
-        raise damaged(f"{path} is no manifest", f"it has more than {MAX_BYTES:,} bytes")
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        found = path.stat()
+        if not S_ISREG(found.st_mode):
+            raise damaged(f"{folder} is no dataset", f"{FILE} is no file")
+        if found.st_size > MAX_BYTES:
+            raise damaged(f"{path} is no manifest", f"it has more than {MAX_BYTES:,} bytes")
+        data = json.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise damaged(f"{folder} is no dataset", f"{FILE}: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:  # also of a NUL in the name
         raise damaged(f"{path} is no manifest", " ".join(str(error).split())) from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise damaged(f"{path} is no manifest", f'it lacks "format": "{FORMAT}"')
