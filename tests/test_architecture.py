@@ -27,8 +27,7 @@ MAX_LINES = 500
 
 _MODEL = ("diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
-_PROGRAMS = ("programs", "native_start", "auto_program")
-_STEPS = ("observe", "simulator", "provenance")
+_PROGRAMS, _STEPS = ("programs", "native_start", "auto_program"), ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
 _AFTER = ("bench", "tasks", "envs", "datasets", "web", "experiments", "cli")
@@ -84,8 +83,7 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_DATASETS = ("datasets.dataset", "datasets.recorder", "datasets.scripted")
-_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", *_DATASETS, "experiments")
+_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", "datasets", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),

@@ -99,7 +99,7 @@ def command(
     goes on.
 
     \b
-        powderdsl record sand-pushing --out data --episodes 1000
+        powderdsl record TASK --out data --episodes 1000
         powderdsl record --verify data
     """
     if verify is not None:

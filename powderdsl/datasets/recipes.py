@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Any
 
-from powderdsl import __version__
 from powderdsl.datasets.manifest import MAX_EPISODES, MAX_SHARD_BYTES, Recipe, episode_bytes
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.model.fingerprint import fingerprint
@@ -48,7 +48,7 @@ def recipe_of(
         task_fingerprint=fingerprint(task),
         ruleset=ruleset.name,
         ruleset_fingerprint=fingerprint(ruleset),
-        powderdsl=__version__,
+        powderdsl=sys.modules["powderdsl"].__version__,
         policy=policy,
         seed=seed,
         worlds=env.worlds,

@@ -26,6 +26,7 @@ from PIL import Image
 
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics
+from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
@@ -237,6 +238,13 @@ def write_into_no_folder() -> None:
         pass
 
 
+def record_with_another_seed() -> None:
+    from powderdsl.datasets import record
+
+    for seed in (0, 1):
+        record("herd-gas", "nothing", "recorded", episodes=1, seed=seed, max_episode_steps=1, backend="dense")
+
+
 SITUATIONS: dict[str, Callable[[], object]] = {
     "PD101": lambda: powderdsl.load("rules/snd.yaml"),
     "PD102": read_a_large_file,
@@ -246,6 +254,8 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD609": read_a_soft_picture,
     "PD612": write_a_film_without_the_package,
     "PD613": write_into_no_folder,
+    "PD630": lambda: read_manifest(Path("recorded")),
+    "PD631": record_with_another_seed,
     "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }
