@@ -10,7 +10,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "runs", "web", "experiments", "cli")
+_AFTER = ("bench", "tasks", "envs", "runs", "studies", "web", "experiments", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -46,6 +46,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
     "runs": ("diagnostics", "worlds"),
+    "studies": (*_MODEL, "compiler", "worlds", "runs", "bench"),  # calls commands, in processes of their own
     "web": _SCREEN,
     "experiments": (*_SCREEN, "tasks", "envs", "web"),
     "cli": (*_EVERYTHING[:-1], "user_cache"),
@@ -73,5 +74,5 @@ THIRD_PARTIES: dict[str, Home] = {
     "gymnasium": Home(("envs", "experiments"), ("envs", "experiments")),
     "stable_baselines3": Home(("envs", "experiments"), ("envs", "experiments")),
     "click": Home(("cli",), ("cli",)),
-    "matplotlib": Home(("bench",), ()),
+    "matplotlib": Home(("bench", "studies", "cli"), ()),
 }

@@ -106,6 +106,7 @@ _ROWS = (
     ("PD803", "invalid-knob", _ERROR),
     ("PD804", "invalid-agent", _ERROR),
     ("PD805", "constant-reward", _WARNING),
+    ("PD806", "invalid-study", _ERROR),
     # PD9xx: our own mistakes
     ("PD901", "internal-error", _ERROR),
 )
