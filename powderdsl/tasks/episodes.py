@@ -157,6 +157,39 @@ class TaskProgram:
             placed(episodes.before, new.before),
         )
 
+    # Saving
+
+    def saved(self, episodes: Episodes) -> dict[str, Any]:
+        """Episodes as plain tensors in dicts, copies on the CPU, that any backend and device can go on from."""
+        world = episodes.world
+        rows = ("seed", "acted", "failed", "start", "before")
+        maps = {"state": world.state, "regions": episodes.regions, "targets": episodes.targets}
+        return {
+            **{name: _copy(getattr(episodes, name)) for name in rows},
+            **{name: {key: _copy(value) for key, value in one.items()} for name, one in maps.items()},
+            "clock": [_copy(one) for one in (world.seed, world.index, world.step)],
+        }
+
+    def loaded(self, saved: Mapping[str, Any]) -> Episodes:
+        """What `saved` was made of. Raises KeyError and ValueError for episodes of other rules or sizes."""
+        device = self.simulator.device
+
+        def tensors(one: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: value.to(device, copy=True) for name, value in one.items()}
+
+        state = tensors(saved["state"])
+        names = [slot.name for slot in self.simulator.slots]
+        if set(state) != set(names) or tuple(state["element"].shape[1:]) != self.task.size:
+            raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
+        clock = [one.to(device, copy=True) for one in saved["clock"]]
+        return Episodes(
+            World(self.simulator, state, *clock),
+            *(saved[name].to(device, copy=True) for name in ("seed", "acted", "failed")),
+            {**tensors(saved["regions"]), **self._fixed},
+            tensors(saved["targets"]),
+            *(saved[name].to(device, copy=True) for name in ("start", "before")),
+        )
+
     # Acting
 
     def act(
@@ -237,6 +270,10 @@ class TaskProgram:
         return Given(
             world.state, world.step, params_of(self.simulator, params, len(world.step)), regions, targets
         )
+
+
+def _copy(tensor: Tensor) -> Tensor:
+    return tensor.detach().to("cpu", copy=True)
 
 
 def compile_task(
