@@ -94,6 +94,10 @@ _ROWS = (
     ("PD611", "ragged-rows", _ERROR),
     ("PD612", "missing-package", _ERROR),
     ("PD613", "file-not-writable", _ERROR),
+    ("PD620", "no-such-run", _ERROR),
+    ("PD621", "another-run", _ERROR),
+    ("PD622", "run-in-use", _ERROR),
+    ("PD623", "run-does-not-fit", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),
     # PD8xx: tasks

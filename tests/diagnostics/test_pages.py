@@ -31,6 +31,7 @@ from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.ledgers.book import ledger
 from powderdsl.properties.refute import refuted
+from powderdsl.runs import does_not_fit, find_run, open_run
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.files import replacing
@@ -237,6 +238,21 @@ def write_into_no_folder() -> None:
         pass
 
 
+def open_a_run_of_another_seed() -> None:
+    open_run("runs/dunes", "ppo", {"seed": 1})
+    open_run("runs/dunes", "ppo", {"seed": 2})
+
+
+def train_in_one_folder_twice() -> None:
+    run = open_run("runs/dunes", "ppo", {})
+    with run.locked(), run.locked():
+        pass
+
+
+def use_a_run_that_does_not_fit() -> None:
+    raise does_not_fit(Path("runs/dunes"), "id 3 is `core.wall` there, nothing here")
+
+
 SITUATIONS: dict[str, Callable[[], object]] = {
     "PD101": lambda: powderdsl.load("rules/snd.yaml"),
     "PD102": read_a_large_file,
@@ -246,6 +262,10 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD609": read_a_soft_picture,
     "PD612": write_a_film_without_the_package,
     "PD613": write_into_no_folder,
+    "PD620": lambda: find_run("runs/dunes"),
+    "PD621": open_a_run_of_another_seed,
+    "PD622": train_in_one_folder_twice,
+    "PD623": use_a_run_that_does_not_fit,
     "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }
