@@ -100,6 +100,7 @@ class CountType(click.ParamType):
 @click.pass_context
 def command(
     ctx: click.Context,
+    /,
     task: str | None,
     folder: Path | None,
     resume: Path | None,
@@ -168,7 +169,8 @@ def _config_of(folder: Path, asked: dict[str, Any], more: Any) -> TrainConfig:
 def _progress(config: TrainConfig) -> Iterator[Progress]:
     """A bar on a terminal; elsewhere a line twice a minute."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress as Bar, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
 
     if sys.stderr.isatty():
         columns = (

@@ -62,7 +62,9 @@ class TrainedPolicy:
 
     def __call__(self, observed: Tensor, keys: Tensor) -> Tensor:
         with torch.no_grad():
-            choices = self.network.get_distribution(observed).distribution
+            choices: Any = self.network.get_distribution(
+                observed
+            ).distribution  # one of each number of an action
         if self.deterministic:
             return torch.stack([one.probs.argmax(1) for one in choices], 1)
         drawn = uniforms(keys, len(choices))
@@ -98,5 +100,5 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
 
 
 def config_of(run: RunFolder) -> TrainConfig:
-    """The settings that a run was begun with. Raises CompileError (PD630) if they are damaged."""
+    """The settings that a run was begun with. Raises CompileError (PD640) if they are damaged."""
     return from_json({name: value for name, value in run.config.items() if name != "task_fingerprint"})

@@ -108,7 +108,7 @@ _REAL: Mapping[str, tuple[float, float]] = MappingProxyType(
 
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
-    """The settings of a preset, with changes. Raises CompileError (PD630) with everything that is wrong."""
+    """The settings of a preset, with changes. Raises CompileError (PD640) with everything that is wrong."""
     wrong: list[Diagnostic] = []
     if name not in PRESETS:
         wrong.append(_wrong(f"there is no preset `{name}`", suggest(str(name), PRESETS, "presets")))
@@ -129,12 +129,12 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
 
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
-    """Settings as `TrainConfig.as_json` gives them; what is missing is as usual. Raises CompileError (PD630)."""
+    """Settings as `TrainConfig.as_json` gives them; what is missing is as usual. Raises CompileError (PD640)."""
     return preset("paper", **{"task": "", **values})
 
 
 def check_config(config: TrainConfig) -> TrainConfig:
-    """The same settings. Raises CompileError (PD630) with everything that is wrong in them."""
+    """The same settings. Raises CompileError (PD640) with everything that is wrong in them."""
     wrong = _mistakes(config)
     if wrong:
         raise CompileError(wrong)
@@ -156,7 +156,7 @@ def _mistakes(config: TrainConfig) -> list[Diagnostic]:
         value = getattr(config, name)
         if not isinstance(value, str) or not value:
             found.append(_wrong(f"`{name}` is {value!r}: it takes a name"))
-    for name, choices in (("network", NETWORKS), ("backend", BACKENDS)):
+    for name, choices in (("network", NETWORKS), ("backend", tuple(BACKENDS))):
         if getattr(config, name) not in choices:
             found.append(_no_choice(name, getattr(config, name), choices))
     takes = OBSERVATIONS.get(str(config.network), ("ids", "compact", "matrix"))
@@ -178,4 +178,4 @@ def _no_choice(name: str, value: Any, choices: tuple[str, ...]) -> Diagnostic:
 
 
 def _wrong(message: str, helps: list[str] | tuple[str, ...] = ()) -> Diagnostic:
-    return Diagnostic("PD630", message, Label(None), helps=tuple(helps))
+    return Diagnostic("PD640", message, Label(None), helps=tuple(helps))

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     same weights as one that was not, bit by bit, on a processor; so does one whose `steps` are raised.
 
     Raises:
-        CompileError: PD630 for settings, all mistakes at once; what `load_task` says of the task; PD621 if the folder
+        CompileError: PD640 for settings, all mistakes at once; what `load_task` says of the task; PD621 if the folder
             holds another run; PD622 if another process trains there.
         KeyboardInterrupt: after the state before the rollout that was going on has been saved.
     """
@@ -101,6 +100,7 @@ class _Keeper(BaseCallback):
 
     def __init__(self, run: RunFolder, env: PowderVecEnv, minutes: float, progress: Progress | None):
         super().__init__()
+        self.model: PPO
         self.run, self.worlds, self.seconds, self.progress = run, env, minutes * 60, progress
         self.saved_at = time.monotonic()
         self.kept: tuple[int, dict[str, Any]] | None = None
@@ -134,8 +134,7 @@ class _MetricsWriter(KVWriter):
         self.metrics = metrics
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, Any], step: int = 0) -> None:
-        numbers = {name: float(value) for name, value in key_values.items() if isinstance(value, Real)}
-        self.metrics.write(step, numbers)
+        self.metrics.write(step, _numbers(key_values))
 
     def close(self) -> None:
         """The run closes its metrics."""
@@ -144,9 +143,15 @@ class _MetricsWriter(KVWriter):
 # State
 
 
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    """What is a number among them: Python's or NumPy's."""
+    return {
+        name: float(value) for name, value in values.items() if isinstance(value, int | float | np.number)
+    }
+
+
 def _state(model: PPO, env: PowderVecEnv) -> dict[str, Any]:
     """All that decides how training goes on. Tensors of the model are not copied."""
-    numbers = model.logger.name_to_value  # of the update that the next dump will show
     return {
         "policy": model.policy.state_dict(),
         "optimizer": model.policy.optimizer.state_dict(),
@@ -155,7 +160,7 @@ def _state(model: PPO, env: PowderVecEnv) -> dict[str, Any]:
         "episodes": [[one["r"], one["l"], one["t"]] for one in model.ep_info_buffer or ()],
         "successes": [bool(one) for one in model.ep_success_buffer or ()],
         "updates": model._n_updates,
-        "logged": {name: float(value) for name, value in numbers.items() if isinstance(value, Real)},
+        "logged": _numbers(model.logger.name_to_value),  # of the update that is shown after the next rollout
         "steps": model.num_timesteps,
         "random": _random_state(),
     }
@@ -179,10 +184,10 @@ def _restore(model: PPO, env: PowderVecEnv, state: Mapping[str, Any]) -> None:
 
 def _random_state() -> dict[str, Any]:
     """The global generators, which Stable-Baselines3 draws from."""
-    name, keys, *rest = np.random.get_state()
+    name, keys, *rest = np.random.get_state(legacy=True)
     found = {
         "python": random.getstate(),
-        "numpy": [name, torch.from_numpy(keys.astype(np.int64)), *rest],
+        "numpy": [name, torch.from_numpy(np.asarray(keys).astype(np.int64)), *rest],
         "torch": torch.get_rng_state(),
     }
     if torch.cuda.is_available() and torch.cuda.is_initialized():

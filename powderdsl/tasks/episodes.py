@@ -181,13 +181,13 @@ class TaskProgram:
         names = [slot.name for slot in self.simulator.slots]
         if set(state) != set(names) or tuple(state["element"].shape[1:]) != self.task.size:
             raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
-        clock = [one.to(device, copy=True) for one in saved["clock"]]
+        seed, index, step = (one.to(device, copy=True) for one in saved["clock"])
+        rows = tensors({name: saved[name] for name in ("seed", "acted", "failed", "start", "before")})
         return Episodes(
-            World(self.simulator, state, *clock),
-            *(saved[name].to(device, copy=True) for name in ("seed", "acted", "failed")),
-            {**tensors(saved["regions"]), **self._fixed},
-            tensors(saved["targets"]),
-            *(saved[name].to(device, copy=True) for name in ("start", "before")),
+            world=World(self.simulator, state, seed, index, step),
+            regions={**tensors(saved["regions"]), **self._fixed},
+            targets=tensors(saved["targets"]),
+            **rows,
         )
 
     # Acting
