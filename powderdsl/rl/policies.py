@@ -38,6 +38,12 @@ def uniforms(keys: Tensor, count: int) -> Tensor:
     return drawn.double() / float(1 << 32)
 
 
+def action_keys(seed: int, episodes: Tensor, step: int) -> Tensor:
+    """The keys of one action in each of some episodes, by their numbers: int64 [B]."""
+    low = mix((mix(torch.full_like(episodes, seed) & MASK) + episodes) & MASK)
+    return mix((low + step) & MASK) << 31 | mix(low ^ mix(torch.full_like(low, step))) >> 1
+
+
 def random_policy(nvec: tuple[int, ...]) -> Policy:
     """All actions equally likely."""
 
@@ -58,6 +64,8 @@ class TrainedPolicy:
     network: ActorCriticCnnPolicy
     observation: str
     """The kind of observation it takes."""
+    step: int
+    """The interactions that it has learned from."""
     deterministic: bool = False
 
     def __call__(self, observed: Tensor, keys: Tensor) -> Tensor:
@@ -91,12 +99,13 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         lambda _: config.learning_rate,
         **policy_kwargs(config, env),
     )
+    checkpoint = found.checkpoint()
     try:
-        network.load_state_dict(found.checkpoint().state["policy"])
+        network.load_state_dict(checkpoint.state["policy"])
     except RuntimeError as error:
         raise ValueError(f"the run {found.path} is of another task: {error}") from None
     network.to(env.device).set_training_mode(False)
-    return TrainedPolicy(network, config.observation, deterministic)
+    return TrainedPolicy(network, config.observation, checkpoint.step, deterministic)
 
 
 def config_of(run: RunFolder) -> TrainConfig:
