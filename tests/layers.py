@@ -10,7 +10,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "runs", "web", "experiments", "cli")
+_AFTER = ("bench", "tasks", "envs", "runs", "worldmodel", "web", "experiments", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -46,6 +46,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
     "runs": ("diagnostics", "worlds"),
+    "worldmodel": (*_SCREEN, "tasks", "runs"),
     "web": _SCREEN,
     "experiments": (*_SCREEN, "tasks", "envs", "web"),
     "cli": (*_EVERYTHING[:-1], "user_cache"),
@@ -63,7 +64,17 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", "runs", "experiments")
+_TORCH = (
+    "*.torch_*",
+    *_PROGRAMS,
+    *_STEPS,
+    "testing",
+    "tasks.episodes",
+    "envs",
+    "runs",
+    "worldmodel",
+    "experiments",
+)
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),

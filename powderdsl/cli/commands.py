@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "trace": ("trace_command", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
     "fuzz": ("fuzz_command", "Compare all backends on random rules and worlds."),
     "bench": ("bench_command", "Measure how fast rules run, on each backend, batch and size."),
+    "wm": ("wm_command", "World models: train networks that predict worlds, test them, teach them packs."),
     "cache": ("cache_command", "List or remove compiled code that is kept on this machine."),
     "new": ("new_command", "Write a first pack: an element, a rule and a test."),
     "render": ("render_command", "Draw a world as a picture, without running it."),
