@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train_command", "Train an agent on a task; go on where it was interrupted."),
     "evaluate": ("evaluate_command", "Compare an agent with acting at random, and with doing nothing."),
     "watch": ("watch_command", "Make a film of an agent at its task."),
+    "wm": ("wm_command", "World models: train networks that predict worlds, test them, teach them packs."),
     "study": ("study_command", "Run many settings and seeds of training, and compare what comes out."),
     "cache": ("cache_command", "List or remove compiled code that is kept on this machine."),
     "new": ("new_command", "Write a first pack: an element, a rule and a test."),
