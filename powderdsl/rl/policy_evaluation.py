@@ -66,8 +66,15 @@ class Evaluation:
     scores: tuple[Score, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
+        """For JSON: scores by split and policy."""
+        splits: dict[str, dict[str, Any]] = {}
+        for score in self.scores:
+            numbers = {
+                name: value for name, value in asdict(score).items() if name not in ("split", "policy")
+            }
+            splits.setdefault(score.split, {})[score.policy] = numbers
+        about = {name: value for name, value in asdict(self).items() if name != "scores"}
+        return {**about, "splits": splits}
 
 
 def play(
