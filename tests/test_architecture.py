@@ -21,80 +21,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.layers import LAYERS, THIRD_PARTIES
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "powderdsl"
 MAX_LINES = 500
-
-_MODEL = ("diagnostics", "syntax", "model")
-_COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
-_PROGRAMS, _STEPS = ("programs", "native_start", "auto_program"), ("observe", "simulator", "provenance")
-_SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
-_TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "datasets", "web", "experiments", "cli")
-_EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
-
-LAYERS: dict[str, tuple[str, ...]] = {
-    # module or pattern: what it may import besides its own package. The longest row that fits counts.
-    "user_cache": (),
-    "diagnostics": (),
-    "syntax": ("diagnostics", "user_cache"),
-    "model": ("diagnostics", "syntax"),
-    "ledgers": _MODEL,  # decides from the model alone: no world is run
-    "reference": _MODEL,  # never ir: an oracle that shares the lowering cannot see a bug in it
-    "ir": ("diagnostics",),
-    "ir.lower*": _MODEL,  # the one door from the model into the IR
-    "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
-    "backends": ("diagnostics", "ir", "user_cache"),
-    "compiler": _COMPILER[:-1],
-    "native_start": _COMPILER,
-    "auto_program": _COMPILER,
-    "programs": (*_COMPILER, "native_start", "auto_program"),
-    "draw": _MODEL,
-    "observe": (*_COMPILER, "draw"),
-    "simulator": (*_COMPILER, "programs", "observe"),
-    "provenance": (*_MODEL, "simulator"),
-    "tracing": (*_MODEL, "reference", "provenance", "simulator"),  # explains by what the oracle does
-    "worlds": _MODEL,
-    "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
-    "media": _SCREEN[: _SCREEN.index("media")],
-    "terminal": _SCREEN[: _SCREEN.index("terminal")],
-    "pack_tests": _SCREEN,
-    "testing": (*_SCREEN, "ledgers", "pack_tests"),
-    "properties": (*_TESTING, "user_cache"),
-    "pytest_plugin": (*_TESTING, "properties"),
-    "bench": _SCREEN,
-    "tasks": (*_COMPILER, "simulator", "worlds"),
-    "envs": (*_SCREEN, "tasks"),
-    "datasets": (*_SCREEN, "tasks", "envs"),
-    "web": _SCREEN,
-    "experiments": (*_SCREEN, "tasks", "envs", "web"),
-    "cli": (*_EVERYTHING[:-1], "user_cache"),
-    "__init__": _EVERYTHING,  # the public names, imported when they are asked for
-    "__main__": ("cli",),
-}
-
-
-@dataclass(frozen=True)
-class Home:
-    """Where a third party may be imported, and where that may happen while the module itself is imported."""
-
-    anywhere: tuple[str, ...]
-    at_import: tuple[str, ...]
-
-
-_TEXT = ("syntax", "worlds.scene")
-_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", "datasets", "experiments")
-THIRD_PARTIES: dict[str, Home] = {
-    "yaml": Home(_TEXT, _TEXT),
-    "lark": Home(_TEXT, _TEXT),
-    "torch": Home(
-        (*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "bench", "web", "cli"), _TORCH
-    ),
-    "gymnasium": Home(("envs", "experiments"), ("envs", "experiments")),
-    "stable_baselines3": Home(("envs", "experiments"), ("envs", "experiments")),
-    "click": Home(("cli",), ("cli",)),
-    "matplotlib": Home(("bench",), ()),
-}
 
 SLOW_IMPORTS = ("torch", "gymnasium", "stable_baselines3", "matplotlib", "tensorboard")
 """What the front end, `powderdsl check` and `powderdsl --help` must do without."""
@@ -117,6 +48,7 @@ PYTHON_WORDS = {
 ENGLISH_WORDS = {
     "fire": "rules fire, or can never fire",
     "flow": "data flow, control flow",
+    "board": "TensorBoard",
 }
 """Names in the shipped rules that are also plain English: allowed in sentences, never in code."""
 

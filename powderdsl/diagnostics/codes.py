@@ -94,8 +94,13 @@ _ROWS = (
     ("PD611", "ragged-rows", _ERROR),
     ("PD612", "missing-package", _ERROR),
     ("PD613", "file-not-writable", _ERROR),
+    ("PD620", "no-such-run", _ERROR),
+    ("PD621", "another-run", _ERROR),
+    ("PD622", "run-in-use", _ERROR),
+    ("PD623", "run-does-not-fit", _ERROR),
     ("PD630", "invalid-dataset", _ERROR),
     ("PD631", "dataset-mismatch", _ERROR),
+    ("PD640", "invalid-setting", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),
     # PD8xx: tasks
@@ -104,6 +109,7 @@ _ROWS = (
     ("PD803", "invalid-knob", _ERROR),
     ("PD804", "invalid-agent", _ERROR),
     ("PD805", "constant-reward", _WARNING),
+    ("PD806", "invalid-study", _ERROR),
     # PD9xx: our own mistakes
     ("PD901", "internal-error", _ERROR),
 )

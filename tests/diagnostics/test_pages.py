@@ -3,8 +3,8 @@
 A page has a wrong example and, mostly, the mended one:
 
 * ``yaml wrong`` and ``yaml right`` are rule files; ``# with: core`` at the top names packs to load with them.
-* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task; all use the
-  rules of the paper.
+* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task, ``yaml wrong study`` a
+  study; all use the rules of the paper.
 * ``text`` is the message itself, for what no file can show; `SITUATIONS` brings it about.
 
 The text under the caret stands in the example, in a comment ``# ^ text`` below it.
@@ -32,6 +32,8 @@ from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.ledgers.book import ledger
 from powderdsl.properties.refute import refuted
+from powderdsl.runs import does_not_fit, find_run, open_run
+from powderdsl.studies.study_file import load_study
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.files import replacing
@@ -99,6 +101,11 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
             return ()
         if "task" in one.info.split():
             return load_task_with_diagnostics(path)[1]
+        if "study" in one.info.split():
+            load_study(
+                "page.yaml", {("train",): frozenset({"run", "seed", "steps"}), ("evaluate",): frozenset()}
+            )
+            return ()
         if "world" in one.info.split():
             read_ascii(one.text, paper_rules().elements, name="page.txt")
             return ()
@@ -245,6 +252,21 @@ def record_with_another_seed() -> None:
         record("herd-gas", "nothing", "recorded", episodes=1, seed=seed, max_episode_steps=1, backend="dense")
 
 
+def open_a_run_of_another_seed() -> None:
+    open_run("runs/dunes", "ppo", {"seed": 1})
+    open_run("runs/dunes", "ppo", {"seed": 2})
+
+
+def train_in_one_folder_twice() -> None:
+    run = open_run("runs/dunes", "ppo", {})
+    with run.locked(), run.locked():
+        pass
+
+
+def use_a_run_that_does_not_fit() -> None:
+    raise does_not_fit(Path("runs/dunes"), "id 3 is `core.wall` there, nothing here")
+
+
 SITUATIONS: dict[str, Callable[[], object]] = {
     "PD101": lambda: powderdsl.load("rules/snd.yaml"),
     "PD102": read_a_large_file,
@@ -254,6 +276,10 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD609": read_a_soft_picture,
     "PD612": write_a_film_without_the_package,
     "PD613": write_into_no_folder,
+    "PD620": lambda: find_run("runs/dunes"),
+    "PD621": open_a_run_of_another_seed,
+    "PD622": train_in_one_folder_twice,
+    "PD623": use_a_run_that_does_not_fit,
     "PD630": lambda: read_manifest(Path("recorded")),
     "PD631": record_with_another_seed,
     "PD801": lambda: load_task("sand-pulling"),

@@ -1,0 +1,227 @@
+"""A run's folder: `run.json` says what it is; checkpoints and metrics how far it got."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock, Timeout
+
+from powderdsl.diagnostics import CompileError, suggest
+from powderdsl.runs.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
+from powderdsl.runs.metrics import Metrics
+from powderdsl.worlds.files import failure, replacing
+
+ABOUT = "run.json"
+FORMAT = 1
+MAX_JSON = 1 << 24
+PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A folder of one training run.
+
+    `kind` is what was trained; `config` all that decides how, as JSON has it; `about` the whole of ``run.json``: also
+    versions, the command line and the time when it began.
+    """
+
+    path: Path
+    kind: str
+    config: Mapping[str, Any]
+    about: Mapping[str, Any]
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from training here. The lock of a process that dies is gone with it.
+
+        Raises:
+            CompileError: PD622 if another one does.
+        """
+        lock = FileLock(self.path / ".lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise failure(
+                "PD622",
+                f"another process works on {self.path}",
+                helps=("wait for it, or choose another folder",),
+            ) from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def latest_checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint | None:
+        """The newest checkpoint that is whole; None if there is none."""
+        return latest_checkpoint(self.path / "checkpoints", device)
+
+    def checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint:
+        """The same, for those who need one. Raises CompileError (PD620)."""
+        found = self.latest_checkpoint(device)
+        if found is None:
+            raise _no_run(self.path, "it has no checkpoint that can be read")
+        return found
+
+    def save_checkpoint(self, step: int, state: Any) -> Path:
+        """Save nested dicts, lists and tuples of tensors, numbers, text and None. Raises CompileError (PD613)."""
+        return save_checkpoint(self.path / "checkpoints", step, state)
+
+    def metrics(self, step: int = 0) -> Metrics:
+        """Where to write numbers from `step` on; those of later steps are dropped."""
+        return Metrics(self.path, step)
+
+    def write_json(self, name: str, value: Any) -> Path:
+        """Write a file of the folder whole or not at all."""
+        return write_json(self.path / name, value)
+
+    def read_json(self, name: str) -> Any:
+        """A file of the folder; None if there is none or it is damaged."""
+        return read_json(self.path / name)
+
+
+def open_run(
+    path: str | Path, kind: str, config: Mapping[str, Any], *, note: Mapping[str, Any] | None = None
+) -> RunFolder:
+    """Begin a run, or come back to it with the same configuration.
+
+    Args:
+        config: what JSON can hold. note: more to keep in ``run.json``, which takes no part in the comparison.
+
+    Raises:
+        CompileError: PD621 where the folder holds another run, or other files; PD620 where its ``run.json`` is damaged;
+            PD613 where nothing can be written.
+    """
+    folder, plain = Path(path), json.loads(json.dumps(config))
+    if (folder / ABOUT).exists():
+        found = read_run(folder)
+        differences = _differences(found, kind, plain)
+        if differences:
+            raise failure(
+                "PD621",
+                f"{folder} holds another run",
+                notes=differences,
+                helps=("choose another folder with `--run`, or go on with that run's own settings",),
+            )
+        return found
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        others = sorted(name for name in os.listdir(folder) if not name.startswith("."))
+    except OSError as error:
+        raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
+    if others:
+        raise failure(
+            "PD621",
+            f"{folder} holds other files",
+            notes=(f"such as {others[0]}",),
+            helps=("choose a folder that is empty or not there yet",),
+        )
+    about = {
+        "format": FORMAT,
+        "kind": kind,
+        "config": plain,
+        **(note or {}),
+        "versions": versions(),
+        "command": sys.argv,
+        "began": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_json(folder / ABOUT, about)
+    return read_run(folder, kind)
+
+
+def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
+    """A run that is there already.
+
+    Raises:
+        CompileError: PD620 if there is none, it is damaged, or of another kind than `kind`.
+    """
+    folder = Path(path)
+    if not (folder / ABOUT).exists():
+        raise _no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
+    about = read_json(folder / ABOUT)
+    whole = isinstance(about, dict) and isinstance(about.get("kind"), str)
+    if not whole or not isinstance(about.get("config"), dict):
+        raise _no_run(folder, f"its {ABOUT} is damaged")
+    if about.get("format") != FORMAT:
+        raise _no_run(folder, f"its format is {about.get('format')!r}; this version reads {FORMAT}")
+    if kind is not None and about["kind"] != kind:
+        raise _no_run(folder, f"it is a run of the kind `{about['kind']}`; `{kind}` is needed here")
+    return RunFolder(folder, about["kind"], about["config"], about)
+
+
+def find_run(text: str | Path, kind: str | None = None) -> RunFolder:
+    """A run by the path of its folder, or by its name in ``runs/``. Raises CompileError (PD620)."""
+    folder, kept = Path(text), Path("runs")
+    if not folder.exists() and folder.name == str(text) and kept.is_dir():
+        if (kept / text / ABOUT).exists():
+            return read_run(kept / text, kind)
+        names = sorted(one.parent.name for one in kept.glob(f"*/{ABOUT}"))
+        raise _no_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
+    return read_run(folder, kind)
+
+
+def does_not_fit(folder: Path, *why: str) -> CompileError:
+    """What to raise where a run's model or data was made for something else (PD623)."""
+    return failure("PD623", f"{folder} does not fit", notes=why)
+
+
+def versions() -> dict[str, str]:
+    """What a run's numbers may hang on: Python, the system, and packages that are installed."""
+    found = {
+        "powderdsl": str(sys.modules["powderdsl"].__version__),  # our own package, so it has been imported
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def write_json(path: Path, value: Any) -> Path:
+    """Write a file whole or not at all. Raises CompileError (PD613)."""
+    try:
+        with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+            json.dump(value, file, indent=1, ensure_ascii=False)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
+    return path
+
+
+def read_json(path: Path) -> Any:
+    """The value in a file of at most 16 MiB; None if there is none or it is damaged."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_JSON + 1)
+        return None if len(data) > MAX_JSON else json.loads(data)
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tuple[str, ...]:
+    if found.kind != kind:
+        return (f"it is of the kind `{found.kind}`, not `{kind}`",)
+    return tuple(
+        f"`{name}` is {json.dumps(found.config.get(name))} there, {json.dumps(config.get(name))} here"
+        for name in sorted({*found.config, *config})
+        if found.config.get(name) != config.get(name)
+    )
+
+
+def _no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
+    return failure("PD620", f"{folder} is no run that can be used here", notes=(why,), helps=helps)

@@ -1,0 +1,206 @@
+"""Run folders: what is written is whole, what is damaged is passed over, and two runs never mix."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.runs import find_run, open_run, read_run
+from powderdsl.runs.metrics import read_metrics
+from tests.processes import waited
+
+
+def state_of(step: int) -> dict[str, object]:
+    return {
+        "weights": {"layer": torch.full((3,), float(step))},
+        "numbers": [step, 0.5, None, "text"],
+        "pair": (1, 2),
+    }
+
+
+def codes(error: pytest.ExceptionInfo[CompileError]) -> list[str]:
+    return [one.code for one in error.value.diagnostics]
+
+
+def notes(error: pytest.ExceptionInfo[CompileError]) -> str:
+    return " ".join(note for one in error.value.diagnostics for note in one.notes)
+
+
+def test_the_newest_checkpoint_comes_back_and_one_more_is_kept(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", "toy", {"seed": 1})
+    assert run.latest_checkpoint() is None
+    for step in (1, 20, 300):
+        path = run.save_checkpoint(step, state_of(step))
+    assert len(list(path.parent.iterdir())) == 2
+    found = run.latest_checkpoint()
+    assert found is not None
+    assert (found.step, found.path) == (300, path)
+    assert found.state["numbers"] == [300, 0.5, None, "text"]
+    assert found.state["pair"] == (1, 2)
+    assert torch.equal(found.state["weights"]["layer"], torch.full((3,), 300.0))
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "emptied"])
+def test_a_damaged_checkpoint_is_passed_over(tmp_path: Path, damage: str) -> None:
+    run = open_run(tmp_path / "run", "toy", {})
+    run.save_checkpoint(1, state_of(1))
+    path = run.save_checkpoint(2, state_of(2))
+    data = bytearray(path.read_bytes())
+    if damage == "changed":
+        data[len(data) // 2] ^= 1
+    path.write_bytes({"cut": data[:-7], "changed": data, "emptied": b""}[damage])
+    found = run.latest_checkpoint()
+    assert found is not None
+    assert found.step == 1
+    # A run that goes back and comes to the same step again is not stopped by what lies there.
+    run.save_checkpoint(2, state_of(2))
+    assert run.checkpoint().step == 2
+
+
+def test_later_checkpoints_of_a_run_that_went_back_are_dropped(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", "toy", {})
+    for step in (1, 5, 3):
+        run.save_checkpoint(step, state_of(step))
+    assert run.checkpoint().step == 3
+
+
+def test_loading_executes_nothing(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", "toy", {})
+    run.save_checkpoint(1, {"code": print})
+    with pytest.raises(CompileError) as error:
+        run.latest_checkpoint()
+    assert codes(error) == ["PD620"]
+
+
+def test_the_same_settings_come_back_and_others_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    first = open_run(folder, "toy", {"seed": 1, "sizes": (1, 2)}, note={"of": "x"})
+    assert open_run(folder, "toy", {"seed": 1, "sizes": [1, 2]}) == first
+    assert first.about["of"] == "x"
+    assert {"python", "torch", "powderdsl"} <= first.about["versions"].keys()
+    with pytest.raises(CompileError) as error:
+        open_run(folder, "toy", {"seed": 2, "lines": 5})
+    assert codes(error) == ["PD621"]
+    assert "`seed` is 1 there, 2 here" in notes(error)
+    assert "`lines` is null there, 5 here" in notes(error)
+    with pytest.raises(CompileError) as error:
+        open_run(folder, "other", {"seed": 1})
+    assert "of the kind `toy`" in notes(error)
+
+
+def test_other_peoples_files_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("…", encoding="utf-8")
+    with pytest.raises(CompileError) as error:
+        open_run(tmp_path, "toy", {})
+    assert codes(error) == ["PD621"]
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "damaged"),
+        ("[1, 2]", "damaged"),
+        ('{"kind": "toy"}', "damaged"),
+        ('{"kind": "toy", "config": {}, "format": 99}', "format"),
+        ('{"kind": "other", "config": {}, "format": 1}', "of the kind `other`"),
+        ("[" * 100_000, "damaged"),
+    ],
+)
+def test_a_damaged_run_is_refused_with_a_reason(tmp_path: Path, text: str, why: str) -> None:
+    (tmp_path / "run.json").write_text(text, encoding="utf-8")
+    with pytest.raises(CompileError) as error:
+        read_run(tmp_path, "toy")
+    assert codes(error) == ["PD620"]
+    assert why in notes(error)
+
+
+def test_a_run_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = open_run("runs/dunes", "toy", {})
+    assert find_run("dunes") == made
+    with pytest.raises(CompileError) as error:
+        find_run("dune")
+    assert error.value.diagnostics[0].helps == ("did you mean `dunes`?",)
+
+
+def test_metrics_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", "toy", {})
+    with run.metrics() as metrics:
+        for step in range(1, 6):
+            metrics.write(step, {"loss": 1 / step, "gap": float("nan")})
+    with (run.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
+        file.write('{"step": 6, "lo')  # killed while it wrote
+    with run.metrics(3) as metrics:
+        metrics.write(4, {"loss": 0.0})
+    lines = list(read_metrics(run.path))
+    assert [line["step"] for line in lines] == [1, 2, 3, 4]
+    assert lines[-1] == {"step": 4, "loss": 0.0}
+    assert list((run.path / "tensorboard").iterdir())
+
+
+SAVING = """
+import sys, torch
+from powderdsl.runs import open_run
+run = open_run(sys.argv[1], "toy", {})
+found = run.latest_checkpoint()
+step = found.step if found else 0
+with run.locked():
+    while True:
+        step += 1
+        run.save_checkpoint(step, {"step": step, "weights": torch.full((20_000,), step)})
+        print(step, flush=True)
+"""
+
+
+def test_no_kill_leaves_an_unreadable_checkpoint(tmp_path: Path) -> None:
+    chance, last = random.Random(5), 0
+    for _ in range(6):
+        child = subprocess.Popen(
+            [sys.executable, "-c", SAVING, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True
+        )
+        assert child.stdout is not None
+        said = 0
+        for _ in range(chance.randint(2, 20)):
+            said = int(child.stdout.readline())
+        os.kill(child.pid, signal.SIGKILL)
+        rest = child.communicate()[0].split("\n")
+        said = max([said, *(int(line) for line in rest[:-1])])
+        found = read_run(tmp_path / "run").checkpoint()
+        assert found.step >= said > last
+        assert found.state["step"] == found.step
+        assert torch.equal(found.state["weights"], torch.full((20_000,), found.step))
+        last = found.step
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["kind"] == "toy"
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", "toy", {})
+    child = subprocess.Popen([sys.executable, "-c", SAVING, str(run.path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "1\n"
+        with pytest.raises(CompileError) as error, run.locked():
+            pass
+        assert codes(error) == ["PD622"]
+    finally:
+        child.kill()
+        child.communicate()
+
+    def free() -> bool:
+        try:
+            with run.locked():
+                return True
+        except CompileError:
+            return False
+
+    assert waited(free)
