@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import Task
 
-POLICIES = ("random", "nothing")
+SCRIPTED = ("random", "nothing")
 
 
 @click.command("record")
@@ -37,7 +38,11 @@ POLICIES = ("random", "nothing")
 @click.option("--episodes", type=WholeType(1, 1 << 32), help="How many are recorded.")
 @click.option("--split", default="train", show_default=True, help="Which worlds.")
 @click.option(
-    "--policy", type=click.Choice(POLICIES), default="random", show_default=True, help="What acts in them."
+    "--policy",
+    metavar="random|nothing|RUN",
+    default="random",
+    show_default=True,
+    help="What acts in them: every action equally likely, one that does nothing, or a trained agent.",
 )
 @click.option(
     "--observation",
@@ -116,9 +121,10 @@ def command(
 
     try:
         with user_values(), _progress(found.name) as progress:
+            act = _policy(policy, found, split, backend, device)
             dataset = record(
                 found,
-                policy,
+                act.policy,
                 out,
                 episodes=episodes,
                 seed=seed,
@@ -126,6 +132,8 @@ def command(
                 shard=shard,
                 compress=compress,
                 envs=envs,
+                policy_name=act.name,
+                sees=act.sees,
                 progress=progress,
                 split=split,
                 worlds=worlds,
@@ -177,6 +185,13 @@ def _checked(
             check_split(found, split)
     except CompileError as error:
         diagnostics.extend(error.diagnostics)
+    if policy not in SCRIPTED:
+        from powderdsl.runs import find_run
+
+        try:
+            find_run(policy, "ppo")
+        except CompileError as error:
+            diagnostics.extend(error.diagnostics)
     if found is not None and policy == "nothing":
         _require_gymnasium()
         from powderdsl.datasets.scripted import still_action
@@ -190,6 +205,30 @@ def _checked(
     for line in wrong:
         click.echo(f"error: {line}", err=True)
     return None if wrong or diagnostics else found
+
+
+@dataclass(frozen=True)
+class _Act:
+    """What acts: see `record`."""
+
+    policy: Any
+    name: str | None = None
+    sees: str | None = None
+
+
+def _policy(policy: str, task: Task, split: str, backend: str, device: str) -> _Act:
+    """A policy by name, or the one of a run. Raises CompileError (PD620), and ValueError if the run does not fit."""
+    if policy in SCRIPTED:
+        return _Act(policy)
+    from powderdsl.envs.tensor_env import TensorEnv
+    from powderdsl.rl.policies import config_of, load_policy
+    from powderdsl.runs import find_run
+
+    run = find_run(policy, "ppo")
+    sees = config_of(run).observation
+    env = TensorEnv(task, 1, split=split, observation=sees, backend=backend, device=device)
+    name = f"{run.path.name}, checkpoint {run.checkpoint().path.stem}"
+    return _Act(load_policy(run, env), name, sees)
 
 
 def _require_gymnasium() -> None:

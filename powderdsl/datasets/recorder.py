@@ -27,8 +27,10 @@ from powderdsl.datasets.manifest import (
     write_manifest,
 )
 from powderdsl.datasets.recipes import KINDS, check_count, recipe_of
-from powderdsl.datasets.scripted import SCRIPTED, Moment, Policy
+from powderdsl.datasets.scripted import SCRIPTED
 from powderdsl.datasets.shards import is_whole, write_shard
+from powderdsl.envs.acting import Policy, action_keys
+from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
@@ -54,6 +56,7 @@ def record(
     compress: bool = False,
     envs: int = 256,
     policy_name: str | None = None,
+    sees: str | None = None,
     progress: Progress | None = None,
     **how: Any,
 ) -> Dataset:
@@ -63,22 +66,22 @@ def record(
     completed; a shard that is damaged is recorded anew.
 
     Args:
-        policy: a name of `SCRIPTED`, or a function from observations, uint8 [B, C, H, W], and a `Moment` to actions,
-            whole numbers [B, 5]. Recording follows from the recipe alone as far as it acts in each episode by that
-            episode alone: a stochastic one draws from the moment.
+        policy: a name of `SCRIPTED`, or a function from observations and keys to actions: see `envs.acting.Policy`.
+            Keys follow from the seed, the episode and the action's number; a stochastic policy draws by them.
         folder: it is made, but not the folder around it.
         observation: ``ids`` or ``compact``.
         shard: episodes a shard; by default 256, fewer where they take more than 256 MiB.
         compress: a seventh of the disk space for ``ids``, a quarter for ``compact``, and slower to read.
         envs: episodes that are played at once, at most; it changes nothing in what is recorded.
         policy_name: what the manifest calls a function: other functions, other names.
+        sees: the kind of observation that the policy is given, where that is another than what is recorded.
         progress: is called after every action.
         how: split, knobs, params, worlds, last_action, max_episode_steps, backend, device, threads: of `TensorEnv`.
 
     Raises:
         CompileError: a task, split, knob or parameter that there is not; PD630: the folder has something else; PD631:
-            it has another dataset; PD613: it cannot be written, or another process records there. ValueError:
-            another argument that is wrong.
+            it has another dataset; PD613: it cannot be written; PD622: another process records there. ValueError: another
+            argument that is wrong.
     """
     check_count("episodes", episodes, MAX_EPISODES)
     check_count("envs", envs, 1 << 20)
@@ -95,11 +98,12 @@ def record(
         raise TypeError(f"record does not take {sorted(reserved)[0]}")
     env = TensorEnv(task, 1, observation=observation, autoreset_mode="disabled", **how)
     recipe = recipe_of(env, policy=name, episodes=episodes, seed=seed, compress=compress, shard=shard)
+    sight = observation_of(sees or observation, env.simulator, env.task.size)
     act = SCRIPTED[policy](env.program) if isinstance(policy, str) else policy
     place = Path(folder)
     with _held(place):
         manifest = _begun(place, recipe)
-        _play(env, act, place, manifest, envs, progress or (lambda done, total: None))
+        _play(env, act, sight, place, manifest, envs, progress or (lambda done, total: None))
     return Dataset.open(place)
 
 
@@ -115,7 +119,8 @@ def _held(folder: Path) -> Iterator[None]:
         lock = FileLock(folder / ".lock", timeout=0)
         lock.acquire()
     except Timeout:
-        raise failure("PD613", f"cannot write {folder}", notes=("another process records there",)) from None
+        helps = ("wait for it, or choose another folder",)
+        raise failure("PD622", f"another process works on {folder}", helps=helps) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise failure("PD613", f"cannot write {folder}", notes=(reason,)) from None
@@ -171,7 +176,13 @@ def _tape(slots: int, recipe: Recipe) -> _Tape:
 
 
 def _play(
-    one: TensorEnv, policy: Policy, folder: Path, manifest: Manifest, envs: int, progress: Progress
+    one: TensorEnv,
+    policy: Policy,
+    sight: Observation,
+    folder: Path,
+    manifest: Manifest,
+    envs: int,
+    progress: Progress,
 ) -> None:
     """Play the episodes of all shards that are missing, in order; each shard is written when its last one ends.
 
@@ -206,13 +217,15 @@ def _play(
     every = np.arange(slots)
     tape.observation[every, 0] = observed.cpu().numpy()
     while playing.any():
-        moment = Moment(
+        keys = action_keys(
             recipe.seed,
             torch.from_numpy(episode.copy()).to(device),
             torch.from_numpy(taken.copy()).to(device),
         )
+        assert env.episodes is not None
+        shown = observed if sight.kind == recipe.observation else sight.of(env.episodes.world)
         with torch.no_grad():
-            actions = torch.as_tensor(policy(observed, moment))
+            actions = torch.as_tensor(policy(shown, keys))
         observed, reward, terminated, truncated, info = env.step(actions)
         tape.action[every, taken] = actions.cpu().numpy()
         given = {

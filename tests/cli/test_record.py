@@ -95,7 +95,7 @@ def test_all_mistakes_are_told_at_once(task: Path, tmp_path: Path) -> None:
         (("--verify", "gone"), "PD630"),
         (("small", "--verify", "gone"), "--verify takes a folder"),
         (("--seed", "-1"), "no whole number"),
-        (("--policy", "clever"), "clever"),
+        (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
         (("--observation", "matrix"), "matrix"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--device", "tpu"), "PD701"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--shard", "100000"), "may take"),

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from powderdsl.datasets import Dataset, record
 from powderdsl.datasets.manifest import read_manifest
-from powderdsl.datasets.scripted import Moment, random_policy
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
+from powderdsl.envs.acting import action_keys, random_policy
 from powderdsl.tasks.episodes import TaskProgram
 
 
@@ -77,15 +77,14 @@ def test_compressed_shards_hold_the_same(small: TaskProgram, recorded: Dataset, 
 def test_recording_goes_on_where_it_stopped(
     moment: int, small: TaskProgram, recorded: Dataset, tmp_path: Path
 ) -> None:
-    acts, calls = random_policy(small), 0
+    acts, calls = random_policy(small.action_nvec), 0
 
-    def failing(observed: Tensor, now: Moment) -> Tensor:
+    def failing(observed: Tensor, keys: Tensor) -> Tensor:
         nonlocal calls
         calls += 1
         if calls > moment:
             raise KeyboardInterrupt
-        actions: Tensor = acts(observed, now)
-        return actions
+        return acts(observed, keys)
 
     folder, how = tmp_path / "data", {"episodes": 20, "seed": 3, "shard": 8, "policy_name": "random"}
     with pytest.raises(KeyboardInterrupt):
@@ -133,38 +132,42 @@ def test_worlds_begin_at_the_seed_and_repeat(small: TaskProgram, tmp_path: Path)
 
 
 def test_a_policy_is_told_what_it_acts_on(small: TaskProgram, tmp_path: Path) -> None:
-    seen: dict[tuple[int, int], Any] = {}
+    """Its observations are of the kind it asked for, its keys those of the episode and action."""
+    seen: dict[int, Tensor] = {}
 
-    def policy(observed: Tensor, moment: Moment) -> list[list[int]]:
-        for row, (number, taken) in enumerate(
-            zip(moment.episode.tolist(), moment.taken.tolist(), strict=True)
-        ):
-            seen[number, taken] = observed[row].clone()
-        return [[number % 4, 0, 0, 1, 1] for number in moment.episode.tolist()]
+    def policy(observed: Tensor, keys: Tensor) -> Tensor:
+        seen.update(zip(keys.tolist(), observed, strict=True))
+        return (keys[:, None] >> torch.arange(5)) % torch.tensor(small.action_nvec)
 
-    data = record(small, policy, tmp_path / "data", episodes=7, shard=3, envs=2, policy_name="by number")
-    assert data.recipe.policy == "by number"
+    folder = tmp_path / "data"
+    data = record(
+        small, policy, folder, episodes=7, seed=9, shard=3, envs=2, policy_name="bits", sees="compact"
+    )
+    assert data.recipe.policy == "bits"
+    assert data.recipe.observation == "ids"
     for number in range(7):
         one = data.episode(number)
-        assert set(one.action[:, 0].tolist()) == {number % 4}
-        for step in range(len(one.action)):
-            assert torch.equal(seen[number, step], one.observation[step])
+        for step, action in enumerate(one.action.tolist()):
+            key = int(action_keys(9, torch.tensor([number]), step))
+            assert torch.equal(seen[key][:1], one.observation[step])
+            assert action == [(key >> bit) % most for bit, most in enumerate(small.action_nvec)]
 
 
 def test_random_actions_are_uniform(small: TaskProgram) -> None:
     """Every value of every part within five standard deviations, and parts independent of each other."""
-    moment = Moment(1 << 40, torch.arange(8000), torch.arange(8000) % 7)
-    actions = random_policy(small)(torch.zeros(8000, 1), moment).numpy()
+    number = torch.arange(8000)
+    keys = action_keys(1 << 40, number, number % 7)
+    actions = random_policy(small.action_nvec)(number, keys).numpy()
     for column, most in enumerate(small.action_nvec):
         counts = np.bincount(actions[:, column], minlength=most)
         assert len(counts) == most
         assert (abs(counts - 8000 / most) < 5 * np.sqrt(8000 / most)).all()
     pairs = np.bincount(actions[:, 3] * 3 + actions[:, 4], minlength=9)
     assert (abs(pairs - 8000 / 9) < 5 * np.sqrt(8000 / 9)).all()
-    later = random_policy(small)(
-        torch.zeros(8000, 1), Moment(1 << 40, moment.episode, moment.taken + 1)
-    ).numpy()
+    later = random_policy(small.action_nvec)(number, action_keys(1 << 40, number, number % 7 + 1)).numpy()
     assert (later == actions).all(1).mean() < 0.05
+    one_by_one = torch.cat([action_keys(1 << 40, number[i : i + 1], int(i % 7)) for i in range(20)])
+    assert torch.equal(one_by_one, keys[:20])
 
 
 def test_doing_nothing_is_one_action(small: TaskProgram, tmp_path: Path) -> None:
@@ -194,7 +197,7 @@ def test_another_recipe_is_refused(small: TaskProgram, recorded: Dataset) -> Non
 def test_one_process_at_a_time(small: TaskProgram, recorded: Dataset) -> None:
     with (
         FileLock(recorded.folder / ".lock"),
-        pytest.raises(CompileError, match="another process records there"),
+        pytest.raises(CompileError, match="PD622"),
     ):
         record(small, "random", recorded.folder, episodes=20, seed=3, shard=8)
 
@@ -222,9 +225,9 @@ def test_folders_of_others_are_left_alone(small: TaskProgram, tmp_path: Path) ->
         ({"shard": 1 << 30}, "a shard of 1073741824 episodes may take"),
         ({"observation": "matrix"}, "observation is one of ids, compact"),
         ({"policy": "clever"}, "one of random, nothing"),
-        ({"policy": lambda observed, moment: None}, "needs a policy_name"),
+        ({"policy": lambda observed, keys: None}, "needs a policy_name"),
         (
-            {"policy": lambda observed, moment: [[9] * 5] * 2, "policy_name": "bad"},
+            {"policy": lambda observed, keys: [[9] * 5] * 2, "policy_name": "bad"},
             r"actions\[0, 0\] \(x\) is 9",
         ),
         ({"num_envs": 3}, "record does not take num_envs"),
