@@ -175,6 +175,6 @@ def params_of(sim: Simulator, given: Mapping[str, Tensor], batch: int) -> dict[s
     """All parameters as float64 [B], for measures that ask for them."""
     found = {}
     for param in sim.ruleset.params:
-        value = torch.as_tensor(given.get(param.name, float(param.default)), device=sim.device)
-        found[param.name] = value.to(torch.float64).expand(batch)
+        value = given.get(param.name, float(param.default))
+        found[param.name] = torch.as_tensor(value, dtype=torch.float64, device=sim.device).expand(batch)
     return found

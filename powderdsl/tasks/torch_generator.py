@@ -8,7 +8,7 @@ Painting happens on bits: an id is a few planes, a word is 64 rows of a column.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -35,6 +35,10 @@ _NUMBERS, _STATEMENT, _COUNTER, _INDEX = 128, 0x9E3779B1, 0x85EBCA6B, 0x7A51
 keeps draws of generators apart from those of rules."""
 
 
+_LIMITED = ("scatter", "stamp")
+"""Statements whose cells are found only when they are painted."""
+
+
 @dataclass(frozen=True)
 class Made:
     """Generated worlds: ids uint8 [B, H, W]; regions bool [B, H, W] or [1, H, W]; targets uint8 [B, H, W]."""
@@ -44,17 +48,53 @@ class Made:
     targets: Mapping[str, Tensor]
 
 
-class Hashes:
-    """The random numbers of a batch of seeds, int64 [B]."""
+class DrawTable:
+    """Which numbers a generator draws, so that all of them are hashed at once: few operations, each on many numbers.
 
-    def __init__(self, seeds: Tensor):
+    A statement has a block of `repeats` times `wanted` draws. Statements of one number share their draws.
+    """
+
+    def __init__(self, blocks: Iterable[tuple[int, int, int]], device: torch.device):
+        """`blocks`: number, repeats and wanted of each statement."""
+        most: dict[int, tuple[int, int]] = {}
+        for statement, repeats, wanted in blocks:
+            old = most.get(statement, (0, 0))
+            most[statement] = max(repeats, old[0]), max(wanted, old[1])
+        self.blocks: dict[int, tuple[int, int, int]] = {}
+        """By statement: the place of its first draw, repeats, wanted."""
+        keys: list[int] = []
+        counters: list[int] = []
+        for statement, (repeats, wanted) in most.items():
+            self.blocks[statement] = (len(keys), repeats, wanted)
+            keys += [statement * _STATEMENT & MASK] * (repeats * wanted)
+            counters += [r * _NUMBERS + n for r in range(repeats) for n in range(wanted)]
+        self.size = len(keys)
+        self.keys = torch.tensor(keys, dtype=torch.int64, device=device)
+        self.spread = torch.tensor(counters, dtype=torch.int64, device=device) * _COUNTER & MASK
+
+
+class Hashes:
+    """The random numbers of a batch of seeds, int64 [B]: those of a table, and others of single statements."""
+
+    def __init__(self, seeds: Tensor, table: DrawTable):
         self.keys = base_keys(seeds, torch.full_like(seeds, _INDEX))
+        self.table = table
+        self.drawn = self._hash(table.keys, table.spread) if table.size else None
 
     def draw(self, statement: int, counters: Tensor) -> Tensor:
         """32-bit numbers of one statement: int64 [B, n] for counters int64 [n]."""
-        keys = mix((self.keys[0] + statement * _STATEMENT) & MASK)
-        spread = (counters * _COUNTER) & MASK
-        return mix((mix((keys[:, None] + spread) & MASK) + self.keys[1][:, None]) & MASK)
+        key = torch.tensor([statement * _STATEMENT & MASK], device=counters.device)
+        return self._hash(key, (counters * _COUNTER) & MASK)
+
+    def _hash(self, keys: Tensor, spread: Tensor) -> Tensor:
+        keys = mix((self.keys[0][:, None] + keys) & MASK)
+        return mix((mix((keys + spread) & MASK) + self.keys[1][:, None]) & MASK)
+
+    def block(self, statement: int, repeats: int) -> Tensor:
+        """The draws of a statement of the table in its first repetitions: int64 [B, repeats, wanted]."""
+        assert self.drawn is not None
+        start, most, wanted = self.table.blocks[statement]
+        return self.drawn[:, start : start + most * wanted].view(-1, most, wanted)[:, :repeats]
 
 
 def name_number(name: str) -> int:
@@ -66,26 +106,19 @@ def name_number(name: str) -> int:
 
 
 class _Draws:
-    """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter.
+    """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter."""
 
-    `wanted` is how many draws there will be: all of them are hashed at once.
-    """
-
-    def __init__(
-        self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Tensor], wanted: int
-    ):
+    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Tensor]):
         self.hashes, self.names, self.device = hashes, names, hashes.keys.device
+        self.statement, self.repeats = statement, repeats
+        self.drawn: tuple[Tensor, ...] | None = None
         self.used = 0
-        self.drawn: Tensor | None = None
-        if wanted:
-            counters = torch.arange(repeats, device=self.device)[:, None] * _NUMBERS
-            counters = (counters + torch.arange(wanted, device=self.device)).flatten()
-            self.drawn = hashes.draw(statement, counters).view(-1, repeats, wanted)
 
     def uniform(self, low: Tensor | int, high: Tensor | int) -> Tensor:
         """Whole numbers from `low` to `high`, both included; where there are none, `low`."""
-        assert self.drawn is not None
-        drawn = self.drawn[..., self.used]
+        if self.drawn is None:
+            self.drawn = self.hashes.block(self.statement, self.repeats).unbind(-1)
+        drawn = self.drawn[self.used]
         self.used += 1
         return low + ((drawn * (high - low + 1)) >> 32)
 
@@ -115,6 +148,26 @@ def _draws_in(*amounts: Amount | None) -> int:
     return sum(part.op == "draw" for one in amounts if one is not None for part in one.walk())
 
 
+def _draw_blocks(generator: Generator) -> Iterator[tuple[int, int, int]]:
+    """What a generator draws, as `DrawTable` takes it."""
+    for name, amount in generator.lets:
+        yield name_number(name), 1, _draws_in(amount)
+    for region in generator.regions:
+        for number, shape in enumerate(region.shapes):
+            yield _shape_number(region, number), 1, _draws_in(*shape.amounts)
+    for group in (*generator.groups, *(group for target in generator.targets for group in target.groups)):
+        yield group.number, 1, _draws_in(group.count)
+        for name, amount in group.lets:
+            yield name_number(name), group.most, _draws_in(amount)
+        for one in group.drawings:
+            yield one.number, group.most, _draws_in(*one.amounts) + (len(one.ids) > 1)
+
+
+def _shape_number(region: Region, place: int) -> int:
+    """A region's own draws hang on its name and the shape's place."""
+    return name_number(f"{region.name} {place}")
+
+
 class WorldMaker:
     """A generator made executable for one size and device."""
 
@@ -126,8 +179,10 @@ class WorldMaker:
         painted = [i for group in groups for one in group.drawings for i in one.ids]
         held = [int(i) for stamp in self.stamps.values() for i in stamp.unique() if i != NOTHING]
         self.planes = max(1, max([generator.fill, *painted, *held]).bit_length())
+        self.table = DrawTable(_draw_blocks(generator), device)
         self.fixed: dict[Drawing, Tensor] = {}
         """Words of shapes that are the same in every world."""
+        self._bits: dict[tuple[int, int], Tensor] = {}
         self.fixed_regions = {
             region.name: self._union([self.fixed_words(one) for one in region.shapes])[None]
             for region in generator.regions
@@ -141,7 +196,7 @@ class WorldMaker:
         """The worlds of some seeds, int64 [B]."""
         chunk = max(1, len(seeds))
         if self.device.type == "cpu":
-            chunk = max(1, CHUNK_CELLS // (self.size[0] * self.size[1]))
+            chunk = max(1, CHUNK_CELLS // max(self.size[0] * self.size[1], self.table.size))
         made = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
         if len(made) == 1:
             return made[0]
@@ -152,7 +207,7 @@ class WorldMaker:
         return Made(torch.cat([one.ids for one in made]), regions, targets)
 
     def _chunk(self, seeds: Tensor) -> Made:
-        hashes = Hashes(seeds)
+        hashes = Hashes(seeds, self.table)
         names = self._lets(self.generator.lets, hashes, 1, {})
         regions = dict(self.fixed_regions)
         for region in self.generator.regions:
@@ -184,17 +239,16 @@ class WorldMaker:
         """`names` and more of them: int64 that broadcasts to [B, R]."""
         found = dict(names)
         for name, amount in lets:
-            value = _Draws(hashes, name_number(name), repeats, found, _draws_in(amount)).tensor(amount)
+            value = _Draws(hashes, name_number(name), repeats, found).tensor(amount)
             assert value is not None
             found[name] = value
         return found
 
     def _region(self, region: Region, hashes: Hashes, names: Mapping[str, Tensor]) -> Tensor:
-        """Words [B, W, K] of a region. Its own draws hang on its name and the shape's place."""
+        """Words [B, W, K] of a region."""
         found = []
         for number, shape in enumerate(region.shapes):
-            place = name_number(f"{region.name} {number}")
-            draws = _Draws(hashes, place, 1, names, _draws_in(*shape.amounts))
+            draws = _Draws(hashes, _shape_number(region, number), 1, names)
             words = self.drawn_words(shape, [draws.tensor(one) for one in shape.amounts])
             full = (len(hashes.keys[0]), 1, self.size[1], self.words)
             found.append(words.expand(full)[:, 0])
@@ -221,6 +275,14 @@ class WorldMaker:
             self.fixed[drawing] = pack(cells)
         return self.fixed[drawing]
 
+    def fixed_bits(self, number: int, planes: int) -> Tensor:
+        """The bits of an id, as `_plane_bits` has them."""
+        if (number, planes) not in self._bits:
+            self._bits[number, planes] = _plane_bits(
+                torch.tensor(number, device=self.device), planes, self.planes
+            )
+        return self._bits[number, planes]
+
     def _paint(
         self,
         planes: Tensor,
@@ -232,7 +294,7 @@ class WorldMaker:
         """Paint all groups on planes, in place."""
         batch = planes.shape[1]
         for group in groups:
-            count = _Draws(hashes, group.number, 1, names, _draws_in(group.count)).tensor(group.count)
+            count = _Draws(hashes, group.number, 1, names).tensor(group.count)
             assert count is not None
             repeats = group.most
             if planes.device.type == "cpu" and repeats > 1:
@@ -240,12 +302,12 @@ class WorldMaker:
             if repeats == 0:
                 continue
             active = torch.arange(repeats, device=self.device) < count
+            once = -active.expand(batch, repeats).long()[..., None, None]
             local = self._lets(group.lets, hashes, repeats, names)
             painters = []
             for one in group.drawings:
-                wanted = _draws_in(*one.amounts) + (len(one.ids) > 1)
-                draws = _Draws(hashes, one.number, repeats, local, wanted)
-                painters.append(_Painter(self, one, draws, active.expand(batch, repeats), len(planes)))
+                draws = _Draws(hashes, one.number, repeats, local)
+                painters.append(_Painter(self, one, draws, once, len(planes)))
             for repeat in range(repeats):
                 for painter in painters:
                     painter.paint(planes, repeat, regions)
@@ -254,31 +316,31 @@ class WorldMaker:
 class _Painter:
     """One statement in all its repetitions: what it needs is computed for all of them at once."""
 
-    def __init__(self, maker: WorldMaker, drawing: Drawing, draws: _Draws, active: Tensor, planes: int):
+    def __init__(self, maker: WorldMaker, drawing: Drawing, draws: _Draws, once: Tensor, planes: int):
+        """`once`: int64 [B, R, 1, 1], all bits where a world has a repetition."""
         self.maker, self.drawing, self.draws = maker, drawing, draws
-        full = active.shape
-        self.bits = _plane_bits(self._elements(), planes, maker.planes)
-        numbers = [draws.tensor(one) for one in drawing.amounts]
-        self.numbers = [None if one is None else one.expand(full) for one in numbers]
-        once = -active.long()[..., None, None]
-        """All bits where a world has this repetition."""
-        if drawing.kind in ("scatter", "stamp"):
-            self.words = once
-        elif all(one is None or one.is_number for one in drawing.amounts):
-            self.words = maker.fixed_words(drawing) & once
+        repeats = once.shape[1]
+        if len(drawing.ids) > 1:
+            ids = torch.tensor(drawing.ids, device=maker.device)[draws.uniform(0, len(drawing.ids) - 1)]
+            bits = _plane_bits(ids, planes, maker.planes)
+        else:  # those of stamps stand in their pictures
+            bits = maker.fixed_bits(drawing.ids[0] if drawing.ids else 0, planes)
+        self.bits = bits.unbind(2) if bits.shape[2] > 1 else bits.unbind(2) * repeats
+        self.numbers: list[Tensor | None] = []
+        if all(one is None or one.is_number for one in drawing.amounts) and drawing.kind not in _LIMITED:
+            words = maker.fixed_words(drawing) & once
         else:
-            self.words = maker.drawn_words(drawing, self.numbers) & once
-
-    def _elements(self) -> Tensor:
-        """The ids, int64 that broadcasts to [B, R]; those of stamps stand in their pictures."""
-        ids = torch.tensor(self.drawing.ids or (0,), device=self.draws.device)
-        return ids[0] if len(ids) == 1 else ids[self.draws.uniform(0, len(ids) - 1)]
+            numbers = [draws.tensor(one) for one in drawing.amounts]
+            self.numbers = [None if one is None else one.expand(once.shape[:2]) for one in numbers]
+            words = once
+            if drawing.kind not in _LIMITED:
+                words = maker.drawn_words(drawing, self.numbers) & once
+        self.words = words.unbind(1)
 
     def paint(self, planes: Tensor, repeat: int, regions: Mapping[str, Tensor]) -> None:
         """Paint one repetition on planes, in place."""
         drawing = self.drawing
-        words, bits = self.words[:, repeat], self.bits
-        bits = bits[:, :, min(repeat, bits.shape[2] - 1)]
+        words, bits = self.words[repeat], self.bits[repeat]
         if drawing.kind == "stamp":
             picture = self._stamp(repeat)
             words = words & pack(picture != NOTHING)
