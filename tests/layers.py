@@ -10,7 +10,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "runs", "web", "experiments", "cli")
+_AFTER = ("bench", "tasks", "envs", "runs", "rl", "web", "experiments", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -46,6 +46,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
     "runs": ("diagnostics", "worlds"),
+    "rl": (*_SCREEN, "tasks", "envs", "runs"),
     "web": _SCREEN,
     "experiments": (*_SCREEN, "tasks", "envs", "web"),
     "cli": (*_EVERYTHING[:-1], "user_cache"),
@@ -63,15 +64,16 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", "runs", "experiments")
+_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", "runs", "rl", "experiments")
+_GYMNASIUM = ("envs", "rl", "experiments")
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),
     "torch": Home(
         (*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "bench", "web", "cli"), _TORCH
     ),
-    "gymnasium": Home(("envs", "experiments"), ("envs", "experiments")),
-    "stable_baselines3": Home(("envs", "experiments"), ("envs", "experiments")),
+    "gymnasium": Home(_GYMNASIUM, _GYMNASIUM),
+    "stable_baselines3": Home(_GYMNASIUM, _GYMNASIUM),
     "click": Home(("cli",), ("cli",)),
     "matplotlib": Home(("bench",), ()),
 }

@@ -21,6 +21,7 @@ from powderdsl.envs.single import PowderEnv
 from powderdsl.envs.tensor_env import TensorEnv, world_seeds
 from powderdsl.envs.vector import PowderVectorEnv
 from powderdsl.tasks.episodes import TaskProgram, compile_task, load_task
+from tests.states import same
 
 ENVS, STEPS = 5, 16
 MODES = tuple(AutoresetMode)
@@ -358,3 +359,43 @@ def test_programs_are_shared(task_file: Path) -> None:
     assert TensorEnv(program).program is TensorEnv(program, 2).program is program
     with pytest.raises(ValueError, match="load_task"):
         TensorEnv(program.task, knobs={"disks": 1})
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_saved_environment_goes_on_as_it_would_have(small: TaskProgram, mode: AutoresetMode) -> None:
+    first, second = (TensorEnv(small, ENVS, observation="compact", autoreset_mode=mode) for _ in range(2))
+    first.reset(seed=3, options={"params": {"water.melt": [0.1, 0.9, 0.5, 0.0, 1.0]}})
+    actions = torch.from_numpy(actions_of(small))
+    for action in actions[:4]:
+        first.step(action)
+    saved = first.state()
+    observed = second.restore(copy.deepcopy(saved))
+    assert torch.equal(observed, first.observation.of(first.episodes.world))
+    mask = None
+    for action in actions[4:]:
+        if mode is AutoresetMode.DISABLED and mask is not None and bool(mask.any()):
+            observations = [env.reset(options={"reset_mask": mask})[0] for env in (first, second)]
+            assert torch.equal(*observations)
+        found = [env.step(action) for env in (first, second)]
+        assert same(found[0], found[1])
+        mask = found[0][2] | found[0][3]
+    third = TensorEnv(small, ENVS)
+    third.restore(saved)  # what was saved has not been written to
+    assert same(third.state(), saved)
+
+
+def test_what_was_saved_elsewhere_is_refused(small: TaskProgram, tmp_path: Path) -> None:
+    env = TensorEnv(small, ENVS)
+    with pytest.raises(ResetNeeded):
+        env.state()
+    env.reset(seed=0)
+    before = env.state()
+    other = TensorEnv(small, ENVS + 1)
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match="6 worlds were saved"):
+        env.restore(other.state())
+    state = env.state()
+    state["episodes"]["state"].pop("element")
+    with pytest.raises(ValueError, match="another state"):
+        env.restore(state)
+    assert same(env.state(), before)

@@ -22,22 +22,12 @@ from powderdsl.rl.ppo_config import HOW, from_json
 from powderdsl.runs import RunFolder, read_run
 from powderdsl.runs.metrics import read_metrics
 from tests.rl.tiny_tasks import PLACE, quick, write_task
+from tests.states import same
 
 
 @pytest.fixture
 def task(tmp_path: Path) -> Path:
     return write_task(tmp_path)
-
-
-def same(a: Any, b: Any) -> bool:
-    """Whether two states are equal, bit by bit."""
-    if isinstance(a, torch.Tensor):
-        return a.dtype == b.dtype and torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return bool(a == b)
 
 
 def lasting(run: RunFolder) -> dict[str, Any]:
