@@ -31,6 +31,7 @@ from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.ledgers.book import ledger
 from powderdsl.properties.refute import refuted
+from powderdsl.rl import preset
 from powderdsl.runs import does_not_fit, find_run, open_run
 from powderdsl.studies.study_file import load_study
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
@@ -272,6 +273,7 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD621": open_a_run_of_another_seed,
     "PD622": train_in_one_folder_twice,
     "PD623": use_a_run_that_does_not_fit,
+    "PD640": lambda: preset("paper", "sand-pushing", batch=1),
     "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }
