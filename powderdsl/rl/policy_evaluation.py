@@ -11,9 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.envs.acting import Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.rl.policies import Policy, action_keys, config_of, load_policy, random_policy
+from powderdsl.rl.policies import config_of, load_policy
 from powderdsl.rl.ppo_config import TrainConfig
 from powderdsl.runs import RunFolder, find_run
 from powderdsl.simulator import World

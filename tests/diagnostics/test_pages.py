@@ -26,6 +26,7 @@ from PIL import Image
 
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics
+from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
@@ -245,6 +246,13 @@ def write_into_no_folder() -> None:
         pass
 
 
+def record_with_another_seed() -> None:
+    from powderdsl.datasets import record
+
+    for seed in (0, 1):
+        record("herd-gas", "nothing", "recorded", episodes=1, seed=seed, max_episode_steps=1, backend="dense")
+
+
 def open_a_run_of_another_seed() -> None:
     open_run("runs/dunes", "ppo", {"seed": 1})
     open_run("runs/dunes", "ppo", {"seed": 2})
@@ -274,6 +282,8 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD622": train_in_one_folder_twice,
     "PD623": use_a_run_that_does_not_fit,
     "PD640": lambda: preset("paper", "sand-pushing", batch=1),
+    "PD630": lambda: read_manifest(Path("recorded")),
+    "PD631": record_with_another_seed,
     "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }
