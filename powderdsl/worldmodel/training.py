@@ -70,7 +70,7 @@ PAPER = TrainConfig()
 """5,000 iterations of 256 pairs, width 32, a buffer of 1024·256: for a GPU."""
 
 SMALL = TrainConfig(
-    data=DataConfig(capacity=4096, refresh=16), width=16, iterations=800, batch=16, learning_rate=0.002
+    data=DataConfig(capacity=4096, refresh=8), width=16, iterations=1200, batch=8, learning_rate=0.002
 )
 """The same network, narrower, on fewer pairs: minutes on one CPU core."""
 
