@@ -21,6 +21,9 @@ MOTION_COLOR = (200, 100, 100)
 MAX_TINT = 0.5
 """The tint at speed 1 and above; slower cells are tinted in proportion."""
 
+OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
+"""Colours of regions, in their order in the file; of more than four the first comes again."""
+
 Colors = Sequence[str] | NDArray[np.uint8]
 """Colours by element id: ``#RRGGBB`` each, or uint8 [n, 3]."""
 
@@ -106,6 +109,16 @@ def contact_sheet(
         top, left = gap + place // columns * (height + gap), gap + place % columns * (width + gap)
         sheet[top : top + height, left : left + width] = picture
     return sheet
+
+
+def outline(
+    image: NDArray[np.uint8], cells: NDArray[np.bool_], factor: int, color: tuple[int, int, int]
+) -> None:
+    """Draw the edge of a set of cells into a picture uint8 [H·factor, W·factor, 3], one pixel wide, inside it."""
+    pixels = np.repeat(np.repeat(cells, factor, 0), factor, 1)
+    padded = np.pad(pixels, 1)
+    inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    image[pixels & ~inner] = color
 
 
 def to_numpy(image: Array) -> NDArray[Any]:

@@ -10,7 +10,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "runs", "worldmodel", "web", "experiments", "cli")
+_AFTER = ("bench", "tasks", "envs", "runs", "rl", "worldmodel", "studies", "web", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -46,9 +46,10 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
     "runs": ("diagnostics", "worlds"),
+    "rl": (*_SCREEN, "tasks", "envs", "runs"),
     "worldmodel": (*_SCREEN, "tasks", "runs"),
+    "studies": (*_MODEL, "compiler", "worlds", "runs", "bench"),  # calls commands, in processes of their own
     "web": _SCREEN,
-    "experiments": (*_SCREEN, "tasks", "envs", "web"),
     "cli": (*_EVERYTHING[:-1], "user_cache"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
@@ -73,7 +74,7 @@ _TORCH = (
     "envs",
     "runs",
     "worldmodel",
-    "experiments",
+    "rl",
 )
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
@@ -81,8 +82,8 @@ THIRD_PARTIES: dict[str, Home] = {
     "torch": Home(
         (*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "bench", "web", "cli"), _TORCH
     ),
-    "gymnasium": Home(("envs", "experiments"), ("envs", "experiments")),
-    "stable_baselines3": Home(("envs", "experiments"), ("envs", "experiments")),
+    "gymnasium": Home(("envs", "rl"), ("envs", "rl")),
+    "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
     "click": Home(("cli",), ("cli",)),
-    "matplotlib": Home(("bench",), ()),
+    "matplotlib": Home(("bench", "studies", "cli"), ()),
 }

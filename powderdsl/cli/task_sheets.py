@@ -10,18 +10,14 @@ from typing import Any
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
 from powderdsl.cli.show_command import table
-from powderdsl.draw import contact_sheet, palette, rgb, scale
+from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, rgb, scale
 from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task
-
-OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
-"""Colours of regions, in their order in the file; of more than four the first comes again."""
 
 
 def show_task(
@@ -142,13 +138,3 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
         for world, image in enumerate(images):
             outline(image, masks[world % len(masks)].numpy(), factor, color)
     write_png(out, contact_sheet(images, columns=columns))
-
-
-def outline(
-    image: NDArray[np.uint8], cells: NDArray[np.bool_], factor: int, color: tuple[int, int, int]
-) -> None:
-    """Draw the edge of a set of cells into a picture uint8 [H·factor, W·factor, 3], one pixel wide, inside it."""
-    pixels = np.repeat(np.repeat(cells, factor, 0), factor, 1)
-    padded = np.pad(pixels, 1)
-    inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-    image[pixels & ~inner] = color

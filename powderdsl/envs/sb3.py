@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,17 @@ class PowderVecEnv(VecEnv):
             }
             if self.tensors.task.goal.success is not None:
                 infos[place]["is_success"] = bool(success[place])
+
+    def state(self) -> dict[str, Any]:
+        """What `TensorEnv.state` gives."""
+        return self.tensors.state()
+
+    def restore(self, state: Mapping[str, Any]) -> Array:
+        """What `TensorEnv.restore` does; seeds and options that no reset has used are forgotten."""
+        observed = self.tensors.restore(state)
+        self._reset_seeds()
+        self._reset_options()
+        return array(observed)
 
     def close(self) -> None:
         """Nothing is left to close."""

@@ -218,6 +218,48 @@ class TensorEnv:
         usual = self.simulator.parameters({}, self.num_envs)
         return {name: torch.where(mask, whole[name], self.params.get(name, usual[name])) for name in names}
 
+    # Saving
+
+    def state(self) -> dict[str, Any]:
+        """All that decides how things go on, as dicts of tensors on the CPU: worlds, seeds, episodes, returns, parameters.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if self.episodes is None or self._base is None:
+            raise ResetNeeded("reset the environment before saving it")
+        rows = {
+            "base": self._base,
+            "episode": self._episode,
+            "returned": self._returned,
+            "ended": self._ended,
+        }
+        return {
+            **{name: value.to("cpu", copy=True) for name, value in rows.items()},
+            "params": {name: value.to("cpu", copy=True) for name, value in self.params.items()},
+            "episodes": self.program.saved(self.episodes),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> Tensor:
+        """Go on from what `state` gave, in another process, or on another backend or device.
+
+        Returns:
+            the observations there, [B, …].
+
+        Raises:
+            ValueError: it is of another task or number of worlds. KeyError: it is no such state. Nothing has changed then.
+        """
+        if len(state["base"]) != self.num_envs:
+            raise ValueError(f"{len(state['base'])} worlds were saved: {self.num_envs} are needed")
+        episodes = self.program.loaded(state["episodes"])
+        base, episode, returned, ended = (
+            state[name].to(self.device, copy=True) for name in ("base", "episode", "returned", "ended")
+        )
+        params = {name: value.to(self.device, copy=True) for name, value in state["params"].items()}
+        self.episodes, self._base, self._episode = episodes, base, episode
+        self._returned, self._ended, self.params = returned, ended, params
+        return self.observation.of(episodes.world)
+
     # Stepping
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from powderdsl.simulator import Simulator, World
 from powderdsl.simulator import compile as compile_rules
 from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import Task
-from powderdsl.tasks.torch_actions import Hands, params_of
+from powderdsl.tasks.torch_actions import Done, Hands, params_of
 from powderdsl.tasks.torch_generator import Made, WorldMaker
 from powderdsl.tasks.torch_measures import Facts, Given, Meter, measures_of, scalar_value, scalars_of
 
@@ -157,33 +157,77 @@ class TaskProgram:
             placed(episodes.before, new.before),
         )
 
+    # Saving
+
+    def saved(self, episodes: Episodes) -> dict[str, Any]:
+        """Episodes as plain tensors in dicts, copies on the CPU, that any backend and device can go on from."""
+        world = episodes.world
+        rows = ("seed", "acted", "failed", "start", "before")
+        maps = {"state": world.state, "regions": episodes.regions, "targets": episodes.targets}
+        return {
+            **{name: _copy(getattr(episodes, name)) for name in rows},
+            **{name: {key: _copy(value) for key, value in one.items()} for name, one in maps.items()},
+            "clock": [_copy(one) for one in (world.seed, world.index, world.step)],
+        }
+
+    def loaded(self, saved: Mapping[str, Any]) -> Episodes:
+        """What `saved` was made of. Raises KeyError and ValueError for episodes of other rules or sizes."""
+        device = self.simulator.device
+
+        def tensors(one: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: value.to(device, copy=True) for name, value in one.items()}
+
+        state = tensors(saved["state"])
+        names = [slot.name for slot in self.simulator.slots]
+        if set(state) != set(names) or tuple(state["element"].shape[1:]) != self.task.size:
+            raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
+        seed, index, step = (one.to(device, copy=True) for one in saved["clock"])
+        rows = tensors({name: saved[name] for name in ("seed", "acted", "failed", "start", "before")})
+        return Episodes(
+            world=World(self.simulator, state, seed, index, step),
+            regions={**tensors(saved["regions"]), **self._fixed},
+            targets=tensors(saved["targets"]),
+            **rows,
+        )
+
     # Acting
 
     def act(
         self,
         episodes: Episodes,
-        actions: Tensor,
+        actions: Tensor | None,
         *,
         reuse: bool = False,
         params: Mapping[str, Any] | None = None,
+        seen: Callable[[World], None] | None = None,
     ) -> tuple[Episodes, Tensor, Tensor, Tensor]:
         """One action of each episode, int64 [B, 5] as `check_actions` gives them, and the steps after it.
 
         Args:
+            actions: None lets the worlds run as if nobody had acted. The action is spent, and nothing is painted,
+                placed or blown.
             reuse: the tensors of `episodes` are written to, and must not be used afterwards.
             params: parameters of the rules for this action, one number each or [B].
+            seen: called with the worlds after the action and after each step, which then run one by one. Free steps
+                are shown where all episodes have them. Not with `reuse`.
 
         Returns:
             the episodes; reward float32 [B]; success bool [B], whether `success` of `end:` holds now; over bool [B]:
             success, failure, or no action left. With the last action the free steps have run.
         """
         agent, goal = self.task.agent, self.task.goal
-        done = self._hands.act(episodes.world, actions, reuse=reuse)
-        world = self.simulator.step(done.world, agent.steps_per_action, params=params, reuse=reuse)
+        if actions is None:
+            nobody = torch.zeros_like(episodes.acted)
+            done = Done(episodes.world, nobody, nobody, nobody)
+        else:
+            done = self._hands.act(episodes.world, actions, reuse=reuse)
+        if seen is not None:
+            seen(done.world)
+        world = self._run(done.world, agent.steps_per_action, params, reuse, seen)
         acted = episodes.acted + 1
         last = acted >= agent.actions
         if agent.free_steps:
-            world = self._free(world, last, params)
+            world = self._free(world, last, params, seen)
         now = episodes.before
         if self._counts_always or bool(last.any()):
             now = self._meter.take(self._given(world, episodes.regions, episodes.targets, params or {}))
@@ -211,14 +255,36 @@ class TaskProgram:
         """What `measures` are now: float64 [B, n]."""
         return self._meter.take(self._given(episodes.world, episodes.regions, episodes.targets, params or {}))
 
-    def _free(self, world: World, last: Tensor, params: Mapping[str, Any] | None) -> World:
+    def _run(
+        self,
+        world: World,
+        steps: int,
+        params: Mapping[str, Any] | None,
+        reuse: bool = False,
+        seen: Callable[[World], None] | None = None,
+    ) -> World:
+        """Some steps; one by one where they are to be seen."""
+        if seen is None:
+            return self.simulator.step(world, steps, params=params, reuse=reuse)
+        for _ in range(steps):
+            world = self.simulator.step(world, 1, params=params)
+            seen(world)
+        return world
+
+    def _free(
+        self,
+        world: World,
+        last: Tensor,
+        params: Mapping[str, Any] | None,
+        seen: Callable[[World], None] | None,
+    ) -> World:
         """The steps after the last action, in the worlds that had it."""
         steps = self.task.agent.free_steps
         places = last.nonzero()[:, 0]
         if len(places) == 0:
             return world
         if len(places) == len(last):
-            return self.simulator.step(world, steps, params=params)
+            return self._run(world, steps, params, seen=seen)
         own = {
             name: value[places] if isinstance(value, Tensor) and value.ndim else value
             for name, value in (params or {}).items()
@@ -237,6 +303,10 @@ class TaskProgram:
         return Given(
             world.state, world.step, params_of(self.simulator, params, len(world.step)), regions, targets
         )
+
+
+def _copy(tensor: Tensor) -> Tensor:
+    return tensor.detach().to("cpu", copy=True)
 
 
 def compile_task(

@@ -3,8 +3,8 @@
 A page has a wrong example and, mostly, the mended one:
 
 * ``yaml wrong`` and ``yaml right`` are rule files; ``# with: core`` at the top names packs to load with them.
-* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task; all use the
-  rules of the paper.
+* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task, ``yaml wrong study`` a
+  study; all use the rules of the paper.
 * ``text`` is the message itself, for what no file can show; `SITUATIONS` brings it about.
 
 The text under the caret stands in the example, in a comment ``# ^ text`` below it.
@@ -32,6 +32,7 @@ from powderdsl.diagnostics.render import render_text
 from powderdsl.ledgers.book import ledger
 from powderdsl.properties.refute import refuted
 from powderdsl.runs import does_not_fit, find_run, open_run
+from powderdsl.studies.study_file import load_study
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.files import replacing
@@ -99,6 +100,11 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
             return ()
         if "task" in one.info.split():
             return load_task_with_diagnostics(path)[1]
+        if "study" in one.info.split():
+            load_study(
+                "page.yaml", {("train",): frozenset({"run", "seed", "steps"}), ("evaluate",): frozenset()}
+            )
+            return ()
         if "world" in one.info.split():
             read_ascii(one.text, paper_rules().elements, name="page.txt")
             return ()

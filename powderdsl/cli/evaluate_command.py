@@ -1,0 +1,138 @@
+"""`powderdsl evaluate`: an agent beside acting at random and doing nothing, on each split of its task."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.cli.options import WholeType, check_writable, set_option
+from powderdsl.cli.show_command import table
+from powderdsl.cli.task_sheets import knob_values
+from powderdsl.compiler import BACKENDS
+from powderdsl.tasks.task_names import is_task
+
+if TYPE_CHECKING:
+    from powderdsl.rl.policy_evaluation import Evaluation, Score
+
+
+def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> list[str] | None:
+    if value is None:
+        return None
+    return [one.strip() for one in value.split(",") if one.strip()]
+
+
+@click.command("evaluate")
+@click.argument("run", metavar="RUN|TASK")
+@click.option(
+    "--splits", callback=_names, metavar="A,B", help="Which worlds.  [default: all splits of the task]"
+)
+@click.option(
+    "--policies", callback=_names, metavar="A,B", help="Of trained, random, nothing.  [default: all]"
+)
+@click.option(
+    "--episodes",
+    type=WholeType(1, 10**6),
+    default=256,
+    show_default=True,
+    help="On each split, for each policy.",
+)
+@click.option(
+    "--deterministic/--sampled",
+    default=False,
+    help="The likeliest action, or one drawn as in training.  [default: sampled]",
+)
+@click.option(
+    "--seed", type=WholeType(0, 2**32 - 1), default=0, show_default=True, help="Of what policies draw."
+)
+@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
+@set_option
+@click.option(
+    "--backend", type=click.Choice(list(BACKENDS)), help="What runs the rules.  [default: the run's]"
+)
+@click.option("--device", help="A torch device.  [default: the run's]")
+@click.option(
+    "--format",
+    "layout",
+    type=click.Choice(("text", "json")),
+    default="text",
+    show_default=True,
+    help="A table, or one JSON object.",
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="FILE.json", help="Where else to write the JSON object."
+)
+def command(
+    run: str,
+    splits: list[str] | None,
+    policies: list[str] | None,
+    episodes: int,
+    deterministic: bool,
+    seed: int,
+    knobs: tuple[str, ...],
+    settings: dict[str, str],
+    backend: str | None,
+    device: str | None,
+    layout: str,
+    out: Path | None,
+) -> None:
+    """Mean return and 95 % interval of the agent of a RUN, on each split, in the same worlds as the other policies.
+
+    The result is also written to evaluation.json in the run's folder. Of a TASK, the policies that need no training.
+    """
+    task = None
+    if is_task(run):
+        from powderdsl.tasks.shipped_tasks import load_task
+
+        task = load_task(run, knobs=knob_values(knobs), params=settings)
+    elif knobs or settings:
+        raise BadInput("--knob and --set go with a task: a run has its own")
+    if out is not None:
+        check_writable(out)
+    from powderdsl.rl.policy_evaluation import evaluate
+    from powderdsl.runs import find_run
+    from powderdsl.runs.folder import write_json
+
+    with user_values():
+        found = evaluate(
+            find_run(run, "ppo") if task is None else task,
+            splits=splits,
+            policies=policies,
+            episodes=episodes,
+            deterministic=deterministic,
+            seed=seed,
+            backend=backend,
+            device=device,
+        )
+    if out is not None:
+        write_json(out, found.as_json())
+    if layout == "json":
+        click.echo(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
+    else:
+        click.echo("\n".join(_text(found)))
+
+
+def _text(found: Evaluation) -> list[str]:
+    after = "" if found.step is None else f", after {found.step:,} interactions"
+    rows = [["split", "policy", "return", "above random", "success", "actions"]]
+    rows += [_row(score) for score in found.scores]
+    return [f"{found.task}{after}", *table(rows)]
+
+
+def _row(score: Score) -> list[str]:
+    success = "" if score.success is None else f"{score.success:.0%}"
+    return [
+        score.split,
+        score.policy,
+        _number(score.mean, score.interval),
+        "" if score.above_random is None else _number(score.above_random, score.above_random_interval),
+        success,
+        f"{score.length:.1f}",
+    ]
+
+
+def _number(mean: float, half: float | None) -> str:
+    return f"{mean:.3f}" + ("" if half is None else f" ± {half:.3f}")

@@ -1,0 +1,28 @@
+"""Training agents on tasks: PPO of Stable-Baselines3's, with runs that outlive a kill, and what comes after.
+
+`train` makes a run; `evaluate` compares its policy with others; `load_policy` gives the policy for use with tensors.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from powderdsl.rl.ppo_config import TrainConfig, preset
+
+if TYPE_CHECKING:
+    from powderdsl.rl.policies import load_policy
+    from powderdsl.rl.policy_evaluation import evaluate
+    from powderdsl.rl.ppo_training import train
+
+__all__ = ["TrainConfig", "evaluate", "load_policy", "preset", "train"]
+
+_HOMES = {"train": "ppo_training", "evaluate": "policy_evaluation", "load_policy": "policies"}
+
+
+def __getattr__(name: str) -> Any:
+    """Public names are imported when first used: settings can be checked without torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'powderdsl.rl' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"powderdsl.rl.{_HOMES[name]}"), name)

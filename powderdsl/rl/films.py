@@ -1,0 +1,161 @@
+"""Films of episodes: worlds side by side, with regions, what the agent does, and the return so far."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, rgb, scale
+from powderdsl.rl.policies import Policy
+from powderdsl.rl.policy_evaluation import Played, play
+from powderdsl.simulator import World
+from powderdsl.tasks.episodes import Episodes, TaskProgram
+from powderdsl.tasks.task import BLOW, Task
+
+LINE = 14
+"""Pixels below each world, for the return."""
+
+HAND = (255, 255, 255)
+INK = (235, 235, 235)
+PAPER = (30, 30, 30)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One moment of all worlds: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None; `actions` int64 [B, 5]
+    or None before the first and where nobody acts; `returns` float64 [B] before them; `over` bool [B]."""
+
+    ids: NDArray[np.uint8]
+    motion: NDArray[np.float32] | None
+    actions: Tensor | None
+    returns: Tensor
+    over: Tensor
+
+
+class Recorder:
+    """Keeps the scenes of `play`."""
+
+    def __init__(self, count: int) -> None:
+        self.regions: dict[str, NDArray[np.bool_]] = {}
+        self.scenes: list[Scene] = []
+        self._pending: list[tuple[Any, Any]] = []
+        self._returns = torch.zeros(count, dtype=torch.float64)
+        self._over = torch.zeros(count, dtype=torch.bool)
+
+    def begun(self, episodes: Episodes) -> None:
+        """The worlds at their start."""
+        self.regions = {name: value.cpu().numpy() for name, value in episodes.regions.items()}
+        self.seen(episodes.world)
+        self.acted(None, self._returns, self._over)
+
+    def seen(self, world: World) -> None:
+        """The worlds after an action, or a step."""
+        vectors = [item.name for item in world.sim.ruleset.fields if item.kind.name == "vec2"]
+        motion = world[vectors[0]].cpu().numpy().copy() if vectors else None
+        self._pending.append((world.ids.cpu().numpy().copy(), motion))
+
+    def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
+        """What was seen since the last call belongs to these actions; the last scene of them shows the new returns."""
+        for number, (ids, motion) in enumerate(self._pending):
+            last = number == len(self._pending) - 1
+            now = (returns, over) if last else (self._returns, self._over)
+            self.scenes.append(Scene(ids, motion, actions, now[0].cpu().clone(), now[1].cpu().clone()))
+        self._pending.clear()
+        self._returns, self._over = returns.clone(), over.clone()
+
+
+def film(
+    program: TaskProgram,
+    policy: Policy | None,
+    worlds: Tensor,
+    *,
+    observation: str = "ids",
+    seed: int = 0,
+    factor: int = 4,
+) -> tuple[Played, Iterator[NDArray[np.uint8]]]:
+    """Play worlds, int64 [n], as `policy_evaluation.play` does; what came of it, and the pictures, uint8 [H', W', 3].
+
+    There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
+    episode is over stand still.
+    """
+    recorder = Recorder(len(worlds))
+    played = play(
+        program,
+        policy,
+        worlds,
+        observation=observation,
+        seed=seed,
+        begun=recorder.begun,
+        seen=recorder.seen,
+        acted=recorder.acted,
+    )
+    return played, _pictures(program.task, recorder, factor)
+
+
+def _pictures(task: Task, recorder: Recorder, factor: int) -> Iterator[NDArray[np.uint8]]:
+    colors, font = palette(task.ruleset.elements), ImageFont.load_default()
+    still: dict[int, NDArray[np.uint8]] = {}
+    columns = min(4, len(recorder.scenes[0].ids))
+    for scene in recorder.scenes:
+        tiles = []
+        for world in range(len(scene.ids)):
+            tile = still.get(world)
+            if tile is None:
+                tile = _tile(task, recorder, scene, world, colors, factor, font)
+                if scene.over[world]:
+                    still[world] = tile
+            tiles.append(tile)
+        yield contact_sheet(tiles, columns=columns)
+
+
+def _tile(
+    task: Task, recorder: Recorder, scene: Scene, world: int, colors: Any, factor: int, font: Any
+) -> NDArray[np.uint8]:
+    """One world, uint8 [H·factor + LINE, W·factor, 3]."""
+    motion = None if scene.motion is None else scene.motion[world]
+    picture = np.array(scale(rgb(scene.ids[world], colors, motion), factor))
+    for number, masks in enumerate(recorder.regions.values()):
+        outline(picture, masks[world % len(masks)], factor, OUTLINES[number % len(OUTLINES)])
+    words = ""
+    if scene.actions is not None:
+        x, y, choice, *blow = scene.actions[world].tolist()
+        words = _words(task, choice, blow)
+        if words:
+            outline(picture, _block(task, y, x), factor, HAND)
+    image = Image.new("RGB", (picture.shape[1], picture.shape[0] + LINE), PAPER)
+    image.paste(Image.fromarray(picture), (0, 0))
+    mark = "  over" if scene.over[world] else f"  {words}"
+    text = f"{float(scene.returns[world]):.2f}{mark}"
+    ImageDraw.Draw(image).text((2, picture.shape[0] + 1), text, fill=INK, font=font)
+    return np.array(image)
+
+
+def _block(task: Task, row: int, column: int) -> NDArray[np.bool_]:
+    """The cells that an action at a bin changes: bool [H, W]."""
+    cells = np.ones(task.size, dtype=bool)
+    agent = task.agent
+    for axis, place in enumerate((row, column)):
+        side, bins, brush = task.size[axis], agent.bins[axis], agent.brush[axis]
+        first = (2 * place + 1) * side // (2 * bins) - brush // 2
+        lines = np.arange(side)
+        within = (lines >= first) & (lines < first + brush)
+        cells &= within[:, None] if axis == 0 else within[None]
+    return cells
+
+
+def _words(task: Task, choice: int, blow: list[int]) -> str:
+    """What an action does, in a word or two; nothing where it does nothing."""
+    number = task.agent.choices[choice]
+    if number >= 0:
+        return next(one.name for one in task.ruleset.elements if one.id == number)
+    if number != BLOW:
+        return ""
+    parts = ("left", "", "right")[blow[0]], ("up", "", "down")[blow[1]]
+    return "blow " + (" ".join(part for part in parts if part) or "still")
