@@ -66,12 +66,10 @@ def fresh_unet(slots: int, width: int, seed: int) -> UNet:
         for layer in network.modules():
             if isinstance(layer, nn.Conv2d):
                 inputs = layer.in_channels * layer.kernel_size[0] * layer.kernel_size[1]
-                gain = (
-                    1 if layer is network.head else 2
-                )  # a ReLU halves the mean square, and none follows the head
+                gain = 1 if layer is network.head else 2  # a ReLU halves the mean square
                 layer.weight.normal_(std=math.sqrt(gain / inputs), generator=source)
             elif isinstance(layer, nn.ConvTranspose2d):
                 layer.weight.normal_(std=math.sqrt(1 / layer.in_channels), generator=source)
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d) and layer.bias is not None:
                 layer.bias.zero_()
-    return network  # type: ignore[no-any-return]
+    return network
