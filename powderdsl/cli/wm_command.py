@@ -204,7 +204,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     "--split", metavar="SPLIT", default="designed", show_default=True, help="Its worlds to test on."
 )
 @click.option("--rules", metavar="RULES", help="Other rules than the run's.")
-@_words("--only", "Draw elements of these packs only.")
+@_words("--only", "Draw elements of these packs only.  [default: the run's]")
 @click.option(
     "--knob", "knobs", multiple=True, metavar="NAME=N", help="Knobs of the task.  [default: the run's]"
 )
@@ -243,7 +243,7 @@ def eval_command(
         task=task,
         split=split,
         rules=rules,
-        only=only,
+        only=only or None,
         knobs=knob_values(knobs) if knobs else None,
         worlds=worlds,
         machine=machine,
@@ -319,6 +319,9 @@ def _machine(values: Mapping[str, Any]) -> Machine:
 
     find_device(values["device"])
     names = ("device", "threads", "backend", "store", "compiled")
+    import torch
+
+    torch.set_num_threads(values["threads"])
     return Machine(**{name: values[name] for name in names if name in values})
 
 

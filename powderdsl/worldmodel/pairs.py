@@ -10,11 +10,14 @@ import torch
 from torch import Tensor
 
 from powderdsl.compiler import load
+from powderdsl.diagnostics import suggest
+from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.worldmodel.watched import Watched, watched
+from powderdsl.worlds.files import failure
 
 TEST_SEEDS = 1 << 32
 """The first seed of worlds that models are tested on. Training takes seeds below it."""
@@ -59,17 +62,28 @@ class DataConfig:
         return DataConfig(**{**values, "only": tuple(values.get("only", ()))})
 
 
+class HasIds(Protocol):
+    """A batch of worlds, as far as pairs need to know it: `World` is one."""
+
+    @property
+    def ids(self) -> Tensor:
+        """Element ids, uint8 [B, H, W]."""
+
+
 class Worlds(Protocol):
     """What gives worlds: `TaskWorlds`, or your own. The same seed gives the same world and the same future."""
+
+    rules: Ruleset
+    """Has all elements that worlds hold."""
 
     @property
     def size(self) -> tuple[int, int]:
         """Rows and columns."""
 
-    def start(self, seeds: Tensor) -> World:
-        """The worlds of seeds, int64 [B]."""
+    def start(self, seeds: Tensor) -> Any:
+        """The worlds of seeds, int64 [B], as something that `HasIds`."""
 
-    def later(self, world: World, steps: int) -> World:
+    def later(self, world: Any, steps: int) -> Any:
         """The worlds some steps later; `world` stays as it was."""
 
 
@@ -85,14 +99,21 @@ class TaskWorlds:
         return self.program.task.size
 
     @property
+    def fingerprint(self) -> str:
+        """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
+        return fingerprint(self.program.task.splits)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The names of the variants: seed s gives variant s mod their number."""
         return self.found.names
 
     def start(self, seeds: Tensor) -> World:
+        """The worlds of seeds, int64 [B]."""
         return self.program.start(seeds).world
 
     def later(self, world: World, steps: int) -> World:
+        """The worlds some steps later."""
         return self.program.simulator.step(world, steps)
 
 
@@ -125,9 +146,6 @@ def task_worlds(
 
 def _check_packs(packs: tuple[str, ...], rules: Ruleset) -> None:
     """Raises CompileError (PD304) for packs that the rules do not have."""
-    from powderdsl.diagnostics import suggest
-    from powderdsl.worlds.files import failure
-
     for pack in packs:
         if pack not in rules.packs:
             helps = suggest(pack, rules.packs, "packs")
@@ -136,7 +154,7 @@ def _check_packs(packs: tuple[str, ...], rules: Ruleset) -> None:
 
 def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[Pairs]:
     """The pairs of some worlds in the order of time: `pairs` times a pair a world."""
-    world = worlds.start(seeds)
+    world: HasIds = worlds.start(seeds)
     for _ in range(pairs):
         start = world.ids
         world = worlds.later(world, steps)

@@ -173,7 +173,7 @@ def evaluate(
     task: str | None = None,
     split: str = "designed",
     rules: str | None = None,
-    only: tuple[str, ...] = (),
+    only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
     worlds: int | None = None,
     machine: Machine = HERE,
@@ -182,7 +182,7 @@ def evaluate(
 
     Args:
         task, rules: those of the training data unless others are given.
-        only: packs whose elements alone are drawn.
+        only, knobs: likewise; knobs are only those of the training data where the task is.
         worlds: worlds of a split, or random futures of each of its stands; 32 and 4 unless said otherwise.
 
     Raises:
@@ -211,7 +211,7 @@ def evaluate(
         found.rules.name,
         task or data.task,
         split,
-        only,
+        data.only if only is None else only,
         many,
         scores,
         missing,
@@ -226,7 +226,7 @@ def unseen_worlds(
     task: str | None = None,
     split: str = "designed",
     rules: str | None = None,
-    only: tuple[str, ...] = (),
+    only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
     machine: Machine = HERE,
 ) -> TaskWorlds:
@@ -241,10 +241,10 @@ def unseen_worlds(
         split=split,
         rules=data.rules if rules is None else rules,
         params=data.params if rules is None else {},
-        only=only,
+        only=data.only if only is None else only,
         knobs=(data.knobs if task is None else {}) if knobs is None else knobs,
     )
-    check_palette(trained.palette, load_rules_of(tested_on))
+    check_palette(trained.run.path, trained.palette, load_rules_of(tested_on))
     return task_worlds(
         tested_on, device=machine.device, threads=machine.threads, backend=machine.backend, partly=True
     )
