@@ -10,7 +10,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "runs", "rl", "web", "experiments", "cli")
+_AFTER = ("bench", "tasks", "envs", "runs", "datasets", "rl", "worldmodel", "studies", "web", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -46,9 +46,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
     "runs": ("diagnostics", "worlds"),
+    "datasets": (*_SCREEN, "tasks", "envs"),
     "rl": (*_SCREEN, "tasks", "envs", "runs"),
+    "worldmodel": (*_SCREEN, "tasks", "runs"),
+    "studies": (*_MODEL, "compiler", "worlds", "runs", "bench"),  # calls commands, in processes of their own
     "web": _SCREEN,
-    "experiments": (*_SCREEN, "tasks", "envs", "web"),
     "cli": (*_EVERYTHING[:-1], "user_cache"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
@@ -64,16 +66,26 @@ class Home:
 
 
 _TEXT = ("syntax", "worlds.scene")
-_TORCH = ("*.torch_*", *_PROGRAMS, *_STEPS, "testing", "tasks.episodes", "envs", "runs", "rl", "experiments")
-_GYMNASIUM = ("envs", "rl", "experiments")
+_TORCH = (
+    "*.torch_*",
+    *_PROGRAMS,
+    *_STEPS,
+    "testing",
+    "tasks.episodes",
+    "envs",
+    "datasets",
+    "runs",
+    "worldmodel",
+    "rl",
+)
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),
     "torch": Home(
         (*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "bench", "web", "cli"), _TORCH
     ),
-    "gymnasium": Home(_GYMNASIUM, _GYMNASIUM),
-    "stable_baselines3": Home(_GYMNASIUM, _GYMNASIUM),
+    "gymnasium": Home(("envs", "rl"), ("envs", "rl")),
+    "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
     "click": Home(("cli",), ("cli",)),
-    "matplotlib": Home(("bench",), ()),
+    "matplotlib": Home(("bench", "studies", "cli"), ()),
 }

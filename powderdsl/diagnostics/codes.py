@@ -98,6 +98,9 @@ _ROWS = (
     ("PD621", "another-run", _ERROR),
     ("PD622", "run-in-use", _ERROR),
     ("PD623", "run-does-not-fit", _ERROR),
+    ("PD624", "training-diverged", _ERROR),
+    ("PD630", "invalid-dataset", _ERROR),
+    ("PD631", "dataset-mismatch", _ERROR),
     ("PD640", "invalid-setting", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),
@@ -107,6 +110,7 @@ _ROWS = (
     ("PD803", "invalid-knob", _ERROR),
     ("PD804", "invalid-agent", _ERROR),
     ("PD805", "constant-reward", _WARNING),
+    ("PD806", "invalid-study", _ERROR),
     # PD9xx: our own mistakes
     ("PD901", "internal-error", _ERROR),
 )

@@ -1,8 +1,7 @@
-"""Policies: functions from observations to actions, on tensors. Random numbers are hashes, so no batch changes them."""
+"""The policies of runs: networks as functions from observations to actions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,12 @@ from gymnasium.spaces import MultiDiscrete
 from stable_baselines3.common.policies import ActorCriticCnnPolicy
 from torch import Tensor
 
-from powderdsl.backends.torch_random import MASK, mix
+from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl.patch_network import small_policy
 from powderdsl.rl.ppo_config import TrainConfig, from_json
 from powderdsl.runs import RunFolder, does_not_fit, find_run
-
-Policy = Callable[[Tensor, Tensor], Tensor]
-"""From observations [B, …] and keys, int64 [B], to actions int64 [B, 5]. Keys are what random numbers hang on."""
 
 
 def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
@@ -30,33 +26,9 @@ def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
     return build(env, features_dim=config.features)
 
 
-def uniforms(keys: Tensor, count: int) -> Tensor:
-    """Numbers in [0, 1) by key: float64 [B, count]."""
-    numbers = torch.arange(count, device=keys.device) * 0x9E3779B1 & MASK
-    low, high = mix(keys & MASK), (keys >> 32) & MASK
-    drawn = mix((mix(low ^ high)[:, None] + numbers) & MASK)
-    return drawn.double() / float(1 << 32)
-
-
-def action_keys(seed: int, episodes: Tensor, step: int) -> Tensor:
-    """The keys of one action in each of some episodes, by their numbers: int64 [B]."""
-    low = mix((mix(torch.full_like(episodes, seed) & MASK) + episodes) & MASK)
-    return mix((low + step) & MASK) << 31 | mix(low ^ mix(torch.full_like(low, step))) >> 1
-
-
-def random_policy(nvec: tuple[int, ...]) -> Policy:
-    """All actions equally likely."""
-
-    def act(observed: Tensor, keys: Tensor) -> Tensor:
-        counts = torch.tensor(nvec, device=keys.device)
-        return (uniforms(keys, len(nvec)) * counts).long()
-
-    return act
-
-
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """The policy of a run: a function as `Policy` says.
+    """The policy of a run: a function as `envs.acting.Policy` says.
 
     `deterministic`: the likeliest action, instead of one drawn.
     """

@@ -11,9 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.envs.acting import Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.rl.policies import Policy, action_keys, config_of, load_policy, random_policy
+from powderdsl.rl.policies import config_of, load_policy
 from powderdsl.rl.ppo_config import TrainConfig
 from powderdsl.runs import RunFolder, find_run
 from powderdsl.simulator import World
@@ -66,8 +67,15 @@ class Evaluation:
     scores: tuple[Score, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
+        """For JSON: scores by split and policy."""
+        splits: dict[str, dict[str, Any]] = {}
+        for score in self.scores:
+            numbers = {
+                name: value for name, value in asdict(score).items() if name not in ("split", "policy")
+            }
+            splits.setdefault(score.split, {})[score.policy] = numbers
+        about = {name: value for name, value in asdict(self).items() if name != "scores"}
+        return {**about, "splits": splits}
 
 
 def play(

@@ -3,8 +3,8 @@
 A page has a wrong example and, mostly, the mended one:
 
 * ``yaml wrong`` and ``yaml right`` are rule files; ``# with: core`` at the top names packs to load with them.
-* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task; all use the
-  rules of the paper.
+* ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task, ``yaml wrong study`` a
+  study; all use the rules of the paper.
 * ``text`` is the message itself, for what no file can show; `SITUATIONS` brings it about.
 
 The text under the caret stands in the example, in a comment ``# ^ text`` below it.
@@ -26,6 +26,7 @@ from PIL import Image
 
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics
+from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
@@ -33,7 +34,9 @@ from powderdsl.ledgers.book import ledger
 from powderdsl.properties.refute import refuted
 from powderdsl.rl import preset
 from powderdsl.runs import does_not_fit, find_run, open_run
+from powderdsl.studies.study_file import load_study
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
+from powderdsl.worldmodel.training import diverged
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.files import replacing
 from powderdsl.worlds.image import read_image
@@ -100,6 +103,11 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
             return ()
         if "task" in one.info.split():
             return load_task_with_diagnostics(path)[1]
+        if "study" in one.info.split():
+            load_study(
+                "page.yaml", {("train",): frozenset({"run", "seed", "steps"}), ("evaluate",): frozenset()}
+            )
+            return ()
         if "world" in one.info.split():
             read_ascii(one.text, paper_rules().elements, name="page.txt")
             return ()
@@ -239,6 +247,13 @@ def write_into_no_folder() -> None:
         pass
 
 
+def record_with_another_seed() -> None:
+    from powderdsl.datasets import record
+
+    for seed in (0, 1):
+        record("herd-gas", "nothing", "recorded", episodes=1, seed=seed, max_episode_steps=1, backend="dense")
+
+
 def open_a_run_of_another_seed() -> None:
     open_run("runs/dunes", "ppo", {"seed": 1})
     open_run("runs/dunes", "ppo", {"seed": 2})
@@ -254,6 +269,10 @@ def use_a_run_that_does_not_fit() -> None:
     raise does_not_fit(Path("runs/dunes"), "id 3 is `core.wall` there, nothing here")
 
 
+def learn_too_fast() -> None:
+    raise diverged(Path("runs/dunes"), 40, 0.5)
+
+
 SITUATIONS: dict[str, Callable[[], object]] = {
     "PD101": lambda: powderdsl.load("rules/snd.yaml"),
     "PD102": read_a_large_file,
@@ -267,6 +286,9 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD621": open_a_run_of_another_seed,
     "PD622": train_in_one_folder_twice,
     "PD623": use_a_run_that_does_not_fit,
+    "PD624": learn_too_fast,
+    "PD630": lambda: read_manifest(Path("recorded")),
+    "PD631": record_with_another_seed,
     "PD640": lambda: preset("paper", "sand-pushing", batch=1),
     "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),

@@ -1,0 +1,151 @@
+"""`powderdsl study`: many runs over a grid of settings, with one table and one figure at the end."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+
+import click
+
+from powderdsl.cli.commands import COMMANDS
+from powderdsl.cli.exits import FAILED, OK, BadInput, counted
+from powderdsl.cli.options import WholeType
+from powderdsl.studies.study import SIZES, Point, Study
+from powderdsl.studies.study_file import load_study, shipped_studies
+from powderdsl.studies.study_run import Outcome, StudyRun
+
+CALLED: tuple[tuple[str, ...], ...] = (
+    ("train",),
+    ("evaluate",),
+    ("wm", "train"),
+    ("wm", "finetune"),
+    ("wm", "eval"),
+)
+"""Commands that steps of a study may call: those that write runs and evaluate them."""
+
+
+def commands() -> Mapping[tuple[str, ...], frozenset[str]]:
+    """These commands, and their options without dashes."""
+    found: dict[tuple[str, ...], frozenset[str]] = {}
+    for words in CALLED:
+        command: click.Command = import_module(f"powderdsl.cli.{COMMANDS[words[0]][0]}").command
+        for word in words[1:]:
+            assert isinstance(command, click.Group)
+            command = command.commands[word]
+        options = [option for one in command.params if isinstance(one, click.Option) for option in one.opts]
+        found[words] = frozenset(option[2:] for option in options if option.startswith("--"))
+    return found
+
+
+@click.command("study")
+@click.argument("study", metavar="STUDY", required=False)
+@click.option(
+    "--size", type=click.Choice(SIZES), default="small", show_default=True, help="Which values it takes."
+)
+@click.option(
+    "--seeds", type=WholeType(1, 1000), help="How many runs of each combination, instead of the study's."
+)
+@click.option("--jobs", type=WholeType(1, 256), default=2, show_default=True, help="Processes at a time.")
+@click.option(
+    "--threads", type=WholeType(1, 256), default=1, show_default=True, help="Threads of each process."
+)
+@click.option(
+    "--only", multiple=True, metavar="NAME=VALUE", help="Only combinations with this value. May be repeated."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="FOLDER", help="studies/STUDY-SIZE by default."
+)
+@click.option("--dry-run", is_flag=True, help="Print the commands, and run none.")
+def command(
+    study: str | None,
+    size: str,
+    seeds: int | None,
+    jobs: int,
+    threads: int,
+    only: tuple[str, ...],
+    out: Path | None,
+    dry_run: bool,
+) -> int:
+    """Run a study: a file that names commands and the settings to vary, or a shipped one.
+
+    Writes results.md, results.json and figure.png to its folder. The same call goes on where it stopped, and adds to
+    what is there. Without STUDY, lists those that come with powderdsl.
+    """
+    known = commands()
+    if study is None:
+        for name in shipped_studies():
+            click.echo(f"{name:24} {load_study(name, known).about}")
+        return OK
+    found = load_study(study, known)
+    points = [point for point in found.points(size, seeds) if _chosen(found, point, only)]
+    if not points:
+        raise BadInput(f"no combination has {' and '.join(only)}")
+    folder = out or Path("studies") / f"{found.name}-{size}"
+    run = StudyRun(found, folder, size, threads)
+    if dry_run:
+        for point in points:
+            for step in found.steps:
+                click.echo(" ".join(["powderdsl", *run.command(step, point, folder / "runs" / point.name)]))
+        return OK
+    run.prepare()
+    try:
+        outcomes = _with_progress(run, points, jobs)
+    except KeyboardInterrupt:
+        click.echo("stopped; the same command goes on from here", err=True)
+        raise
+    _report(found, size, folder, outcomes)
+    return FAILED if any(one.problem for one in outcomes) else OK
+
+
+def _chosen(study: Study, point: Point, only: tuple[str, ...]) -> bool:
+    """Whether a combination has the values that were asked for."""
+    values = dict(point.values)
+    for text in only:
+        name, equals, value = text.partition("=")
+        if not equals or name not in values:
+            raise BadInput(f"`--only {text}`: write NAME=VALUE, with one of {', '.join(values)} as NAME")
+        if values[name] != value:
+            return False
+    return True
+
+
+def _with_progress(run: StudyRun, points: list[Point], jobs: int) -> list[Outcome]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(run.study.name, total=len(points))
+
+        def told(one: Outcome) -> None:
+            progress.advance(bar)
+            text = ", ".join(f"{name} {value:.4g}" for name, value in one.values.items())
+            console.print(f"{one.point.name}: {one.problem or text}", markup=False)
+
+        return run.run(points, jobs, told)
+
+
+def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> None:
+    from powderdsl.runs.folder import write_json
+    from powderdsl.studies.figure import write_figure
+    from powderdsl.studies.results import as_data, as_markdown
+    from powderdsl.worlds.files import replacing
+
+    text = as_markdown(study, size, outcomes)
+    write_json(folder / "results.json", as_data(study, size, outcomes))
+    with replacing(folder / "results.md") as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    sys.stdout.write(text)
+    try:
+        import matplotlib  # noqa: F401  only whether it is there
+    except ImportError:
+        click.echo("no figure: pip install 'powderdsl[plot]'", err=True)
+    else:
+        write_figure(folder / "figure.png", study, size, outcomes)
+        click.echo(str(folder / "figure.png"))
+    lost = sum(one.problem is not None for one in outcomes)
+    if lost:
+        click.echo(f"{counted(lost, 'combination')} did not finish; the same command tries again", err=True)

@@ -1,0 +1,150 @@
+"""What a study found: means over seeds with intervals, a table, and whether it went as expected."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from powderdsl.studies.study import Measure, Study
+from powderdsl.studies.study_run import Outcome
+
+T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
+"""97.5 % quantiles of Student's t for 1 to 10 degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A measure at one combination: its mean over seeds, half the width of the 95 % interval (Student's t), and all
+    values. The half width is not finite for a single value."""
+
+    values: tuple[tuple[str, str], ...]
+    mean: float
+    half_width: float
+    samples: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A measure over all combinations. `trend` compares the last with the first, seed by seed, where all seeds have
+    both: mean difference and half width."""
+
+    measure: Measure
+    cells: tuple[Cell, ...]
+    trend: tuple[float, float] | None
+    ordered: bool
+
+    @property
+    def verdict(self) -> str:
+        """Whether it went as expected, in words."""
+        if self.measure.expect is None or self.trend is None:
+            return ""
+        sign = 1 if self.measure.expect == "rises" else -1
+        difference, width = self.trend
+        ends = f"last − first: {difference:+.4g} ± {width:.2g}"
+        if sign * difference <= 0:
+            return f"does not {self.measure.expect[:-1]} ({ends})"
+        sure = "" if sign * difference > width else ", within the noise of these seeds"
+        every = "at every point" if self.ordered else "not at every point"
+        return f"{self.measure.expect} {every}{sure} ({ends})"
+
+
+def interval(samples: Sequence[float]) -> tuple[float, float]:
+    """Mean, and half the width of its 95 % interval by Student's t; infinite for one sample."""
+    mean = statistics.fmean(samples)
+    if len(samples) < 2:
+        return mean, math.inf
+    quantile = T_975[min(len(samples) - 1, len(T_975)) - 1]  # a little wide for more than 11
+    return mean, quantile * statistics.stdev(samples) / math.sqrt(len(samples))
+
+
+def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
+    """What finished points say. Combinations stand in the order in which values were written."""
+    good = [one for one in outcomes if one.problem is None]
+    return [_finding(measure, good) for measure in study.measures]
+
+
+def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
+    groups: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
+    for one in outcomes:
+        groups.setdefault(one.point.values, {})[one.point.seed] = one.values[measure.name]
+    cells = []
+    for values, by_seed in groups.items():
+        samples = tuple(value for _, value in sorted(by_seed.items()))
+        cells.append(Cell(values, *interval(samples), samples))
+    trend, ordered = None, False
+    if len(cells) > 1 and measure.expect is not None:
+        first, *_, last = groups.values()
+        both = sorted(first.keys() & last.keys())
+        if both:
+            trend = interval([last[seed] - first[seed] for seed in both])
+        sign = 1 if measure.expect == "rises" else -1
+        means = [sign * cell.mean for cell in cells]
+        ordered = all(one < two for one, two in itertools.pairwise(means))
+    return Finding(measure, tuple(cells), trend, ordered)
+
+
+def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """All of it, for JSON."""
+    return {
+        "study": study.name,
+        "size": size,
+        "points": [
+            {
+                "values": dict(one.point.values),
+                "seed": one.point.seed,
+                "measures": dict(one.values),
+                "problem": one.problem,
+            }
+            for one in outcomes
+        ],
+        "findings": [
+            {
+                "measure": one.measure.name,
+                "verdict": one.verdict,
+                "cells": [
+                    {**asdict(cell), "values": dict(cell.values), "half_width": _finite(cell.half_width)}
+                    for cell in one.cells
+                ],
+            }
+            for one in findings(study, outcomes)
+        ],
+    }
+
+
+def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
+    """A table of means and intervals, and what was expected."""
+    found = findings(study, outcomes)
+    names = [axis.name for axis in study.axes]
+    head = [*names, *(one.measure.about for one in found), "seeds"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    counts: dict[tuple[tuple[str, str], ...], int] = {}
+    for one in found:
+        for cell in one.cells:
+            rows.setdefault(cell.values, []).append(shown(cell.mean, cell.half_width))
+            counts[cell.values] = len(cell.samples)
+    for values, numbers in rows.items():
+        words = [*(value for _, value in values), *numbers, str(counts[values])]
+        lines.append("| " + " | ".join(words) + " |")
+    verdicts = [f"- {one.measure.about}: {one.verdict}" for one in found if one.verdict]
+    failed = [f"- {one.point.name}: {one.problem}" for one in outcomes if one.problem]
+    text = [f"{study.about} Size: {size}.", "", *lines]
+    text += ["", *verdicts] if verdicts else []
+    text += ["", "Not finished:", "", *failed] if failed else []
+    return "\n".join(text) + "\n"
+
+
+def shown(mean: float, half_width: float) -> str:
+    """`0.1234 ± 0.0056`: as many places as the interval deserves."""
+    if not math.isfinite(half_width):
+        return f"{mean:.4g}"
+    places = 4 if half_width <= 0 else min(max(1 - math.floor(math.log10(half_width)), 0), 6)
+    return f"{mean:.{places}f} ± {half_width:.{places}f}"
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

@@ -1,0 +1,85 @@
+"""What a study is, once checked."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from string import Template
+
+SIZES = ("small", "paper")
+EXPECTED = ("rises", "falls")
+SEED, SIZE = "seed", "size"
+
+
+@dataclass(frozen=True)
+class Step:
+    """A call of a command: what it works on, and its options as text, in which ``$NAME`` stands for a value.
+
+    `on` is the argument of the command: a step before it, whose run is meant, or text.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    on: str | None
+    on_step: bool
+    options: tuple[tuple[str, tuple[str, ...]], ...]
+    makes_run: bool
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A setting that is varied, and its values for each of `SIZES`."""
+
+    name: str
+    about: str
+    values: Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number out of the ``evaluation.json`` of a step's run: the keys that lead to it, with ``$NAME`` as above."""
+
+    name: str
+    step: str
+    keys: tuple[str, ...]
+    about: str
+    expect: str | None
+
+
+@dataclass(frozen=True)
+class Point:
+    """One combination of values, and a seed."""
+
+    values: tuple[tuple[str, str], ...]
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Names its folder."""
+        return ",".join([*(f"{name}={value}" for name, value in self.values), f"seed={self.seed}"])
+
+
+@dataclass(frozen=True)
+class Study:
+    """A checked study. `text` is the file it was read from."""
+
+    name: str
+    about: str
+    seeds: int
+    axes: tuple[Axis, ...]
+    steps: tuple[Step, ...]
+    measures: tuple[Measure, ...]
+    text: str
+
+    def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
+        """All combinations, each with every seed; the seeds outside, so that early ends leave whole sets."""
+        names = [axis.name for axis in self.axes]
+        for seed in range(self.seeds if seeds is None else seeds):
+            for values in itertools.product(*(axis.values[size] for axis in self.axes)):
+                yield Point(tuple(zip(names, values, strict=True)), seed)
+
+
+def filled(text: str, point: Point, size: str) -> str:
+    """A text with the values of a point in it."""
+    return Template(text).safe_substitute({**dict(point.values), SEED: str(point.seed), SIZE: size})

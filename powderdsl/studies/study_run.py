@@ -1,0 +1,181 @@
+"""Running a study: each point is a chain of commands in processes of their own. What is done is not done again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from powderdsl.runs.folder import read_json, write_json
+from powderdsl.studies.study import Measure, Point, Step, Study, filled
+from powderdsl.worlds.files import failure
+
+EVALUATION = "evaluation.json"
+LOG_LINES = 6
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A point that is finished: its measures by name, or why there are none."""
+
+    point: Point
+    values: Mapping[str, float]
+    problem: str | None = None
+
+
+class Cancelled(Exception):
+    """Somebody asked to stop."""
+
+
+class StudyRun:
+    """A study that is being run in a folder.
+
+    Args:
+        size: one of `SIZES`. threads: of each process.
+    """
+
+    def __init__(self, study: Study, folder: Path, size: str, threads: int = 1):
+        self.study, self.folder, self.size, self.threads = study, folder, size, threads
+        self._stopped = threading.Event()
+        self._running: set[subprocess.Popen[bytes]] = set()
+
+    def prepare(self) -> None:
+        """Make the folder, or come back to it.
+
+        Raises:
+            CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
+        """
+        about = {"study": self.study.name, "size": self.size, "text": self.study.text}
+        kept = self.folder / "study.json"
+        if kept.exists():
+            found = read_json(kept)
+            if found != about:
+                what = "another study, or this one as it was before its file changed"
+                helps = ("choose another folder with `--out`",)
+                raise failure("PD621", f"{self.folder} holds {what}", helps=helps)
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            others = sorted(name for name in os.listdir(self.folder) if not name.startswith("."))
+        except OSError as error:
+            raise failure("PD613", f"cannot write {self.folder}", notes=(str(error.strerror),)) from None
+        if others:
+            raise failure("PD621", f"{self.folder} holds other files", notes=(f"such as {others[0]}",))
+        write_json(kept, about)
+
+    def run(
+        self, points: Sequence[Point], jobs: int, told: Callable[[Outcome], None] | None = None
+    ) -> list[Outcome]:
+        """Bring points to their end, `jobs` at a time. Ctrl-C ends all processes; the same call goes on later."""
+        with ThreadPoolExecutor(jobs) as pool:
+            waiting: set[Future[Outcome]] = {pool.submit(self._point, point) for point in points}
+            done: list[Outcome] = []
+            try:
+                while waiting:
+                    ended, waiting = wait(waiting, timeout=0.5, return_when=FIRST_COMPLETED)
+                    for one in ended:
+                        done.append(one.result())
+                        if told is not None:
+                            told(done[-1])
+            except BaseException:
+                self._stopped.set()
+                for process in list(self._running):
+                    with suppress(OSError):
+                        process.send_signal(signal.SIGINT)  # they save where they are
+                for one in waiting:
+                    one.cancel()
+                raise
+        order = {point: number for number, point in enumerate(points)}
+        return sorted(done, key=lambda outcome: order[outcome.point])
+
+    def _point(self, point: Point) -> Outcome:
+        kept = self.folder / "done" / f"{point.name}.json"
+        values = read_json(kept)
+        if isinstance(values, dict) and values.keys() == {one.name for one in self.study.measures}:
+            return Outcome(point, values)
+        place = self.folder / "runs" / point.name
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            kept.parent.mkdir(exist_ok=True)
+            for step in self.study.steps:
+                problem = self._step(step, point, place)
+                if problem is not None:
+                    return Outcome(point, {}, problem)
+            values = {
+                one.name: value_of(one, place / one.step, point, self.size) for one in self.study.measures
+            }
+        except (OSError, Cancelled, ValueError) as error:
+            return Outcome(point, {}, str(error) or "stopped")
+        write_json(kept, values)
+        return Outcome(point, values)
+
+    def command(self, step: Step, point: Point, place: Path) -> list[str]:
+        """The words of a step's command for a point whose runs lie in `place`."""
+        words = list(step.command)
+        if step.on is not None:
+            words.append(
+                str(place / self._maker(step.on)) if step.on_step else filled(step.on, point, self.size)
+            )
+        for name, values in step.options:
+            for value in values:
+                words += [f"--{name}", filled(value, point, self.size)]
+        return [*words, "--run", str(place / step.name)] if step.makes_run else words
+
+    def _maker(self, name: str) -> str:
+        """The step whose run a step means: itself, or what it works on, if it makes no run."""
+        steps = {step.name: step for step in self.study.steps}
+        step = steps[name]
+        while not step.makes_run and step.on is not None and step.on_step:
+            step = steps[step.on]
+        return step.name
+
+    def _step(self, step: Step, point: Point, place: Path) -> str | None:
+        """Run a step; what went wrong, if something did."""
+        if self._stopped.is_set():
+            raise Cancelled("stopped")
+        log = place / f"{step.name}.log"
+        threads = str(self.threads)
+        environment = {**os.environ, "OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
+        words = [sys.executable, "-m", "powderdsl", *self.command(step, point, place)]
+        with log.open("ab") as file:
+            process = subprocess.Popen(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                env=environment,
+                start_new_session=True,  # Ctrl-C reaches us alone: we pass it on once
+            )
+            self._running.add(process)
+            try:
+                status = process.wait()
+            finally:
+                self._running.discard(process)
+        if status == 0:
+            return None
+        last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
+        return "\n".join([f"{step.name} ended with {status}; {log} ends with:", *last])
+
+
+def value_of(measure: Measure, run: Path, point: Point, size: str) -> float:
+    """A measure out of a run's evaluation. Raises ValueError where it is not there."""
+    found: Any = read_json(run / EVALUATION)
+    for key in measure.keys:
+        word = filled(key, point, size)
+        if not isinstance(found, dict) or word not in found:
+            there = ", ".join(sorted(map(str, found))[:12]) if isinstance(found, dict) else "nothing"
+            raise ValueError(
+                f"{run / EVALUATION} has no `{word}` for the measure `{measure.name}`: it has {there}"
+            )
+        found = found[word]
+    if isinstance(found, bool) or not isinstance(found, (int, float)):
+        raise ValueError(f"the measure `{measure.name}` is no number in {run / EVALUATION}")
+    return float(found)

@@ -1,0 +1,168 @@
+"""Pairs of a world and itself some steps later, simulated by the compiled rules."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from powderdsl.compiler import load
+from powderdsl.diagnostics import suggest
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.simulator import World
+from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.worldmodel.watched import Watched, watched
+from powderdsl.worlds.files import failure
+
+TEST_SEEDS = 1 << 32
+"""The first seed of worlds that models are tested on. Training takes seeds below it."""
+
+Pairs = tuple[Tensor, Tensor]
+"""Start and end, element ids uint8 [B, H, W] each."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which pairs a network learns from. Plain values: ``dataclasses.asdict`` gives what a run's file keeps.
+
+    The worlds are those of seeds 0 to `states` − 1. Each is run for `steps`·`pairs` steps and gives `pairs` pairs: the
+    paper's 16 of 8 steps. `only` names packs: worlds draw no other pack's elements. The replay buffer holds `capacity`
+    pairs, of which each iteration replaces `refresh`; if all pairs of all worlds fit in, it holds these and stays so.
+    """
+
+    task: str = "world-model"
+    split: str = "train"
+    rules: str = ""
+    """As everywhere: a shipped ruleset, packs joined by ``+``, left out behind ``-``. Empty: the task's own."""
+    only: tuple[str, ...] = ()
+    knobs: Mapping[str, int] = field(default_factory=dict)
+    params: Mapping[str, float | str] = field(default_factory=dict)
+    states: int = 1_000_000
+    steps: int = 8
+    pairs: int = 16
+    capacity: int = 1024 * 256
+    refresh: int = 256
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for numbers that cannot be."""
+        for name in ("states", "steps", "pairs", "capacity", "refresh"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be 1 or more, found {getattr(self, name)}")
+        if self.states > TEST_SEEDS:
+            raise ValueError(f"states must be at most {TEST_SEEDS:,}: tests begin there")
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> DataConfig:
+        """From what JSON gave back. Raises TypeError, ValueError."""
+        return DataConfig(**{**values, "only": tuple(values.get("only", ()))})
+
+
+class HasIds(Protocol):
+    """A batch of worlds, as far as pairs need to know it: `World` is one."""
+
+    @property
+    def ids(self) -> Tensor:
+        """Element ids, uint8 [B, H, W]."""
+
+
+class Worlds(Protocol):
+    """What gives worlds: `TaskWorlds`, or your own. The same seed gives the same world and the same future."""
+
+    rules: Ruleset
+    """Has all elements that worlds hold."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns."""
+
+    def start(self, seeds: Tensor) -> Any:
+        """The worlds of seeds, int64 [B], as something that `HasIds`."""
+
+    def later(self, world: Any, steps: int) -> Any:
+        """The worlds some steps later; `world` stays as it was."""
+
+
+class TaskWorlds:
+    """The worlds of a task's split under some rules. Made by `task_worlds`."""
+
+    def __init__(self, program: TaskProgram, found: Watched):
+        self.program, self.found = program, found
+        self.rules: Ruleset = program.simulator.ruleset
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.program.task.size
+
+    @property
+    def fingerprint(self) -> str:
+        """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
+        return fingerprint(self.program.task.splits)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the variants: seed s gives variant s mod their number."""
+        return self.found.names
+
+    def start(self, seeds: Tensor) -> World:
+        """The worlds of seeds, int64 [B]."""
+        return self.program.start(seeds).world
+
+    def later(self, world: World, steps: int) -> World:
+        """The worlds some steps later."""
+        return self.program.simulator.step(world, steps)
+
+
+def task_worlds(
+    config: DataConfig,
+    *,
+    device: str = "cpu",
+    threads: int = 1,
+    backend: str = "auto",
+    partly: bool = False,
+) -> TaskWorlds:
+    """The worlds that a configuration speaks of, ready to run.
+
+    Args:
+        partly: leave out worlds that the rules cannot have; `TaskWorlds.found.missing` says which.
+
+    Raises:
+        CompileError: with all that is wrong in the task, the rules, the knobs or the parameters; PD604 where worlds need
+            elements that the rules do not have; PD701 for a backend or device that is not there.
+    """
+    own = not config.rules
+    task = load_task(config.task, knobs=config.knobs, params=config.params if own else None)
+    check_split(task, config.split)
+    rules = task.ruleset if own else load(config.rules, params=config.params)
+    _check_packs(config.only, rules)
+    found = watched(task, config.split, rules, config.only, partly=partly)
+    program = compile_task(found.task, split=config.split, backend=backend, device=device, threads=threads)
+    return TaskWorlds(program, found)
+
+
+def _check_packs(packs: tuple[str, ...], rules: Ruleset) -> None:
+    """Raises CompileError (PD304) for packs that the rules do not have."""
+    for pack in packs:
+        if pack not in rules.packs:
+            helps = suggest(pack, rules.packs, "packs")
+            raise failure("PD304", f"the rules {rules.name} have no pack `{pack}`", helps=tuple(helps))
+
+
+def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[Pairs]:
+    """The pairs of some worlds in the order of time: `pairs` times a pair a world."""
+    world: HasIds = worlds.start(seeds)
+    for _ in range(pairs):
+        start = world.ids
+        world = worlds.later(world, steps)
+        yield start, world.ids
+
+
+def unseen_seeds(count: int, variants: int = 1) -> Tensor:
+    """Seeds that no training takes, int64 [count·variants]: `count` of each variant, all of a variant together."""
+    first = -(-TEST_SEEDS // variants) * variants
+    grid = torch.arange(count)[None, :] * variants + torch.arange(variants)[:, None]
+    return (first + grid).flatten()

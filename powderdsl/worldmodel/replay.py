@@ -1,0 +1,150 @@
+"""The replay buffer: pairs as uint8, the oldest replaced as training goes on.
+
+What it holds in an iteration, and which pairs a batch has, are functions of the configuration, the run's seed and the
+iteration. So a checkpoint needs no copy of it: `Replay.go_to` makes it again, cell by cell the same.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from powderdsl.backends.torch_random import MASK, base_keys, mix
+from powderdsl.worldmodel.pairs import DataConfig, HasIds, Pairs, Worlds, pairs_of
+
+TOGETHER = 1 << 20
+"""Cells of the worlds that are run together when the buffer is filled."""
+
+STORES = ("auto", "memory", "disk")
+
+_BATCH, _FIRST = 0x57A7, 0x0FF5
+"""Which hashes: those that choose a batch, and the one that chooses the first world."""
+
+
+class Replay:
+    """`starts` and `ends` are uint8 [size, H, W]; ``iteration`` is the one that they are ready for.
+
+    Args:
+        seed: the run's. It decides which world comes first, and which pairs a batch has.
+        store: ``memory`` (of `device`), ``disk``, or ``auto``: disk where the buffer would take more than half of memory.
+        folder: where files are kept that `close` removes; only needed on disk.
+    """
+
+    def __init__(
+        self,
+        worlds: Worlds,
+        config: DataConfig,
+        *,
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+        store: str = "auto",
+        folder: Path | None = None,
+    ):
+        if store not in STORES:
+            raise ValueError(f"store must be one of {', '.join(STORES)}, found {store!r}")
+        self.worlds, self.config, self.device = worlds, config, torch.device(device)
+        self.all_fit = config.states * config.pairs <= config.capacity
+        self.size = config.states * config.pairs if self.all_fit else config.capacity
+        keys = base_keys(torch.tensor([seed, seed]), torch.tensor([_BATCH, _FIRST]))
+        self._key = int(mix(keys[0] ^ keys[1])[0])
+        first = int((keys[0, 1] << 32 | keys[1, 1]) & (2**63 - 1))
+        self._first = 0 if self.all_fit else first % config.states
+        self._files: list[Path] = []
+        if store == "auto":
+            store = "disk" if self._bytes() > memory_of(self.device) // 2 and folder else "memory"
+        self.starts, self.ends = (self._room(store, name, folder) for name in ("starts", "ends"))
+        self.iteration = -1
+        self._live: HasIds | None = None
+
+    def go_to(self, iteration: int) -> None:
+        """Make the buffer as it is before an iteration, counted from 0, whatever it was."""
+        config = self.config
+        back = -(-self.size // config.refresh)  # what older iterations brought has been overwritten
+        begin = max(0, iteration - back) // config.pairs * config.pairs
+        if self.all_fit or begin == 0:
+            self._fill()
+        self.iteration, self._live = begin, None
+        while self.iteration < iteration:
+            self.advance()
+
+    def advance(self) -> None:
+        """On to the next iteration: `refresh` worlds go on by some steps, and their pairs replace the oldest."""
+        if self.iteration < 0:
+            raise ValueError("the buffer is empty: `go_to` fills it")
+        if not self.all_fit:
+            config, many = self.config, self.config.refresh
+            turn, moment = divmod(self.iteration, config.pairs)
+            if moment == 0 or self._live is None:
+                filled = -(-self.size // config.pairs)
+                self._live = self.worlds.start(self._seeds(filled + turn * many, many))
+            start = self._live.ids
+            self._live = self.worlds.later(self._live, config.steps)
+            place = self.size + self.iteration * many + torch.arange(many)
+            self._write(place % self.size, (start, self._live.ids))
+        self.iteration += 1
+
+    def batch(self, iteration: int, count: int) -> Pairs:
+        """The pairs of an iteration's batch, drawn uniformly: uint8 [count, H, W] each, on the buffer's device."""
+        key = mix(torch.tensor((self._key + iteration * 0x9E3779B1) & MASK))
+        drawn = mix((mix((key + torch.arange(count) * 0x85EBCA6B) & MASK) + (iteration >> 16)) & MASK)
+        chosen = ((drawn * self.size) >> 32).to(self.starts.device)
+        return self.starts[chosen].to(self.device), self.ends[chosen].to(self.device)
+
+    def close(self) -> None:
+        """Remove what lies on disk."""
+        del self.starts, self.ends
+        for path in self._files:
+            path.unlink(missing_ok=True)
+
+    def _fill(self) -> None:
+        """The first pairs: world by world, in the order of time."""
+        pairs = self.config.pairs
+        height, width = self.worlds.size
+        together = max(1, TOGETHER // (height * width))
+        many = -(-self.size // pairs)
+        for first in range(0, many, together):
+            count = min(together, many - first)
+            found = pairs_of(self.worlds, self._seeds(first, count), self.config.steps, pairs)
+            for moment, pair in enumerate(found):
+                place = (first + torch.arange(count)) * pairs + moment
+                inside = place < self.size
+                self._write(place[inside], (pair[0][inside], pair[1][inside]))
+
+    def _seeds(self, first: int, count: int) -> Tensor:
+        """The seeds of worlds by their number in the run: every state comes as often as every other."""
+        return (self._first + first + torch.arange(count)) % self.config.states
+
+    def _write(self, place: Tensor, pair: Pairs) -> None:
+        place = place.to(self.starts.device)
+        for room, ids in zip((self.starts, self.ends), pair, strict=True):
+            # Where one iteration brings more than there is room for, the newest stay.
+            kept = slice(max(0, len(place) - self.size), None)
+            room[place[kept]] = ids[kept].to(room.device)
+
+    def _bytes(self) -> int:
+        height, width = self.worlds.size
+        return 2 * self.size * height * width
+
+    def _room(self, store: str, name: str, folder: Path | None) -> Tensor:
+        shape = (self.size, *self.worlds.size)
+        if store == "memory":
+            return torch.zeros(shape, dtype=torch.uint8, device=self.device)
+        if folder is None:
+            raise ValueError("a buffer on disk needs a folder")
+        path = folder / f"replay-{name}.bin"
+        self._files.append(path)
+        return torch.from_numpy(np.memmap(path, dtype=np.uint8, mode="w+", shape=shape))
+
+
+def memory_of(device: torch.device) -> int:
+    """Bytes that a device has."""
+    if device.type == "cuda":
+        return int(torch.cuda.get_device_properties(device).total_memory)
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):
+        return 8 << 30

@@ -1,0 +1,291 @@
+"""How well worlds are predicted: networks and baselines by the same measure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from powderdsl.worldmodel.pairs import (
+    Pairs,
+    TaskWorlds,
+    pairs_of,
+    task_worlds,
+    unseen_seeds,
+)
+from powderdsl.worldmodel.training import HERE, Machine, Network, Trained, check_palette, load_rules_of
+
+TOGETHER = 1 << 17
+"""Cells that a network sees at once."""
+
+FIT_WORLDS = 64
+"""Training worlds that baselines are fitted on; all of them where there are fewer."""
+
+MODEL, STILL, FREQUENT = "model", "nothing changes", "most frequent outcome"
+
+
+@dataclass(frozen=True)
+class Score:
+    """Sums over cells. `confusion`, int64 [slots, slots], counts cells by what they became and what was predicted."""
+
+    loss_sum: float
+    confusion: Tensor
+    changed: int
+    changed_right: int
+
+    @property
+    def cells(self) -> int:
+        return int(self.confusion.sum())
+
+    @property
+    def loss(self) -> float:
+        """Cross-entropy a cell, in nats."""
+        return self.loss_sum / max(self.cells, 1)
+
+    @property
+    def accuracy(self) -> float:
+        return int(self.confusion.diagonal().sum()) / max(self.cells, 1)
+
+    @property
+    def changed_accuracy(self) -> float | None:
+        """Of cells that hold another element at the end than at the start; None if there are none."""
+        return self.changed_right / self.changed if self.changed else None
+
+    def __add__(self, other: Score) -> Score:
+        return Score(
+            self.loss_sum + other.loss_sum,
+            self.confusion + other.confusion,
+            self.changed + other.changed,
+            self.changed_right + other.changed_right,
+        )
+
+
+def score(predict: Network, pairs: Iterable[Pairs], slots: int) -> Score:
+    """What a network, or any callable from ids to logits [B, slots, H, W], makes of some pairs."""
+    total = Score(0.0, torch.zeros(slots, slots, dtype=torch.int64), 0, 0)
+    for starts, ends in pairs:
+        few = max(1, TOGETHER // (starts.shape[1] * starts.shape[2]))
+        for begin in range(0, len(starts), few):
+            total = total + _score(predict, starts[begin : begin + few], ends[begin : begin + few], slots)
+    return total
+
+
+@torch.no_grad()
+def _score(predict: Network, starts: Tensor, ends: Tensor, slots: int) -> Score:
+    logits = predict(starts).float()
+    truth = ends.long()
+    loss = F.cross_entropy(logits, truth, reduction="none").double().sum()
+    predicted = logits.argmax(1)
+    confusion = torch.bincount((truth * slots + predicted).flatten(), minlength=slots * slots)
+    changed = starts != ends
+    right = (predicted == truth) & changed
+    return Score(float(loss), confusion.view(slots, slots).cpu(), int(changed.sum()), int(right.sum()))
+
+
+class Table:
+    """A baseline: log-probabilities of what a cell becomes, by what it holds. A callable as networks are.
+
+    `chances` is float [slots, slots]: a row for each start element, which sums to 1.
+    """
+
+    def __init__(self, chances: Tensor):
+        self.chances = chances
+
+    def __call__(self, ids: Tensor) -> Tensor:
+        return self.chances.log().float().to(ids.device)[ids.long()].permute(0, 3, 1, 2)
+
+
+def outcomes(pairs: Iterable[Pairs], slots: int) -> Tensor:
+    """How many cells went from each element to each: int64 [slots, slots]."""
+    counts = torch.zeros(slots, slots, dtype=torch.int64)
+    for starts, ends in pairs:
+        both = (starts.long() * slots + ends.long()).flatten()
+        counts += torch.bincount(both, minlength=slots * slots).view(slots, slots).cpu()
+    return counts
+
+
+def still(counts: Tensor, elements: int) -> Table:
+    """ "Nothing changes": a cell stays with one chance, and becomes each of the other elements with an equal share.
+
+    The chance is the one with the lowest cross-entropy on the counted pairs: the share of cells that stayed, with one
+    cell that stayed and one that did not counted besides.
+    """
+    slots, cells = len(counts), int(counts.sum())
+    stays = (int(counts.diagonal().sum()) + 1) / (cells + 2)
+    chances = torch.full((slots, slots), (1 - stays) / max(elements - 1, 1), dtype=torch.float64)
+    return Table(chances.fill_diagonal_(stays))
+
+
+def frequent(counts: Tensor, elements: int) -> Table:
+    """ "Most frequent outcome": for each start element the counted shares of what it became.
+
+    One cell is counted besides for each element that it may become, so that no chance is 0.
+    """
+    seen = counts.double() + 1
+    return Table(seen / (counts.sum(1, keepdim=True) + elements))
+
+
+@dataclass(frozen=True)
+class Tested:
+    """What was tested on: names of worlds, each with its score by predictor; `missing` says which could not be."""
+
+    rules: str
+    task: str
+    split: str
+    only: tuple[str, ...]
+    worlds: int
+    scores: Mapping[str, Mapping[str, Score]]
+    missing: Mapping[str, tuple[str, ...]]
+    palette: list[str | None]
+    step: int
+
+    def mean(self, predictor: str) -> float:
+        """The mean of the worlds' losses, each counted once."""
+        return sum(one[predictor].loss for one in self.scores.values()) / len(self.scores)
+
+    def plain(self) -> dict[str, Any]:
+        """For JSON."""
+        names = [MODEL, STILL, FREQUENT]
+        whole = {name: _sum([one[name] for one in self.scores.values()]) for name in names}
+        return {
+            "rules": self.rules,
+            "task": self.task,
+            "split": self.split,
+            "only": list(self.only),
+            "worlds_each": self.worlds,
+            "iterations": self.step,
+            "mean": {name: {**_numbers(whole[name]), "loss": self.mean(name)} for name in names},
+            "tests": {
+                test: {name: _numbers(one[name]) for name in names} for test, one in self.scores.items()
+            },
+            "elements": elements_of(whole[MODEL], self.palette),
+            "left_out": {name: list(lacking) for name, lacking in self.missing.items()},
+        }
+
+
+def evaluate(
+    trained: Trained,
+    *,
+    task: str | None = None,
+    split: str = "designed",
+    rules: str | None = None,
+    only: tuple[str, ...] | None = None,
+    knobs: Mapping[str, int] | None = None,
+    worlds: int | None = None,
+    machine: Machine = HERE,
+) -> Tested:
+    """Test a network beside both baselines, on worlds that no training takes.
+
+    Args:
+        task, rules: those of the training data unless others are given.
+        only, knobs: likewise; knobs are only those of the training data where the task is.
+        worlds: worlds of a split, or random futures of each of its stands; 32 and 4 unless said otherwise.
+
+    Raises:
+        CompileError: as `task_worlds`; PD623 if the rules have elements that the network has no slots for.
+    """
+    fit = _counted(trained, machine)
+    found = unseen_worlds(
+        trained, task=task, split=split, rules=rules, only=only, knobs=knobs, machine=machine
+    )
+    data = trained.config.data
+    slots, names = len(trained.palette), found.names
+    elements = len(found.rules.elements)
+    predictors: dict[str, Network] = {
+        MODEL: trained.network,
+        STILL: still(fit, elements),
+        FREQUENT: frequent(fit, elements),
+    }
+    many = worlds or (4 if len(names) > 1 else 32)
+    scores = {}
+    for number, name in enumerate(names):
+        seeds = unseen_seeds(many, len(names)).view(len(names), many)[number]
+        pairs = list(pairs_of(found, seeds.to(machine.device), data.steps, data.pairs))
+        scores[name] = {who: score(predict, pairs, slots) for who, predict in predictors.items()}
+    missing = {name: lacking for name, lacking, _ in found.found.missing}
+    return Tested(
+        found.rules.name,
+        task or data.task,
+        split,
+        data.only if only is None else only,
+        many,
+        scores,
+        missing,
+        trained.palette,
+        trained.checkpoint.step,
+    )
+
+
+def unseen_worlds(
+    trained: Trained,
+    *,
+    task: str | None = None,
+    split: str = "designed",
+    rules: str | None = None,
+    only: tuple[str, ...] | None = None,
+    knobs: Mapping[str, int] | None = None,
+    machine: Machine = HERE,
+) -> TaskWorlds:
+    """The worlds that `evaluate` tests on, which says what the arguments are and what is raised.
+
+    Worlds that the rules cannot have are left out, as long as others remain.
+    """
+    data = trained.config.data
+    tested_on = replace(
+        data,
+        task=task or data.task,
+        split=split,
+        rules=data.rules if rules is None else rules,
+        params=data.params if rules is None else {},
+        only=data.only if only is None else only,
+        knobs=(data.knobs if task is None else {}) if knobs is None else knobs,
+    )
+    check_palette(trained.run.path, trained.palette, load_rules_of(tested_on))
+    return task_worlds(
+        tested_on, device=machine.device, threads=machine.threads, backend=machine.backend, partly=True
+    )
+
+
+def _counted(trained: Trained, machine: Machine) -> Tensor:
+    """Outcomes of some of the run's training worlds."""
+    data = trained.config.data
+    found = task_worlds(data, device=machine.device, threads=machine.threads, backend=machine.backend)
+    seeds = torch.arange(min(FIT_WORLDS, data.states), device=machine.device)
+    return outcomes(pairs_of(found, seeds, data.steps, data.pairs), len(trained.palette))
+
+
+def elements_of(found: Score, palette: list[str | None]) -> dict[str, dict[str, float | int | None]]:
+    """By element: cells that ended as it, the share of these that was predicted (recall), and the share of cells
+    predicted as it that were (precision). None where there are no such cells."""
+    table: dict[str, dict[str, float | int | None]] = {}
+    for slot, name in enumerate(palette):
+        cells, predicted = int(found.confusion[slot].sum()), int(found.confusion[:, slot].sum())
+        right = int(found.confusion[slot, slot])
+        if name is not None and (cells or predicted):
+            table[name] = {
+                "cells": cells,
+                "recall": right / cells if cells else None,
+                "precision": right / predicted if predicted else None,
+            }
+    return table
+
+
+def _numbers(one: Score) -> dict[str, float | int | None]:
+    return {
+        "loss": one.loss,
+        "accuracy": one.accuracy,
+        "changed_accuracy": one.changed_accuracy,
+        "cells": one.cells,
+        "changed": one.changed,
+    }
+
+
+def _sum(scores: list[Score]) -> Score:
+    total = scores[0]
+    for one in scores[1:]:
+        total = total + one
+    return total

@@ -1,0 +1,376 @@
+"""Training: batches out of the buffer, Adam, and a run folder that any kill leaves in order."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from powderdsl.compiler import load
+from powderdsl.diagnostics import CompileError
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run
+from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
+from powderdsl.worldmodel.replay import Replay
+from powderdsl.worldmodel.unet import UNet, fresh_unet
+from powderdsl.worlds.files import failure
+
+KIND = "worldmodel"
+
+LOG_EVERY = 10
+"""Iterations whose mean loss makes a line of the metrics."""
+
+MAX_WIDTH = 1024
+"""Features of the first block."""
+
+Network = Callable[[Tensor], Tensor]
+"""Ids uint8 [B, H, W] -> logits [B, slots, H, W]."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """All that decides which weights come out (on one kind of device). The defaults are the paper's.
+
+    `parent` is the name of the checkpoint that a fine-tuned network starts from; without it weights are random.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    width: int = 32
+    iterations: int = 5000
+    batch: int = 256
+    learning_rate: float = 0.005
+    seed: int = 0
+    parent: str | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for numbers that cannot be."""
+        for name, most in (("width", MAX_WIDTH), ("iterations", 1 << 40), ("batch", 1 << 20)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must lie in 1..{most}, found {getattr(self, name)}")
+        if not 0 < self.learning_rate < float("inf"):
+            raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"seed must be 0 or more, found {self.seed}")
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> TrainConfig:
+        """From what JSON gave back; what belongs to the run besides is left out. Raises TypeError, ValueError."""
+        own = {one.name: values[one.name] for one in fields(TrainConfig)}
+        return TrainConfig(**{**own, "data": DataConfig.of(own["data"])})
+
+
+PAPER = TrainConfig()
+"""5,000 iterations of 256 pairs, width 32, a buffer of 1024·256: for a GPU."""
+
+SMALL = TrainConfig(
+    data=DataConfig(capacity=4096, refresh=8), width=16, iterations=1200, batch=8, learning_rate=0.002
+)
+"""The same network, narrower, on fewer pairs: minutes on one CPU core."""
+
+PRESETS = {"paper": PAPER, "small": SMALL}
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where a run is computed. It takes no part in what a run is: one may go on elsewhere.
+
+    `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`.
+    """
+
+    device: str = "cpu"
+    threads: int = 1
+    backend: str = "auto"
+    store: str = "auto"
+    compiled: bool = False
+
+
+HERE = Machine()
+"""One thread of this CPU."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What training says of itself, after each iteration: how many are done, and the last loss that was logged."""
+
+    done: int
+    of: int
+    loss: float | None
+    simulated: float = 0.0
+    """The share of time that making worlds takes, since the last line of metrics."""
+
+
+def train(
+    config: TrainConfig,
+    folder: str | Path,
+    *,
+    machine: Machine = HERE,
+    worlds: Worlds | None = None,
+    identity: Mapping[str, Any] | None = None,
+    network: nn.Module | None = None,
+    parent: Checkpoint | None = None,
+    note: Mapping[str, Any] | None = None,
+    tell: Callable[[Moment], None] | None = None,
+    save_seconds: float = 60,
+) -> RunFolder:
+    """Train a network until `config.iterations`, or go on with the run that is in the folder.
+
+    On one device and one thread the weights are the same however often a run is killed and goes on.
+
+    Args:
+        worlds: your own, instead of those of the task that `config.data` names, whose rules and split then say nothing.
+        identity: what else decides which weights come out, such as what your own worlds hang on: kept in ``run.json``,
+            and compared when a run goes on.
+        network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W]; the paper's U-net otherwise.
+        parent: weights to start from, of the run that `finetuned` was given.
+        note: more for ``run.json``, such as where the parent lies.
+        save_seconds: how often a checkpoint is written, besides the last one.
+
+    Raises:
+        CompileError: from `task_worlds` and `open_run`; PD622 if another process trains there; PD623 if weights do not
+            fit the network; PD624 if the loss is no longer finite.
+        ValueError: your own network gives logits of another shape.
+        KeyboardInterrupt: Ctrl-C, after a last checkpoint.
+    """
+    if worlds is None:
+        found = task_worlds(
+            config.data, device=machine.device, threads=machine.threads, backend=machine.backend
+        )
+        worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
+    palette = palette_of(config.data, worlds.rules)
+    plain = {
+        **asdict(config),
+        "palette": palette,
+        "rules_fingerprint": fingerprint(worlds.rules),
+        **(identity or {}),
+    }
+    run = open_run(folder, KIND, plain, note={"machine": asdict(machine), **(note or {})})
+    with run.locked():
+        model = network or fresh_unet(len(palette), config.width, config.seed)
+        model.to(machine.device)
+        optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
+        done, recent = _restore(run, model, optimizer, parent, machine.device)
+        if done < config.iterations:
+            replay = Replay(
+                worlds,
+                config.data,
+                seed=config.seed,
+                device=machine.device,
+                store=machine.store,
+                folder=run.path,
+            )
+            try:
+                replay.go_to(done)
+                trainer = _Trainer(config, machine, run, model, optimizer, replay, len(palette), done, recent)
+                trainer.go(tell or (lambda progress: None), save_seconds)
+            finally:
+                replay.close()
+    return run
+
+
+def _restore(
+    run: RunFolder,
+    model: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    parent: Checkpoint | None,
+    device: str,
+) -> tuple[int, list[float]]:
+    """Iterations that are done, and the losses since the last line of metrics."""
+    found = run.latest_checkpoint(device)
+    if found is None:
+        if parent is not None:
+            fit_weights(model, parent)
+        return 0, []
+    fit_weights(model, found)
+    optimizer.load_state_dict(found.state["optimizer"])
+    return found.step, list(found.state["recent"])
+
+
+class _Trainer:
+    """One call of `train`, from `done` iterations on."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        machine: Machine,
+        run: RunFolder,
+        model: nn.Module,
+        optimizer: torch.optim.Optimizer,
+        replay: Replay,
+        slots: int,
+        done: int,
+        recent: list[float],
+    ):
+        self.config, self.machine, self.run = config, machine, run
+        self.model, self.optimizer, self.replay, self.slots = model, optimizer, replay, slots
+        self.done, self.recent = done, recent
+        self.forward: Network = torch.compile(model) if machine.compiled else model
+        self.cuda = torch.device(machine.device).type == "cuda"
+
+    def go(self, tell: Callable[[Moment], None], save_seconds: float) -> None:
+        """To the end. Raises KeyboardInterrupt once a checkpoint is written."""
+        total, loss, simulated = self.config.iterations, None, 0.0
+        saved = since = time.monotonic()
+        making = 0.0
+        self.model.train()
+        with self.run.metrics(self.done) as metrics, _interruptible() as interrupted:
+            while self.done < total and not interrupted.is_set():
+                starts, ends = self.replay.batch(self.done, self.config.batch)
+                self.recent.append(self.step(starts, ends))
+                began = time.monotonic()
+                self.replay.advance()
+                making += time.monotonic() - began
+                self.done += 1
+                if self.done % LOG_EVERY == 0 or self.done == total:
+                    loss = sum(self.recent) / len(self.recent)
+                    self.recent = []
+                    if not loss < float("inf"):
+                        raise diverged(self.run.path, self.done, self.config.learning_rate)
+                    took = time.monotonic() - since
+                    simulated = making / took
+                    speed = {"time/pairs_a_second": LOG_EVERY * self.config.batch / took}
+                    metrics.write(self.done, {"loss/train": loss, **speed, "time/simulation": simulated})
+                    since, making = time.monotonic(), 0.0
+                tell(Moment(self.done, total, loss, simulated))
+                if time.monotonic() - saved > save_seconds:
+                    self.save()
+                    saved = time.monotonic()
+            self.save()
+            if interrupted.is_set():
+                raise KeyboardInterrupt
+
+    def step(self, starts: Tensor, ends: Tensor) -> float:
+        """One step of Adam; the loss before it: cross-entropy a cell, in nats."""
+        with torch.autocast("cuda", torch.bfloat16, enabled=self.cuda):
+            logits = self.forward(starts)
+        if logits.shape != (len(starts), self.slots, *starts.shape[1:]):
+            expected = [len(starts), self.slots, *starts.shape[1:]]
+            raise ValueError(f"the network must give logits {expected}, found {list(logits.shape)}")
+        loss = F.cross_entropy(logits.float(), ends.long())
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        return loss.item()
+
+    def save(self) -> None:
+        state = {
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "recent": list(self.recent),
+        }
+        self.run.save_checkpoint(self.done, state)
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """Set by the first Ctrl-C, so that an iteration is never left half done; the second one ends the process at once."""
+    pressed = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed  # signals reach the main thread alone
+        return
+
+    def press(number: int, frame: Any) -> None:
+        pressed.set()
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def load_rules_of(config: DataConfig) -> Ruleset:
+    """The rules that a configuration speaks of. Raises CompileError."""
+    if config.rules:
+        return load(config.rules, params=config.params)
+    return load_task(config.task, knobs=config.knobs, params=config.params).ruleset
+
+
+def palette_of(config: DataConfig, rules: Ruleset) -> list[str | None]:
+    """The qualified name of the element of each slot: those of the rules, and of the task's own rules.
+
+    So slots stay where they are when packs are left out, and those of packs that come later are there already.
+    """
+    task = load_task(config.task, knobs=config.knobs)
+    palette: list[str | None] = [None] * max(task.ruleset.slots, rules.slots)
+    for element in (*task.ruleset.elements, *rules.elements):
+        palette[element.id] = element.qualified
+    return palette
+
+
+def check_palette(folder: Path, palette: Sequence[str | None], rules: Ruleset) -> None:
+    """Whether a run's network has slots for the elements of some rules.
+
+    Raises:
+        CompileError: PD623, with every element that has no slot, or whose slot is another's.
+    """
+    why = []
+    for element in rules.elements:
+        if element.id >= len(palette):
+            why.append(f"id {element.id} is `{element.qualified}` here; there are {len(palette)} slots there")
+        elif palette[element.id] not in (None, element.qualified):
+            why.append(f"id {element.id} is `{palette[element.id]}` there, `{element.qualified}` here")
+    if why:
+        raise does_not_fit(folder, *why)
+
+
+def fit_weights(model: nn.Module, checkpoint: Checkpoint) -> None:
+    """Give a network the weights of a checkpoint. Raises CompileError (PD623) if they are those of another network."""
+    state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
+    try:
+        model.load_state_dict(state if isinstance(state, dict) else {})
+    except (RuntimeError, TypeError, AttributeError) as error:
+        words = [line.strip()[:200] for line in str(error).splitlines()[:4]]
+        raise does_not_fit(checkpoint.path, "its weights are those of another network", *words) from None
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A network out of a run: what it was trained on, and its slots."""
+
+    run: RunFolder
+    config: TrainConfig
+    palette: list[str | None]
+    network: nn.Module
+    checkpoint: Checkpoint
+
+
+def load_trained(
+    path: str | Path | RunFolder, *, device: str = "cpu", network: nn.Module | None = None
+) -> Trained:
+    """The network of a run, with its newest weights, ready to predict.
+
+    Raises:
+        CompileError: PD620 if there is no run, or no checkpoint that can be read; PD623 if the weights do not fit.
+    """
+    run = path if isinstance(path, RunFolder) else find_run(path, KIND)
+    try:
+        config = TrainConfig.of(run.config)
+        palette = [None if one is None else str(one) for one in run.config["palette"]]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise failure("PD620", f"{run.path} is no run that can be used here", notes=(str(error),)) from None
+    checkpoint = run.checkpoint(device)
+    model = network or UNet(len(palette), config.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    fit_weights(model, checkpoint)
+    return Trained(run, config, palette, model.to(device).eval(), checkpoint)
+
+
+def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:
+    """What to raise where the loss is no longer finite (PD624)."""
+    return failure(
+        "PD624",
+        f"the loss is no longer finite after {done:,} iterations",
+        notes=(f"in {folder}",),
+        helps=(f"choose a smaller learning rate than {learning_rate:g}",),
+    )

@@ -1,0 +1,142 @@
+"""A task as worlds to watch: under other rules, with fewer elements to draw, and nobody who acts."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+from powderdsl.diagnostics import CompileError, Reporter, Span
+from powderdsl.model.types import Ruleset
+from powderdsl.tasks.task import NO_CHANGE, Drawing, Generator, Goal, Group, Split, Stamp, Task
+
+NOTHING = 255
+"""In stamps: leave the cell as it is."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """`task` has one split, ``split``, of those worlds that the rules can have; `missing` says what the others lack.
+
+    `missing` has an entry for each other world: its name, the names of elements that the rules do not have, and a place.
+    """
+
+    task: Task
+    missing: tuple[tuple[str, tuple[str, ...], Span | None], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the split's variants."""
+        return tuple(variant.name for variant in self.task.splits[0].variants)
+
+
+def watched(
+    task: Task, split: str, rules: Ruleset, only: Collection[str] = (), *, partly: bool = False
+) -> Watched:
+    """The worlds of a split under other rules.
+
+    Elements are found by qualified name. A statement that draws one of several draws among those that the rules have,
+    and of these among the elements of the packs `only`, if any are given. An element that is named alone must be there.
+
+    Args:
+        partly: leave out variants that the rules cannot have, as long as one remains.
+
+    Raises:
+        CompileError: PD604 if worlds need elements that the rules do not have.
+    """
+    given = task.split(split)
+    kept, missing = [], []
+    for variant in given.variants:
+        narrowing = _Narrowing(task.ruleset, rules, frozenset(only))
+        found = narrowing.generator(variant)
+        if narrowing.missing:
+            missing.append((variant.name, tuple(dict.fromkeys(narrowing.missing)), narrowing.span))
+        else:
+            kept.append(found)
+    if missing and not (partly and kept):
+        raise _lacking(task, rules, missing, only)
+    agent = replace(task.agent, choices=(NO_CHANGE,), speed_field=None)
+    nothing = Goal(None, None, None, None)
+    one = Split(given.name, given.about, tuple(kept))
+    return Watched(replace(task, ruleset=rules, agent=agent, goal=nothing, splits=(one,)), tuple(missing))
+
+
+class _Narrowing:
+    """Generators with the ids of other rules. What is missing there is collected."""
+
+    def __init__(self, own: Ruleset, rules: Ruleset, only: frozenset[str]):
+        self.ids = {
+            element.id: other.id
+            for element in own.elements
+            if (other := rules.element(element.qualified)) is not None
+        }
+        self.names = {element.id: element.name for element in own.elements}
+        self.drawn = {
+            element.id
+            for element in own.elements
+            if element.id in self.ids and (not only or element.pack in only)
+        }
+        self.missing: list[str] = []
+        self.span: Span | None = None
+
+    def generator(self, given: Generator) -> Generator:
+        return replace(
+            given,
+            fill=self.id(given.fill, None),
+            groups=tuple(self.group(group) for group in given.groups),
+            stamps=tuple(self.stamp(one) for one in given.stamps if one.name in _stamps_of(given)),
+            targets=(),
+        )
+
+    def group(self, group: Group) -> Group:
+        return replace(group, drawings=tuple(self.drawing(one) for one in group.drawings))
+
+    def drawing(self, drawing: Drawing) -> Drawing:
+        if len(drawing.ids) > 1:
+            ids = tuple(self.ids[one] for one in drawing.ids if one in self.drawn)
+            if not ids:
+                self.lack(drawing.ids, drawing.span)
+        else:
+            ids = tuple(self.id(one, drawing.span) for one in drawing.ids)
+        over = drawing.over
+        if over is not None:
+            over = frozenset(self.ids[one] for one in over if one in self.ids)
+        return replace(drawing, ids=ids, over=over)
+
+    def stamp(self, stamp: Stamp) -> Stamp:
+        rows = tuple(
+            tuple(one if one == NOTHING else self.id(one, None) for one in row) for row in stamp.rows
+        )
+        return replace(stamp, rows=rows)
+
+    def id(self, one: int, span: Span | None) -> int:
+        if one not in self.ids:
+            self.lack((one,), span)
+        return self.ids.get(one, 0)
+
+    def lack(self, ids: Sequence[int], span: Span | None) -> None:
+        self.missing += [self.names[one] for one in ids]
+        self.span = self.span or span
+
+
+def _stamps_of(given: Generator) -> set[str | None]:
+    return {drawing.stamp for group in given.groups for drawing in group.drawings}
+
+
+def _lacking(
+    task: Task,
+    rules: Ruleset,
+    missing: Sequence[tuple[str, tuple[str, ...], Span | None]],
+    only: Collection[str],
+) -> CompileError:
+    reporter = Reporter()
+    under = f"{rules.name} with {', '.join(sorted(only))} alone" if only else rules.name
+    for name, elements, span in missing:
+        reporter.error(
+            "PD604",
+            f"the worlds `{name}` of {task.name} need elements that are not in {under}",
+            span,
+            "none of these can be drawn" if span else "",
+            notes=[f"they need {', '.join(elements)}"],
+            helps=["add the packs that have them, or choose other worlds with `--split` or `--task`"],
+        )
+    return CompileError(reporter.diagnostics)

@@ -1,0 +1,233 @@
+"""Studies: files are checked, grids are complete, what is done is not done again, and intervals are right."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from powderdsl.cli.study_command import commands
+from powderdsl.diagnostics import CompileError, Reporter, Source
+from powderdsl.studies.figure import write_figure
+from powderdsl.studies.results import as_data, as_markdown, findings, interval, shown
+from powderdsl.studies.study import Point, Study
+from powderdsl.studies.study_file import load_study, read_study, shipped_studies
+from powderdsl.studies.study_run import Outcome, StudyRun
+
+KNOWN: Mapping[tuple[str, ...], frozenset[str]] = {
+    ("train",): frozenset({"run", "seed", "steps", "knob"}),
+    ("evaluate",): frozenset({"episodes"}),
+}
+
+TEXT = """
+study: patience
+about: Longer training, more reward.
+seeds: 3
+vary:
+  steps: {about: interactions, small: [100, 200], paper: [1000, 2000, 4000]}
+  squares: [0, 5]
+steps:
+  trained: {command: train, on: sand-pushing, steps: $steps, knob: [lines=2, squares=$squares], seed: $seed}
+  tested: {command: evaluate, on: trained, episodes: 4}
+measures:
+  reward: {of: trained, value: test/trained/mean, about: mean reward, expect: rises}
+"""
+
+
+def read(text: str) -> Study:
+    return read_study(Source("study.yaml", text), Reporter(), KNOWN)
+
+
+def outcomes(study: Study, values: Mapping[tuple[str, ...], Sequence[float]]) -> list[Outcome]:
+    return [
+        Outcome(point, {"reward": values[tuple(value for _, value in point.values)][point.seed]})
+        for point in study.points("small")
+    ]
+
+
+def test_a_grid_is_complete_and_each_size_has_its_own() -> None:
+    study = read(TEXT)
+    points = list(study.points("small"))
+    assert len(points) == len(set(points)) == 2 * 2 * 3
+    assert points[0] == Point((("steps", "100"), ("squares", "0")), 0)
+    assert [point.seed for point in points] == [0] * 4 + [1] * 4 + [2] * 4
+    assert len(list(study.points("paper", seeds=1))) == 3 * 2
+
+
+def test_a_step_becomes_a_command(tmp_path: Path) -> None:
+    study = read(TEXT)
+    run = StudyRun(study, tmp_path, "small")
+    point = next(study.points("small"))
+    place = tmp_path / "runs" / "x"
+    trained, tested = (run.command(step, point, place) for step in study.steps)
+    words = [
+        "train",
+        "sand-pushing",
+        "--steps",
+        "100",
+        "--knob",
+        "lines=2",
+        "--knob",
+        "squares=0",
+        "--seed",
+        "0",
+        "--run",
+    ]
+    assert trained == [*words, str(place / "trained")]
+    assert tested == ["evaluate", str(place / "trained"), "--episodes", "4"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code", "caret"),
+    [
+        ("study: patience", "study: ../patience", "PD111", "../patience"),
+        ("seeds: 3", "seeds: 0", "PD402", "0"),
+        ("seeds: 3", "sedes: 3", "PD108", "sedes"),
+        ("command: train,", "command: rm,", "PD806", "rm"),
+        ("command: train,", "", "PD109", "trained"),
+        ("steps: $steps", "stepps: $steps", "PD806", "stepps"),
+        ("steps: $steps", "run: elsewhere", "PD806", "run"),
+        ("$squares", "$circles", "PD806", "squares=$circles"),
+        ("on: trained,", "on: --run,", "PD806", "--run"),
+        ("[0, 5]", "[]", "PD109", "squares"),
+        ("[0, 5]", "[0, ../5]", "PD110", "../5"),
+        ("[0, 5]", "{small: [0]}", "PD109", "{"),
+        ("squares: [0, 5]", "seed: [0, 5]", "PD111", "seed"),
+        ("of: trained", "of: tested", "PD806", "tested"),
+        ("expect: rises", "expect: grows", "PD110", "grows"),
+        ("paper: [1000, 2000, 4000]", f"paper: [{', '.join(map(str, range(2000)))}]", "PD806", "patience"),
+    ],
+)
+def test_a_mistake_is_told_with_its_place(old: str, new: str, code: str, caret: str) -> None:
+    assert old in TEXT
+    with pytest.raises(CompileError) as error:
+        read(TEXT.replace(old, new, 1))
+    found = [(one.code, one.primary.span.text if one.primary.span else "") for one in error.value.diagnostics]
+    assert (code, caret) in found
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    with pytest.raises(CompileError) as error:
+        read(TEXT.replace("$steps", "$setps").replace("command: evaluate", "command: judge"))
+    assert len(error.value.diagnostics) == 2
+
+
+def test_an_unknown_study_is_told() -> None:
+    with pytest.raises(CompileError) as error:
+        load_study("start-stats", KNOWN)
+    assert error.value.diagnostics[0].helps == ("did you mean `start-states`?",)
+
+
+@pytest.mark.parametrize("name", shipped_studies())
+def test_shipped_studies_are_right(name: str) -> None:
+    study = load_study(name, commands())
+    assert study.name == name
+    assert study.about
+    assert study.measures
+    for size in ("small", "paper"):
+        assert len(list(study.points(size))) >= 2
+
+
+def test_an_interval_is_that_of_student() -> None:
+    mean, width = interval([1.0, 2.0, 3.0, 4.0])
+    assert mean == 2.5
+    assert width == pytest.approx(3.182 * math.sqrt(5 / 3) / 2, rel=1e-6)
+    assert interval([7.0]) == (7.0, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("mean", "width", "text"),
+    [
+        (0.12345, 0.0067, "0.1235 ± 0.0067"),
+        (12.3, 3.4, "12.3 ± 3.4"),
+        (1.0, math.inf, "1"),
+        (250.0, 31.0, "250 ± 31"),
+    ],
+)
+def test_numbers_have_the_places_they_deserve(mean: float, width: float, text: str) -> None:
+    assert shown(mean, width) == text
+
+
+def test_what_was_found_is_said_as_it_is() -> None:
+    study = read(TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", ""))
+    (rose,) = findings(study, outcomes(study, {("100",): (1.0, 1.1, 0.9), ("200",): (2.0, 2.1, 2.0)}))
+    assert rose.verdict.startswith("rises at every point (last − first: +1.03")
+    (noise,) = findings(study, outcomes(study, {("100",): (1.0, 3.0, 0.9), ("200",): (2.0, 2.1, 2.0)}))
+    assert "within the noise" in noise.verdict
+    (fell,) = findings(study, outcomes(study, {("100",): (2.0, 2.0, 2.0), ("200",): (1.0, 1.0, 1.0)}))
+    assert fell.verdict.startswith("does not rise")
+
+
+def test_a_table_names_what_did_not_finish(tmp_path: Path) -> None:
+    study = read(TEXT)
+    found = outcomes(study, {(s, q): (1.0, 2.0, 3.0) for s in ("100", "200") for q in ("0", "5")})
+    found[-1] = Outcome(found[-1].point, {}, "trained ended with 2")
+    text = as_markdown(study, "small", found)
+    assert "| 100 | 0 | 2.0 ± 2.5 | 3 |" in text
+    assert "| 200 | 5 |" in text
+    assert "steps=200,squares=5,seed=2: trained ended with 2" in text
+    assert json.loads(json.dumps(as_data(study, "small", found)))["findings"][0]["cells"][0]["mean"] == 2.0
+    write_figure(tmp_path / "figure.png", study, "small", found)
+    assert (tmp_path / "figure.png").stat().st_size > 1000
+
+
+TINY = """
+task: dig
+rules: core+sand
+size: [8, 8]
+fill: sand
+agent: {may: [empty], brush: 2, bins: 4, actions: 3}
+reward: {final: count(empty)}
+splits: {test: {generate: [frame wall]}}
+"""
+
+
+def test_a_study_runs_goes_on_and_refuses_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("dig.yaml").write_text(TINY, encoding="utf-8")
+    text = """
+study: tiny
+about: Nothing much.
+seeds: 1
+vary: {steps: [12, 24]}
+steps:
+  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: dense, steps: $steps, seed: $seed}
+  tested: {command: evaluate, on: trained, episodes: 4}
+measures:
+  reward: {of: trained, value: splits/test/trained/mean, expect: rises}
+"""
+    study = read_study(Source("study.yaml", text), Reporter(), commands())
+    points = list(study.points("small"))
+    run = StudyRun(study, tmp_path / "out", "small")
+    run.prepare()
+    found = run.run(points, jobs=2)
+    assert [one.problem for one in found] == [None, None]
+    assert all(1.0 <= one.values["reward"] <= 12.0 for one in found)
+    logs = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.log")}
+    assert len(logs) == 4
+    again = StudyRun(study, tmp_path / "out", "small")
+    again.prepare()
+    assert again.run(points, jobs=1) == found
+    assert {path: path.stat().st_mtime_ns for path in logs} == logs
+    other = StudyRun(
+        read_study(Source("study.yaml", text + "\n# changed\n"), Reporter(), commands()),
+        tmp_path / "out",
+        "small",
+    )
+    with pytest.raises(CompileError) as error:
+        other.prepare()
+    assert error.value.diagnostics[0].code == "PD621"
+
+
+def test_a_step_that_fails_is_told_with_its_last_words(tmp_path: Path) -> None:
+    text = TEXT.replace("on: sand-pushing", "on: no-such-task")
+    study = read(text)
+    run = StudyRun(study, tmp_path / "out", "small")
+    run.prepare()
+    (outcome,) = run.run(list(study.points("small"))[:1], jobs=1)
+    assert outcome.problem is not None
+    assert "trained ended with 2" in outcome.problem
+    assert "PD801" in outcome.problem
