@@ -45,7 +45,10 @@ def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert [line.split()[1] for line in table.splitlines()[-3:]] == ["trained", "random", "nothing"]
     other = run("evaluate", "task.yaml", "--episodes", "4", "--format", "json", "--out", "found.json")
     assert json.loads(Path("found.json").read_text()) == json.loads(other.output)
-    assert len(json.loads(other.output)["scores"]) == 4
+    splits = json.loads(other.output)["splits"]
+    assert {name: list(scores) for name, scores in splits.items()} == {
+        name: ["random", "nothing"] for name in ("train", "test")
+    }
 
 
 def test_all_mistakes_are_said_at_once() -> None:

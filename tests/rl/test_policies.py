@@ -12,11 +12,11 @@ from PIL import Image
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.draw import OUTLINES
+from powderdsl.envs.acting import action_keys, random_policy, uniforms
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.films import HAND, film
-from powderdsl.rl.policies import action_keys, random_policy, uniforms
 from powderdsl.rl.policy_evaluation import play
 from powderdsl.runs import RunFolder
 from powderdsl.tasks.episodes import TaskProgram, compile_task
