@@ -168,9 +168,9 @@ def test_an_agent_learns(tmp_path: Path) -> None:
     assert (trained.policy, at_random.policy, nothing.policy) == ("trained", "random", "nothing")
     assert trained.mean > 1.8  # of 2
     assert at_random.mean < 1.2
-    assert trained.above_random is not None
-    assert trained.above_random_interval is not None
-    assert trained.above_random - trained.above_random_interval > 0.5
+    mean, half = trained.above["random"]
+    assert half is not None
+    assert mean - half > 0.5
     assert nothing.mean == 0
 
 
