@@ -8,8 +8,12 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from powderdsl.datasets import Dataset, record
+from powderdsl.envs import TensorEnv
+from powderdsl.envs.acting import action_keys
+from powderdsl.rl.policies import load_policy
 from powderdsl.tasks.episodes import compile_task
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.envs.conftest import SMALL
@@ -151,3 +155,23 @@ def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> 
     names = sorted(path.name for path in out.glob("*shard*"))
     assert len(names) == 200
     assert [(out / name).read_bytes() for name in names] == [(other / name).read_bytes() for name in names]
+
+
+def test_a_trained_agent_is_recorded(task: Path, tmp_path: Path) -> None:
+    """It acts as it does elsewhere: on what it was trained to see, by the keys of the episode."""
+    run, out = tmp_path / "dunes", tmp_path / "data"
+    few = ("--preset", "small", "--observation", "compact", "--envs", 2, "--rollout", 4, "--batch", 8)
+    trained = powderdsl("train", task, "--run", run, *few, "--steps", 8, "--epochs", 1, "--backend", "planes")
+    assert trained.exit_code == 0, trained.stderr
+    command = ("record", task, "--out", out, "--episodes", 3, "--backend", "planes", "--policy", run)
+    assert powderdsl(*command).exit_code == 0
+    data = Dataset.open(out)
+    assert data.recipe.policy.startswith("dunes, checkpoint 000000000008-")
+    env = TensorEnv(str(task), 1, observation="compact", backend="planes", autoreset_mode="disabled")
+    policy = load_policy(run, env)
+    for number in range(3):
+        observed, _ = env.reset(seed=number)
+        for step, action in enumerate(data.episode(number).action):
+            acted = policy(observed, action_keys(0, torch.tensor([number]), step))
+            assert acted[0].tolist() == action.tolist()
+            observed = env.step(acted)[0]
