@@ -115,7 +115,7 @@ def command(
         program,
         acts,
         torch.arange(first, first + worlds),
-        observation=config.observation,
+        observation=config.observation if policy == "trained" else "ids",
         seed=seed,
         factor=scale,
     )

@@ -22,7 +22,7 @@ from powderdsl.tasks.task import BLOW, Task
 LINE = 14
 """Pixels below each world, for the return."""
 
-HAND = (255, 255, 255)
+HAND = (0, 0, 0)
 INK = (235, 235, 235)
 PAPER = (30, 30, 30)
 

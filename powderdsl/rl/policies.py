@@ -17,7 +17,7 @@ from powderdsl.envs.features import paper_policy
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl.patch_network import small_policy
 from powderdsl.rl.ppo_config import TrainConfig, from_json
-from powderdsl.runs import RunFolder, find_run
+from powderdsl.runs import RunFolder, does_not_fit, find_run
 
 
 def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
@@ -59,12 +59,13 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     """The policy of a run's newest checkpoint, for the observations and actions of `env`, on its device.
 
     Raises:
-        CompileError: PD620 if there is no such run or checkpoint. ValueError: the environment does not fit the run.
+        CompileError: PD620 if there is no such run or checkpoint; PD623 if the environment does not fit the run.
     """
     found = run if isinstance(run, RunFolder) else find_run(run, "ppo")
     config = config_of(found)
     if env.observation.kind != config.observation:
-        raise ValueError(f"the run sees `{config.observation}`, not `{env.observation.kind}`")
+        why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"
+        raise does_not_fit(found.path, why)
     network = ActorCriticCnnPolicy(
         env.observation.space,
         MultiDiscrete(np.array(env.action_nvec)),
@@ -75,7 +76,8 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     try:
         network.load_state_dict(checkpoint.state["policy"])
     except RuntimeError as error:
-        raise ValueError(f"the run {found.path} is of another task: {error}") from None
+        why = " ".join(str(error).split())[:300]
+        raise does_not_fit(found.path, f"its network is another: {why}") from None
     network.to(env.device).set_training_mode(False)
     return TrainedPolicy(network, config.observation, checkpoint.step, deterministic)
 

@@ -10,11 +10,15 @@ import torch
 from torch import Tensor
 
 from powderdsl.compiler import load
+from powderdsl.diagnostics import suggest
+from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.worldmodel.rulesets import RulesetSource, VariedWorlds, Variety
 from powderdsl.worldmodel.watched import Watched, watched
+from powderdsl.worlds.files import failure
 
 TEST_SEEDS = 1 << 32
 """The first seed of worlds that models are tested on. Training takes seeds below it."""
@@ -42,6 +46,11 @@ class DataConfig:
     states: int = 1_000_000
     steps: int = 8
     pairs: int = 16
+    rulesets: int = 0
+    """How many rulesets are drawn around `rules`; world s runs under number `first_ruleset` + s mod `rulesets`. 0: none."""
+    first_ruleset: int = 0
+    variety: Variety = field(default_factory=Variety)
+    """How they differ."""
     capacity: int = 1024 * 256
     refresh: int = 256
 
@@ -50,26 +59,40 @@ class DataConfig:
         for name in ("states", "steps", "pairs", "capacity", "refresh"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be 1 or more, found {getattr(self, name)}")
+        if self.rulesets < 0 or self.first_ruleset < 0:
+            raise ValueError("rulesets and first_ruleset must be 0 or more")
         if self.states > TEST_SEEDS:
             raise ValueError(f"states must be at most {TEST_SEEDS:,}: tests begin there")
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> DataConfig:
         """From what JSON gave back. Raises TypeError, ValueError."""
-        return DataConfig(**{**values, "only": tuple(values.get("only", ()))})
+        variety = Variety.of(values.get("variety", {}))
+        return DataConfig(**{**values, "only": tuple(values.get("only", ())), "variety": variety})
+
+
+class HasIds(Protocol):
+    """A batch of worlds, as far as pairs need to know it: `World` is one."""
+
+    @property
+    def ids(self) -> Tensor:
+        """Element ids, uint8 [B, H, W]."""
 
 
 class Worlds(Protocol):
     """What gives worlds: `TaskWorlds`, or your own. The same seed gives the same world and the same future."""
 
+    rules: Ruleset
+    """Has all elements that worlds hold."""
+
     @property
     def size(self) -> tuple[int, int]:
         """Rows and columns."""
 
-    def start(self, seeds: Tensor) -> World:
-        """The worlds of seeds, int64 [B]."""
+    def start(self, seeds: Tensor) -> Any:
+        """The worlds of seeds, int64 [B], as something that `HasIds`."""
 
-    def later(self, world: World, steps: int) -> World:
+    def later(self, world: Any, steps: int) -> Any:
         """The worlds some steps later; `world` stays as it was."""
 
 
@@ -85,14 +108,26 @@ class TaskWorlds:
         return self.program.task.size
 
     @property
+    def device(self) -> torch.device:
+        """Where worlds are run."""
+        return self.program.simulator.device
+
+    @property
+    def fingerprint(self) -> str:
+        """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
+        return fingerprint(self.program.task.splits)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The names of the variants: seed s gives variant s mod their number."""
         return self.found.names
 
     def start(self, seeds: Tensor) -> World:
+        """The worlds of seeds, int64 [B]."""
         return self.program.start(seeds).world
 
     def later(self, world: World, steps: int) -> World:
+        """The worlds some steps later."""
         return self.program.simulator.step(world, steps)
 
 
@@ -103,7 +138,7 @@ def task_worlds(
     threads: int = 1,
     backend: str = "auto",
     partly: bool = False,
-) -> TaskWorlds:
+) -> TaskWorlds | VariedWorlds:
     """The worlds that a configuration speaks of, ready to run.
 
     Args:
@@ -118,6 +153,19 @@ def task_worlds(
     check_split(task, config.split)
     rules = task.ruleset if own else load(config.rules, params=config.params)
     _check_packs(config.only, rules)
+    if config.rulesets:
+        source = RulesetSource(config.rules or rules.name, config.variety, config.params)
+        return VariedWorlds(
+            task,
+            config.split,
+            source,
+            config.rulesets,
+            first=config.first_ruleset,
+            only=config.only,
+            backend=backend,
+            device=device,
+            threads=threads,
+        )
     found = watched(task, config.split, rules, config.only, partly=partly)
     program = compile_task(found.task, split=config.split, backend=backend, device=device, threads=threads)
     return TaskWorlds(program, found)
@@ -125,9 +173,6 @@ def task_worlds(
 
 def _check_packs(packs: tuple[str, ...], rules: Ruleset) -> None:
     """Raises CompileError (PD304) for packs that the rules do not have."""
-    from powderdsl.diagnostics import suggest
-    from powderdsl.worlds.files import failure
-
     for pack in packs:
         if pack not in rules.packs:
             helps = suggest(pack, rules.packs, "packs")
@@ -136,7 +181,7 @@ def _check_packs(packs: tuple[str, ...], rules: Ruleset) -> None:
 
 def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[Pairs]:
     """The pairs of some worlds in the order of time: `pairs` times a pair a world."""
-    world = worlds.start(seeds)
+    world: HasIds = worlds.start(seeds)
     for _ in range(pairs):
         start = world.ids
         world = worlds.later(world, steps)

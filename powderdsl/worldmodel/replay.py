@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.backends.torch_random import MASK, base_keys, mix
-from powderdsl.simulator import World
-from powderdsl.worldmodel.pairs import DataConfig, Pairs, Worlds, pairs_of
+from powderdsl.worldmodel.pairs import DataConfig, HasIds, Pairs, Worlds, pairs_of
 
 TOGETHER = 1 << 20
 """Cells of the worlds that are run together when the buffer is filled."""
@@ -59,7 +58,7 @@ class Replay:
             store = "disk" if self._bytes() > memory_of(self.device) // 2 and folder else "memory"
         self.starts, self.ends = (self._room(store, name, folder) for name in ("starts", "ends"))
         self.iteration = -1
-        self._live: World | None = None
+        self._live: HasIds | None = None
 
     def go_to(self, iteration: int) -> None:
         """Make the buffer as it is before an iteration, counted from 0, whatever it was."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from powderdsl.compiler import load
+from powderdsl.diagnostics import CompileError
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
-from powderdsl.runs import Checkpoint, RunFolder, find_run, open_run
+from powderdsl.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run
 from powderdsl.tasks.shipped_tasks import load_task
-from powderdsl.worldmodel.pairs import DataConfig, task_worlds
+from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.unet import UNet, fresh_unet
 from powderdsl.worlds.files import failure
@@ -29,6 +30,9 @@ KIND = "worldmodel"
 
 LOG_EVERY = 10
 """Iterations whose mean loss makes a line of the metrics."""
+
+MAX_WIDTH = 1024
+"""Features of the first block."""
 
 Network = Callable[[Tensor], Tensor]
 """Ids uint8 [B, H, W] -> logits [B, slots, H, W]."""
@@ -51,9 +55,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Raises ValueError for numbers that cannot be."""
-        for name in ("width", "iterations", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be 1 or more, found {getattr(self, name)}")
+        for name, most in (("width", MAX_WIDTH), ("iterations", 1 << 40), ("batch", 1 << 20)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must lie in 1..{most}, found {getattr(self, name)}")
         if not 0 < self.learning_rate < float("inf"):
             raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
         if not 0 <= self.seed < 2**63:
@@ -62,7 +66,7 @@ class TrainConfig:
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
         """From what JSON gave back; what belongs to the run besides is left out. Raises TypeError, ValueError."""
-        own = {name: value for name, value in values.items() if name not in ("palette", "rules_fingerprint")}
+        own = {one.name: values[one.name] for one in fields(TrainConfig)}
         return TrainConfig(**{**own, "data": DataConfig.of(own["data"])})
 
 
@@ -70,7 +74,7 @@ PAPER = TrainConfig()
 """5,000 iterations of 256 pairs, width 32, a buffer of 1024·256: for a GPU."""
 
 SMALL = TrainConfig(
-    data=DataConfig(capacity=4096, refresh=16), width=16, iterations=800, batch=16, learning_rate=0.002
+    data=DataConfig(capacity=4096, refresh=8), width=16, iterations=1200, batch=8, learning_rate=0.002
 )
 """The same network, narrower, on fewer pairs: minutes on one CPU core."""
 
@@ -102,6 +106,8 @@ class Moment:
     done: int
     of: int
     loss: float | None
+    simulated: float = 0.0
+    """The share of time that making worlds takes, since the last line of metrics."""
 
 
 def train(
@@ -109,6 +115,8 @@ def train(
     folder: str | Path,
     *,
     machine: Machine = HERE,
+    worlds: Worlds | None = None,
+    identity: Mapping[str, Any] | None = None,
     network: nn.Module | None = None,
     parent: Checkpoint | None = None,
     note: Mapping[str, Any] | None = None,
@@ -120,21 +128,33 @@ def train(
     On one device and one thread the weights are the same however often a run is killed and goes on.
 
     Args:
+        worlds: your own, instead of those of the task that `config.data` names, whose rules and split then say nothing.
+        identity: what else decides which weights come out, such as what your own worlds hang on: kept in ``run.json``,
+            and compared when a run goes on.
         network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W]; the paper's U-net otherwise.
-        parent: weights to start from, see `parent_of`.
+        parent: weights to start from, of the run that `finetuned` was given.
         note: more for ``run.json``, such as where the parent lies.
         save_seconds: how often a checkpoint is written, besides the last one.
 
     Raises:
         CompileError: from `task_worlds` and `open_run`; PD622 if another process trains there; PD623 if weights do not
-            fit the network, or the loss is no longer finite.
+            fit the network; PD624 if the loss is no longer finite.
+        ValueError: your own network gives logits of another shape.
         KeyboardInterrupt: Ctrl-C, after a last checkpoint.
     """
-    worlds = task_worlds(config.data, device=machine.device, threads=machine.threads, backend=machine.backend)
+    if worlds is None:
+        found = task_worlds(
+            config.data, device=machine.device, threads=machine.threads, backend=machine.backend
+        )
+        worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
     palette = palette_of(config.data, worlds.rules)
-    plain = {**asdict(config), "palette": palette, "rules_fingerprint": fingerprint(worlds.rules)}
+    plain = {
+        **asdict(config),
+        "palette": palette,
+        "rules_fingerprint": fingerprint(worlds.rules),
+        **(identity or {}),
+    }
     run = open_run(folder, KIND, plain, note={"machine": asdict(machine), **(note or {})})
-    torch.set_num_threads(machine.threads)
     with run.locked():
         model = network or fresh_unet(len(palette), config.width, config.seed)
         model.to(machine.device)
@@ -151,7 +171,7 @@ def train(
             )
             try:
                 replay.go_to(done)
-                trainer = _Trainer(config, machine, run, model, optimizer, replay, done, recent)
+                trainer = _Trainer(config, machine, run, model, optimizer, replay, len(palette), done, recent)
                 trainer.go(tell or (lambda progress: None), save_seconds)
             finally:
                 replay.close()
@@ -187,32 +207,41 @@ class _Trainer:
         model: nn.Module,
         optimizer: torch.optim.Optimizer,
         replay: Replay,
+        slots: int,
         done: int,
         recent: list[float],
     ):
         self.config, self.machine, self.run = config, machine, run
-        self.model, self.optimizer, self.replay = model, optimizer, replay
+        self.model, self.optimizer, self.replay, self.slots = model, optimizer, replay, slots
         self.done, self.recent = done, recent
         self.forward: Network = torch.compile(model) if machine.compiled else model
         self.cuda = torch.device(machine.device).type == "cuda"
 
     def go(self, tell: Callable[[Moment], None], save_seconds: float) -> None:
         """To the end. Raises KeyboardInterrupt once a checkpoint is written."""
-        total, saved, loss = self.config.iterations, time.monotonic(), None
+        total, loss, simulated = self.config.iterations, None, 0.0
+        saved = since = time.monotonic()
+        making = 0.0
         self.model.train()
         with self.run.metrics(self.done) as metrics, _interruptible() as interrupted:
             while self.done < total and not interrupted.is_set():
                 starts, ends = self.replay.batch(self.done, self.config.batch)
                 self.recent.append(self.step(starts, ends))
+                began = time.monotonic()
                 self.replay.advance()
+                making += time.monotonic() - began
                 self.done += 1
                 if self.done % LOG_EVERY == 0 or self.done == total:
                     loss = sum(self.recent) / len(self.recent)
                     self.recent = []
                     if not loss < float("inf"):
-                        raise _diverged(self.run, self.done, self.config)
-                    metrics.write(self.done, {"loss/train": loss})
-                tell(Moment(self.done, total, loss))
+                        raise diverged(self.run.path, self.done, self.config.learning_rate)
+                    took = time.monotonic() - since
+                    simulated = making / took
+                    speed = {"time/pairs_a_second": LOG_EVERY * self.config.batch / took}
+                    metrics.write(self.done, {"loss/train": loss, **speed, "time/simulation": simulated})
+                    since, making = time.monotonic(), 0.0
+                tell(Moment(self.done, total, loss, simulated))
                 if time.monotonic() - saved > save_seconds:
                     self.save()
                     saved = time.monotonic()
@@ -224,6 +253,9 @@ class _Trainer:
         """One step of Adam; the loss before it: cross-entropy a cell, in nats."""
         with torch.autocast("cuda", torch.bfloat16, enabled=self.cuda):
             logits = self.forward(starts)
+        if logits.shape != (len(starts), self.slots, *starts.shape[1:]):
+            expected = [len(starts), self.slots, *starts.shape[1:]]
+            raise ValueError(f"the network must give logits {expected}, found {list(logits.shape)}")
         loss = F.cross_entropy(logits.float(), ends.long())
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -277,41 +309,30 @@ def palette_of(config: DataConfig, rules: Ruleset) -> list[str | None]:
     return palette
 
 
-def check_palette(palette: list[str | None], rules: Ruleset) -> None:
-    """Whether a network with these slots can see worlds of some rules.
+def check_palette(folder: Path, palette: Sequence[str | None], rules: Ruleset) -> None:
+    """Whether a run's network has slots for the elements of some rules.
 
     Raises:
         CompileError: PD623, with every element that has no slot, or whose slot is another's.
     """
-    notes = []
+    why = []
     for element in rules.elements:
         if element.id >= len(palette):
-            notes.append(f"`{element.qualified}` has id {element.id}; the network has {len(palette)} slots")
+            why.append(f"id {element.id} is `{element.qualified}` here; there are {len(palette)} slots there")
         elif palette[element.id] not in (None, element.qualified):
-            notes.append(f"id {element.id} is `{element.qualified}` here, `{palette[element.id]}` there")
-    if notes:
-        raise failure(
-            "PD623",
-            f"the network was not trained for the elements of {rules.name}",
-            notes=tuple(notes),
-            helps=("choose the rules it was trained with, or packs of theirs", "or train another network"),
-        )
+            why.append(f"id {element.id} is `{palette[element.id]}` there, `{element.qualified}` here")
+    if why:
+        raise does_not_fit(folder, *why)
 
 
 def fit_weights(model: nn.Module, checkpoint: Checkpoint) -> None:
-    """Give a network the weights of a checkpoint.
-
-    Raises:
-        CompileError: PD623 if they are those of another network.
-    """
+    """Give a network the weights of a checkpoint. Raises CompileError (PD623) if they are those of another network."""
     state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
     try:
         model.load_state_dict(state if isinstance(state, dict) else {})
-    except RuntimeError as error:
-        lines = tuple(line.strip() for line in str(error).splitlines()[1:4])
-        helps = ("a network of your own must be given again, as it was trained",)
-        message = f"the weights in {checkpoint.path} are those of another network"
-        raise failure("PD623", message, notes=lines, helps=helps) from None
+    except (RuntimeError, TypeError, AttributeError) as error:
+        words = [line.strip()[:200] for line in str(error).splitlines()[:4]]
+        raise does_not_fit(checkpoint.path, "its weights are those of another network", *words) from None
 
 
 @dataclass(frozen=True)
@@ -345,10 +366,11 @@ def load_trained(
     return Trained(run, config, palette, model.to(device).eval(), checkpoint)
 
 
-def _diverged(run: RunFolder, done: int, config: TrainConfig) -> Exception:
+def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:
+    """What to raise where the loss is no longer finite (PD624)."""
     return failure(
-        "PD623",
-        f"the loss is no longer finite after {done} iterations",
-        notes=(f"in {run.path}",),
-        helps=(f"choose a smaller learning rate than {config.learning_rate:g}",),
+        "PD624",
+        f"the loss is no longer finite after {done:,} iterations",
+        notes=(f"in {folder}",),
+        helps=(f"choose a smaller learning rate than {learning_rate:g}",),
     )

@@ -33,6 +33,6 @@ def finetuned(
     rules = add(data.rules or load_task(data.task).ruleset.name, packs)
     knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
     data = replace(data, rules=rules, only=tuple(packs), knobs=knobs)
-    check_palette(trained.palette, load_rules_of(data))
+    check_palette(trained.run.path, trained.palette, load_rules_of(data))
     values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
     return replace(config, data=data, **values)

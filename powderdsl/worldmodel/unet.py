@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -53,7 +55,21 @@ def _block(before: int, after: int) -> nn.Sequential:
 
 
 def fresh_unet(slots: int, width: int, seed: int) -> UNet:
-    """A network with random weights that hang on the seed alone: made on the CPU, the same for every device."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return UNet(slots, width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    """A network with random weights that hang on the seed alone: made on the CPU, the same for every device.
+
+    Their spread is that of He et al. (2015): activations keep their size from layer to layer. With torch's own, which
+    shrink them, the loss takes about three times as many iterations to fall as far.
+    """
+    network = UNet(slots, width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    source = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for layer in network.modules():
+            if isinstance(layer, nn.Conv2d):
+                inputs = layer.in_channels * layer.kernel_size[0] * layer.kernel_size[1]
+                gain = 1 if layer is network.head else 2  # a ReLU halves the mean square
+                layer.weight.normal_(std=math.sqrt(gain / inputs), generator=source)
+            elif isinstance(layer, nn.ConvTranspose2d):
+                layer.weight.normal_(std=math.sqrt(1 / layer.in_channels), generator=source)
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d) and layer.bias is not None:
+                layer.bias.zero_()
+    return network

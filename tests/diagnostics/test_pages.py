@@ -32,9 +32,11 @@ from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.ledgers.book import ledger
 from powderdsl.properties.refute import refuted
+from powderdsl.rl import preset
 from powderdsl.runs import does_not_fit, find_run, open_run
 from powderdsl.studies.study_file import load_study
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
+from powderdsl.worldmodel.training import diverged
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.files import replacing
 from powderdsl.worlds.image import read_image
@@ -267,6 +269,10 @@ def use_a_run_that_does_not_fit() -> None:
     raise does_not_fit(Path("runs/dunes"), "id 3 is `core.wall` there, nothing here")
 
 
+def learn_too_fast() -> None:
+    raise diverged(Path("runs/dunes"), 40, 0.5)
+
+
 SITUATIONS: dict[str, Callable[[], object]] = {
     "PD101": lambda: powderdsl.load("rules/snd.yaml"),
     "PD102": read_a_large_file,
@@ -280,8 +286,10 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD621": open_a_run_of_another_seed,
     "PD622": train_in_one_folder_twice,
     "PD623": use_a_run_that_does_not_fit,
+    "PD624": learn_too_fast,
     "PD630": lambda: read_manifest(Path("recorded")),
     "PD631": record_with_another_seed,
+    "PD640": lambda: preset("paper", "sand-pushing", batch=1),
     "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }

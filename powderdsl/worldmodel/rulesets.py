@@ -1,0 +1,329 @@
+"""Rulesets drawn from a distribution: other chances, swapped properties, packs left out. A number decides each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.backends.torch_random import MASK, base_keys, mix
+from powderdsl.compiler import read, set_params
+from powderdsl.diagnostics import CompileError, Reporter, suggest
+from powderdsl.model.check import check
+from powderdsl.model.declarations import PackDecl
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.simulator import World
+from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.task import Task
+from powderdsl.worldmodel.watched import Watched, watched
+from powderdsl.worlds.files import failure
+
+TRIES = 8
+"""How often a swap or a selection of packs is drawn anew where the rules would contradict themselves."""
+
+UNSEEN_RULESETS = 1 << 32
+"""The first number of rulesets that models are tested on. Training takes numbers below it."""
+
+_DRAW = 0x9F1D
+"""Which hash: the one that rulesets are drawn by."""
+
+
+@dataclass(frozen=True)
+class Variety:
+    """How rulesets differ from the one that they are drawn around.
+
+    `chances`: parameters that are chances are multiplied by a factor between 1/chances and chances, uniform in its
+    logarithm, up to 1. `swaps`: for each of these properties, two elements exchange their values. `leave_out`: how
+    likely each pack that no other one needs is to be left out.
+    """
+
+    chances: float = 1.0
+    swaps: tuple[str, ...] = ()
+    leave_out: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for numbers that cannot be."""
+        if not 1 <= self.chances <= 1e6:
+            raise ValueError(f"chances is a factor from 1 to 1,000,000, found {self.chances}")
+        if not 0 <= self.leave_out < 1:
+            raise ValueError(f"leave_out is a chance below 1, found {self.leave_out}")
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> Variety:
+        """From what JSON gave back. Raises TypeError, ValueError."""
+        return Variety(**{**values, "swaps": tuple(values.get("swaps", ()))})
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A ruleset that was drawn. `left_out`: packs; `swapped`: property and two elements; `params`: other chances."""
+
+    number: int
+    left_out: tuple[str, ...]
+    swapped: tuple[tuple[str, str, str], ...]
+    params: tuple[tuple[str, float], ...]
+
+    @property
+    def structure(self) -> tuple[Any, ...]:
+        """What has to be compiled; parameters are given to each world of a batch."""
+        return self.left_out, self.swapped
+
+
+class RulesetSource:
+    """Draws rulesets around one, which is `rules` as everywhere. The same number gives the same ruleset.
+
+    Raises:
+        CompileError: what loading the rules raises; PD301 for a property that they do not have.
+    """
+
+    def __init__(self, rules: str, variety: Variety, params: Mapping[str, Any] | None = None):
+        reporter = Reporter()
+        self.packs, self.ruleset_decl = read([rules], reporter)
+        reporter.raise_if_errors()
+        self.base = self._checked(self.packs, params)
+        self.variety, self.params = variety, params
+        for name in variety.swaps:
+            if self.base.property(name) is None:
+                known = [one.name for one in self.base.properties]
+                helps = suggest(name, known, "properties")
+                raise failure("PD301", f"the rules {self.base.name} have no property `{name}`", helps=helps)
+
+    def draw(self, number: int) -> Drawn:
+        """Ruleset `number`, 0 or more. One whose rules would contradict themselves is drawn anew."""
+        draws = _draws(number)
+        for _ in range(TRIES):
+            left_out = self._left_out(draws)
+            swapped = self._swapped(draws, left_out)
+            try:
+                model = self.model(Drawn(number, left_out, swapped, ()))
+            except CompileError:
+                continue
+            params = self._chances(draws, model)
+            return Drawn(number, left_out, swapped, params)
+        return Drawn(number, (), (), self._chances(draws, self.base))
+
+    def model(self, drawn: Drawn) -> Ruleset:
+        """The checked model of a ruleset, with parameters as they were before.
+
+        Raises:
+            CompileError: the rules contradict themselves.
+        """
+        return self._model(drawn.left_out, drawn.swapped)
+
+    @lru_cache(maxsize=256)  # noqa: B019  a source lives as long as what it has checked
+    def _model(self, left_out: tuple[str, ...], swapped: tuple[tuple[str, str, str], ...]) -> Ruleset:
+        if not left_out and not swapped:
+            return self.base
+        packs = [pack for pack in self.packs if pack.name.text not in left_out]
+        for prop, one, other in swapped:
+            packs = _exchanged(packs, prop, one, other)
+        there = {f"{pack.name.text}.{param.name.text}" for pack in packs for param in pack.params}
+        return self._checked(
+            packs, {name: value for name, value in (self.params or {}).items() if name in there}
+        )
+
+    def _checked(self, packs: Sequence[PackDecl], params: Mapping[str, Any] | None) -> Ruleset:
+        reporter = Reporter()
+        model = check(list(packs), self.ruleset_decl, reporter)
+        if params:
+            model = set_params(model, params, reporter)
+        reporter.raise_if_errors()
+        return model
+
+    def _left_out(self, draws: Iterator[float]) -> tuple[str, ...]:
+        """Packs drawn one by one; those that another one needs stay."""
+        if not self.variety.leave_out:
+            return ()
+        needed = {name.text for pack in self.packs for name in pack.needs}
+        loose = [pack.name.text for pack in self.packs if pack.name.text not in needed]
+        return tuple(name for name in loose if next(draws) < self.variety.leave_out)
+
+    def _swapped(self, draws: Iterator[float], left_out: tuple[str, ...]) -> tuple[tuple[str, str, str], ...]:
+        """For each property, two elements that say different things about it."""
+        found = []
+        for prop in self.variety.swaps:
+            written = {
+                element.name.text: syntax
+                for pack in self.packs
+                if pack.name.text not in left_out
+                for element in pack.elements
+                for name, syntax in element.values
+                if name.text == prop
+            }
+            pairs = [
+                (one, other)
+                for number, one in enumerate(written)
+                for other in list(written)[number + 1 :]
+                if written[one] != written[other]
+            ]
+            if pairs:
+                found.append((prop, *pairs[int(next(draws) * len(pairs))]))
+        return tuple(found)
+
+    def _chances(self, draws: Iterator[float], model: Ruleset) -> tuple[tuple[str, float], ...]:
+        """Every chance of the base by a factor; of these, the ones that the model has."""
+        if self.variety.chances == 1:
+            return ()
+        spread, there = math.log(self.variety.chances), {param.name for param in model.params}
+        found = []
+        for param in self.base.params:
+            if param.kind.name == "chance":
+                factor = math.exp(spread * (2 * next(draws) - 1))
+                if param.name in there:
+                    found.append((param.name, min(1.0, float(param.default) * factor)))
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class MixedWorld:
+    """Worlds of several rulesets: parts by structure, and where their worlds stand in the batch."""
+
+    parts: Mapping[tuple[Any, ...], World]
+    places: Mapping[tuple[Any, ...], Tensor]
+    params: Mapping[tuple[Any, ...], Mapping[str, Tensor]]
+
+    @property
+    def ids(self) -> Tensor:
+        """Element ids, uint8 [B, H, W]."""
+        first = next(iter(self.parts.values())).ids
+        many = sum(len(place) for place in self.places.values())
+        found = torch.empty((many, *first.shape[1:]), dtype=first.dtype, device=first.device)
+        for key, world in self.parts.items():
+            found[self.places[key]] = world.ids
+        return found
+
+
+class VariedWorlds:
+    """The worlds of a task's split, each under a ruleset of its own: world s under ruleset `first` + s mod `count`.
+
+    Rulesets of one structure are compiled once and run together; their chances are parameters of each world.
+
+    Args:
+        task: under the source's own rules. only: as `DataConfig` has it.
+        backend, device, threads: those of `powderdsl.compile`. ``auto`` takes ``torch``, which starts at once: compiling
+            many rulesets to native code would take longer than running them.
+
+    Raises:
+        CompileError: PD604 if worlds need an element that the rules do not have.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        split: str,
+        source: RulesetSource,
+        count: int,
+        *,
+        first: int = 0,
+        only: tuple[str, ...] = (),
+        backend: str = "auto",
+        device: str = "cpu",
+        threads: int = 1,
+    ):
+        self.source, self.split, self.only = source, split, only
+        self.drawn = [source.draw(first + number) for number in range(count)]
+        self.rules = source.base
+        self._task = task
+        self._machine: dict[str, Any] = {
+            "backend": "torch" if backend == "auto" else backend,
+            "device": device,
+            "threads": threads,
+        }
+        self.found: Watched = watched(task, split, source.base, only)
+        self._programs: dict[tuple[Any, ...], TaskProgram] = {}
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self._task.size
+
+    @property
+    def device(self) -> torch.device:
+        """Where worlds are run."""
+        return torch.device(self._machine["device"])
+
+    @property
+    def fingerprint(self) -> str:
+        """A name for how these worlds start, as `TaskWorlds.fingerprint`."""
+        return fingerprint(self.found.task.splits)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the variants: seed s gives variant s mod their number."""
+        return self.found.names
+
+    def start(self, seeds: Tensor) -> MixedWorld:
+        """The worlds of seeds, int64 [B]."""
+        groups: dict[tuple[Any, ...], list[int]] = {}
+        chosen = [self.drawn[seed % len(self.drawn)] for seed in seeds.tolist()]
+        for number, one in enumerate(chosen):
+            groups.setdefault(one.structure, []).append(number)
+        parts, places, params = {}, {}, {}
+        for key, members in groups.items():
+            place = torch.tensor(members, device=seeds.device)
+            program = self._program(chosen[members[0]])
+            parts[key] = program.start(seeds[place]).world
+            places[key] = place
+            values = [dict(chosen[member].params) for member in members]
+            params[key] = {
+                name: torch.tensor([one[name] for one in values], dtype=torch.float64, device=seeds.device)
+                for name in values[0]
+            }
+        return MixedWorld(parts, places, params)
+
+    def later(self, world: MixedWorld, steps: int) -> MixedWorld:
+        """The worlds some steps later."""
+        parts = {
+            key: self._programs[key].simulator.step(part, steps, params=world.params[key])
+            for key, part in world.parts.items()
+        }
+        return replace(world, parts=parts)
+
+    def _program(self, drawn: Drawn) -> TaskProgram:
+        if drawn.structure not in self._programs:
+            # A world that needs what was left out is another world here: rules with packs left out draw from what is there.
+            found = watched(self._task, self.split, self.source.model(drawn), self.only, partly=True)
+            self._programs[drawn.structure] = compile_task(found.task, split=self.split, **self._machine)
+        return self._programs[drawn.structure]
+
+
+def _draws(number: int) -> Iterator[float]:
+    """Endless numbers in 0..1 that hang on `number` alone."""
+    keys = base_keys(torch.tensor([number]), torch.tensor([_DRAW]))
+    key, count = int(mix(keys[0] ^ keys[1])[0]), 0
+    while True:
+        yield int(mix(torch.tensor((key + count * 0x9E3779B1) & MASK))) / 2**32
+        count += 1
+
+
+def _exchanged(packs: Sequence[PackDecl], prop: str, one: str, other: str) -> list[PackDecl]:
+    """Packs in which two elements have exchanged what they say about a property."""
+    said = {
+        element.name.text: syntax
+        for pack in packs
+        for element in pack.elements
+        for name, syntax in element.values
+        if name.text == prop
+    }
+    partner = {one: other, other: one}
+    found = []
+    for pack in packs:
+        elements = tuple(
+            replace(
+                element,
+                values=tuple(
+                    (name, said[partner[element.name.text]])
+                    if name.text == prop and element.name.text in partner
+                    else (name, syntax)
+                    for name, syntax in element.values
+                ),
+            )
+            for element in pack.elements
+        )
+        found.append(replace(pack, elements=elements))
+    return found

@@ -1,0 +1,125 @@
+"""Rulesets drawn from a distribution: a number decides each, and every world runs under its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import powderdsl
+from powderdsl.diagnostics import CompileError
+from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.worldmodel.rulesets import RulesetSource, VariedWorlds, Variety
+
+TASK = """
+task: mixed
+rules: core+sand+water+lava+fire
+size: [12, 16]
+fill: empty
+generate:
+  - repeat 6:
+      - square any at (0..11, 0..15) half 1..4
+agent: {may: nothing, actions: 16, steps_per_action: 8}
+"""
+RULES = "core+sand+water+lava+fire"
+MANY = Variety(chances=4.0, swaps=("density",), leave_out=0.3)
+
+
+@pytest.fixture(name="task")
+def _task(tmp_path: Path):  # type: ignore[no-untyped-def]
+    path = tmp_path / "mixed.yaml"
+    path.write_text(TASK, encoding="utf-8")
+    return load_task(path)
+
+
+def test_a_number_decides_a_ruleset() -> None:
+    one, other = RulesetSource(RULES, MANY), RulesetSource(RULES, MANY)
+    assert [one.draw(number) for number in range(8)] == [
+        other.draw(number) for number in (0, 1, 2, 3, 4, 5, 6, 7)
+    ]
+    assert one.draw(3) == other.draw(3)
+    assert len({one.draw(number) for number in range(8)}) == 8
+
+
+def test_chances_stay_within_the_factor() -> None:
+    source = RulesetSource(RULES, Variety(chances=2.0))
+    defaults = {
+        param.name: float(param.default) for param in source.base.params if param.kind.name == "chance"
+    }
+    drawn = [dict(source.draw(number).params) for number in range(200)]
+    for name, default in defaults.items():
+        values = [one[name] for one in drawn]
+        assert default / 2 <= min(values) < 0.6 * default
+        assert 1.7 * default < max(values) <= min(1.0, 2 * default) + 1e-12
+        assert sum(value < default for value in values) == pytest.approx(
+            100, abs=25
+        )  # uniform in the logarithm
+
+
+def test_swapped_elements_have_each_others_property() -> None:
+    source = RulesetSource(RULES, Variety(swaps=("density",)))
+    base = source.base.property("density")
+    assert base is not None
+    for number in range(10):
+        drawn = source.draw(number)
+        ((name, one, other),) = drawn.swapped
+        first, second = (source.base.element(element) for element in (one, other))
+        found = source.model(drawn).property("density")
+        assert name == "density"
+        assert first is not None
+        assert second is not None
+        assert found is not None
+        expected = list(base.values)
+        expected[first.id], expected[second.id] = expected[second.id], expected[first.id]
+        assert list(found.values) == expected
+        assert base.values[first.id] != base.values[second.id]
+
+
+def test_packs_that_others_need_stay() -> None:
+    source = RulesetSource(RULES, Variety(leave_out=0.5))
+    left = [set(source.draw(number).left_out) for number in range(40)]
+    needed = {name.text for pack in source.packs for name in pack.needs}
+    assert set().union(*left) == set(source.base.packs) - needed
+    assert "core" in needed
+    for number in range(5):
+        model = source.model(source.draw(number))
+        assert set(model.packs) == set(source.base.packs) - left[number]
+        # Ids stay where they are.
+        ids = {one.qualified: one.id for one in source.base.elements}
+        assert all(ids[one.qualified] == one.id for one in model.elements)
+
+
+def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[no-untyped-def]
+    source = RulesetSource(RULES, MANY)
+    worlds = VariedWorlds(task, "train", source, 3, backend="dense")
+    seeds = torch.tensor([5, 0, 1, 3, 2, 4])
+    start = worlds.start(seeds)
+    end = worlds.later(worlds.later(start, 8), 8)
+    assert start.ids.shape == (6, 12, 16)
+    for place, seed in enumerate(seeds.tolist()):
+        drawn = worlds.drawn[seed % 3]
+        model = source.model(drawn)
+        alone = powderdsl.compile(model.with_params(dict(drawn.params)), backend="dense")
+        world = worlds.start(torch.tensor([seed]))
+        assert torch.equal(world.ids[0], start.ids[place])
+        # The same start under this ruleset alone, with its chances as defaults.
+        part = next(iter(world.parts.values()))
+        own = alone.world(part.ids, part.seed, index=part.index)
+        assert torch.equal(alone.step(own, 16).ids[0], end.ids[place])
+
+
+def test_unknown_properties_and_bad_numbers_are_refused() -> None:
+    with pytest.raises(CompileError) as error:
+        RulesetSource(RULES, Variety(swaps=("densty",)))
+    assert error.value.diagnostics[0].helps == ("did you mean `density`?",)
+    for wrong in ({"chances": 0.5}, {"leave_out": 1.0}, {"chances": float("nan")}):
+        with pytest.raises(ValueError, match=r"chances|leave_out"):
+            Variety(**wrong)  # type: ignore[arg-type]
+
+
+def test_without_variety_a_ruleset_is_the_base() -> None:
+    source = RulesetSource(RULES, Variety())
+    drawn = source.draw(7)
+    assert (drawn.left_out, drawn.swapped, drawn.params) == ((), (), ())
+    assert source.model(drawn) is source.base
