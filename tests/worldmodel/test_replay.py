@@ -113,9 +113,7 @@ def test_disk_holds_what_memory_holds(dunes: str, tmp_path: Path) -> None:
         replay.advance()
     assert torch.equal(memory.starts, disk.starts)
     assert torch.equal(memory.ends, disk.ends)
-    assert all(
-        torch.equal(a, b) for a, b in zip(memory.batch(3, 7), disk.batch(3, 7), strict=True)
-    )
+    assert all(torch.equal(a, b) for a, b in zip(memory.batch(3, 7), disk.batch(3, 7), strict=True))
     files = list(tmp_path.glob("replay-*.bin"))
     assert sum(path.stat().st_size for path in files) == 2 * 20 * 14 * 18
     disk.close()
