@@ -10,7 +10,7 @@ _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "runs", "rl", "worldmodel", "studies", "web", "cli")
+_AFTER = ("bench", "tasks", "envs", "runs", "datasets", "rl", "worldmodel", "studies", "web", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -46,6 +46,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
     "runs": ("diagnostics", "worlds"),
+    "datasets": (*_SCREEN, "tasks", "envs"),
     "rl": (*_SCREEN, "tasks", "envs", "runs"),
     "worldmodel": (*_SCREEN, "tasks", "runs"),
     "studies": (*_MODEL, "compiler", "worlds", "runs", "bench"),  # calls commands, in processes of their own
@@ -72,6 +73,7 @@ _TORCH = (
     "testing",
     "tasks.episodes",
     "envs",
+    "datasets",
     "runs",
     "worldmodel",
     "rl",

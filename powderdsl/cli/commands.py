@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "test": ("test_command", "Run the tests of packs, and hold their invariants against the rules."),
     "trace": ("trace_command", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
     "fuzz": ("fuzz_command", "Compare all backends on random rules and worlds."),
+    "record": ("record_command", "Record episodes of a task: data for offline learning and world models."),
     "bench": ("bench_command", "Measure how fast rules run, on each backend, batch and size."),
     "train": ("train_command", "Train an agent on a task; go on where it was interrupted."),
     "evaluate": ("evaluate_command", "Compare an agent with acting at random, and with doing nothing."),

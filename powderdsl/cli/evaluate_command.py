@@ -117,18 +117,20 @@ def command(
 
 def _text(found: Evaluation) -> list[str]:
     after = "" if found.step is None else f", after {found.step:,} interactions"
-    rows = [["split", "policy", "return", "above random", "success", "actions"]]
+    rows = [["split", "policy", "return", "above random", "above nothing", "success", "actions"]]
     rows += [_row(score) for score in found.scores]
     return [f"{found.task}{after}", *table(rows)]
 
 
 def _row(score: Score) -> list[str]:
+    from powderdsl.rl.policy_evaluation import BASELINES
+
     success = "" if score.success is None else f"{score.success:.0%}"
     return [
         score.split,
         score.policy,
         _number(score.mean, score.interval),
-        "" if score.above_random is None else _number(score.above_random, score.above_random_interval),
+        *(_number(*score.above[other]) if other in score.above else "" for other in BASELINES),
         success,
         f"{score.length:.1f}",
     ]

@@ -12,9 +12,9 @@ import click
 from powderdsl.cli.commands import COMMANDS
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.options import WholeType
-from powderdsl.studies.running import Outcome, StudyRun
 from powderdsl.studies.study import SIZES, Point, Study
 from powderdsl.studies.study_file import load_study, shipped_studies
+from powderdsl.studies.study_run import Outcome, StudyRun
 
 CALLED: tuple[tuple[str, ...], ...] = (
     ("train",),

@@ -130,7 +130,7 @@ def command(
             raise BadInput("say which TASK, or --resume DIR")
         short = {"lines": n_lines, "disks": n_disks, "complexity": complexity}
         chosen = {**knob_values(knobs), **{name: one for name, one in short.items() if one is not None}}
-        name = task if task.isidentifier() or not Path(task).suffix else str(Path(task).resolve())
+        name = str(Path(task).resolve()) if Path(task).suffix else task
         config = preset(preset_name, name, **asked, knobs=chosen, params=settings)
         folder = folder or Path("runs") / f"{Path(task).stem}-seed{config.seed}"
     from powderdsl.rl.ppo_training import train

@@ -97,9 +97,10 @@ def command(
     check_writable(out)
     import torch
 
+    from powderdsl.envs.acting import Policy, random_policy
     from powderdsl.envs.tensor_env import TensorEnv
     from powderdsl.rl.films import film
-    from powderdsl.rl.policies import Policy, load_policy, random_policy
+    from powderdsl.rl.policies import load_policy
     from powderdsl.tasks.episodes import compile_task
 
     program = compile_task(task, split=split, backend=backend or config.backend)
@@ -114,7 +115,7 @@ def command(
         program,
         acts,
         torch.arange(first, first + worlds),
-        observation=config.observation,
+        observation=config.observation if policy == "trained" else "ids",
         seed=seed,
         factor=scale,
     )

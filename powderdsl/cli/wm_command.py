@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import BadInput, colour_wanted
+from powderdsl.cli.exits import BadInput, colour_wanted, user_values
 from powderdsl.cli.options import Decorated, WholeType, backend_option, check_writable, set_option
 
 if TYPE_CHECKING:
@@ -62,6 +62,14 @@ def _data_options(function: Decorated) -> Decorated:
         click.option("--buffer", "capacity", type=WholeType(1, 1 << 32), help="Pairs that the buffer holds."),
         click.option("--refresh", type=WholeType(1, 1 << 20), help="Pairs that each iteration replaces."),
         set_option,
+        click.option(
+            "--rulesets", type=WholeType(0, 1 << 32), help="Draw so many rulesets around the rules."
+        ),
+        click.option("--chances", type=float, help="Their chances differ by up to this factor."),
+        click.option("--swap", "swaps", multiple=True, metavar="PROPERTY", help="Two elements exchange it."),
+        click.option(
+            "--leave-out", type=float, metavar="CHANCE", help="How likely a pack is left out of one."
+        ),
     )
     return _all(options, function)
 
@@ -145,6 +153,7 @@ def train_command(
     squares: int | None,
     knobs: tuple[str, ...],
     settings: dict[str, str],
+    swaps: tuple[str, ...],
     folder: Path | None,
     **values: Any,
 ) -> None:
@@ -153,6 +162,7 @@ def train_command(
     A run that was stopped goes on when the same command is given again, as if it had not been stopped.
     """
     from powderdsl.cli.task_sheets import knob_values
+    from powderdsl.worldmodel.rulesets import Variety
     from powderdsl.worldmodel.training import PRESETS
 
     if packs and held_out:
@@ -160,13 +170,21 @@ def train_command(
     named = {"kinds": elements, "lines": lines, "disks": disks, "squares": squares}
     chosen = {name: value for name, value in named.items() if value is not None}
     config = PRESETS[preset]
+    variety = _given(chances=values["chances"], swaps=swaps or None, leave_out=values["leave_out"])
+    if variety and not values["rulesets"]:
+        raise BadInput(
+            "--chances, --swap and --leave-out say how rulesets differ: --rulesets says how many there are"
+        )
+    with user_values():
+        differ = Variety(**variety)
     data = replace(
         config.data,
         **_given(task=task, split=split),
         rules=_rules_without(rules, task or config.data.task, packs, held_out),
         knobs={**chosen, **knob_values(knobs)},
         params=settings,
-        **_given(**{name: values[name] for name in ("states", "capacity", "refresh")}),
+        variety=differ,
+        **_given(**{name: values[name] for name in ("states", "capacity", "refresh", "rulesets")}),
     )
     changes = _given(
         **{name: values[name] for name in ("width", "iterations", "batch", "learning_rate", "seed")}
@@ -211,6 +229,12 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @click.option(
     "--worlds", type=WholeType(1, 1 << 20), help="Of a split, or futures of each stand.  [default: 32, 4]"
 )
+@click.option(
+    "--rulesets",
+    type=WholeType(0, 1 << 20),
+    default=0,
+    help="Test under so many rulesets that training never saw.",
+)
 @click.option("--format", "layout", type=click.Choice(["text", "json"]), default="text", show_default=True)
 @click.option("--out", metavar="FILE", type=click.Path(path_type=Path), help="[default: RUN/evaluation.json]")
 @_machine_options
@@ -222,6 +246,7 @@ def eval_command(
     only: tuple[str, ...],
     knobs: tuple[str, ...],
     worlds: int | None,
+    rulesets: int,
     layout: str,
     out: Path | None,
     **values: Any,
@@ -246,6 +271,7 @@ def eval_command(
         only=only or None,
         knobs=knob_values(knobs) if knobs else None,
         worlds=worlds,
+        rulesets=rulesets,
         machine=machine,
     )
     plain = tested.plain()

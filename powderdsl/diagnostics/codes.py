@@ -99,6 +99,8 @@ _ROWS = (
     ("PD622", "run-in-use", _ERROR),
     ("PD623", "run-does-not-fit", _ERROR),
     ("PD624", "training-diverged", _ERROR),
+    ("PD630", "invalid-dataset", _ERROR),
+    ("PD631", "dataset-mismatch", _ERROR),
     ("PD640", "invalid-setting", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, rgb, scale
-from powderdsl.rl.policies import Policy
+from powderdsl.envs.acting import Policy
 from powderdsl.rl.policy_evaluation import Played, play
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import Episodes, TaskProgram
@@ -22,7 +22,7 @@ from powderdsl.tasks.task import BLOW, Task
 LINE = 14
 """Pixels below each world, for the return."""
 
-HAND = (255, 255, 255)
+HAND = (0, 0, 0)
 INK = (235, 235, 235)
 PAPER = (30, 30, 30)
 

@@ -1,8 +1,7 @@
-"""Policies: functions from observations to actions, on tensors. Random numbers are hashes, so no batch changes them."""
+"""The policies of runs: networks as functions from observations to actions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,12 @@ from gymnasium.spaces import MultiDiscrete
 from stable_baselines3.common.policies import ActorCriticCnnPolicy
 from torch import Tensor
 
-from powderdsl.backends.torch_random import MASK, mix
+from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl.patch_network import small_policy
 from powderdsl.rl.ppo_config import TrainConfig, from_json
-from powderdsl.runs import RunFolder, find_run
-
-Policy = Callable[[Tensor, Tensor], Tensor]
-"""From observations [B, …] and keys, int64 [B], to actions int64 [B, 5]. Keys are what random numbers hang on."""
+from powderdsl.runs import RunFolder, does_not_fit, find_run
 
 
 def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
@@ -30,33 +26,9 @@ def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
     return build(env, features_dim=config.features)
 
 
-def uniforms(keys: Tensor, count: int) -> Tensor:
-    """Numbers in [0, 1) by key: float64 [B, count]."""
-    numbers = torch.arange(count, device=keys.device) * 0x9E3779B1 & MASK
-    low, high = mix(keys & MASK), (keys >> 32) & MASK
-    drawn = mix((mix(low ^ high)[:, None] + numbers) & MASK)
-    return drawn.double() / float(1 << 32)
-
-
-def action_keys(seed: int, episodes: Tensor, step: int) -> Tensor:
-    """The keys of one action in each of some episodes, by their numbers: int64 [B]."""
-    low = mix((mix(torch.full_like(episodes, seed) & MASK) + episodes) & MASK)
-    return mix((low + step) & MASK) << 31 | mix(low ^ mix(torch.full_like(low, step))) >> 1
-
-
-def random_policy(nvec: tuple[int, ...]) -> Policy:
-    """All actions equally likely."""
-
-    def act(observed: Tensor, keys: Tensor) -> Tensor:
-        counts = torch.tensor(nvec, device=keys.device)
-        return (uniforms(keys, len(nvec)) * counts).long()
-
-    return act
-
-
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """The policy of a run: a function as `Policy` says.
+    """The policy of a run: a function as `envs.acting.Policy` says.
 
     `deterministic`: the likeliest action, instead of one drawn.
     """
@@ -87,12 +59,13 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     """The policy of a run's newest checkpoint, for the observations and actions of `env`, on its device.
 
     Raises:
-        CompileError: PD620 if there is no such run or checkpoint. ValueError: the environment does not fit the run.
+        CompileError: PD620 if there is no such run or checkpoint; PD623 if the environment does not fit the run.
     """
     found = run if isinstance(run, RunFolder) else find_run(run, "ppo")
     config = config_of(found)
     if env.observation.kind != config.observation:
-        raise ValueError(f"the run sees `{config.observation}`, not `{env.observation.kind}`")
+        why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"
+        raise does_not_fit(found.path, why)
     network = ActorCriticCnnPolicy(
         env.observation.space,
         MultiDiscrete(np.array(env.action_nvec)),
@@ -103,7 +76,8 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     try:
         network.load_state_dict(checkpoint.state["policy"])
     except RuntimeError as error:
-        raise ValueError(f"the run {found.path} is of another task: {error}") from None
+        why = " ".join(str(error).split())[:300]
+        raise does_not_fit(found.path, f"its network is another: {why}") from None
     network.to(env.device).set_training_mode(False)
     return TrainedPolicy(network, config.observation, checkpoint.step, deterministic)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.envs.acting import Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.rl.policies import Policy, action_keys, config_of, load_policy, random_policy
+from powderdsl.rl.policies import config_of, load_policy
 from powderdsl.rl.ppo_config import TrainConfig
 from powderdsl.runs import RunFolder, find_run
 from powderdsl.simulator import World
@@ -22,6 +23,7 @@ from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import Task
 
 POLICIES = ("trained", "random", "nothing")
+BASELINES = ("random", "nothing")
 EVALUATION = "evaluation.json"
 BATCH = 256
 """Episodes that are played at once."""
@@ -40,8 +42,8 @@ class Played:
 class Score:
     """A policy on a split. `interval` is half of the 95 % interval of `mean`: 1.96 standard errors; None of one episode.
 
-    `above_random` is the mean difference to the random policy in the same worlds, with its own interval; None for that
-    policy itself, and where it was not played. `success` is None for tasks that do not say what success is.
+    `above` has the mean difference to each of BASELINES in the same worlds, with its own interval, as far as they were
+    played and are others. `success` is None for tasks that do not say what success is.
     """
 
     split: str
@@ -51,8 +53,7 @@ class Score:
     interval: float | None
     success: float | None
     length: float
-    above_random: float | None = None
-    above_random_interval: float | None = None
+    above: Mapping[str, tuple[float, float | None]]
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,7 @@ def evaluate(
             for policy in chosen
         }
         for policy in chosen:
-            scores.append(_score(name, policy, played[policy], played.get("random"), task))
+            scores.append(_score(name, policy, played, task))
             if said is not None:
                 said(scores[-1])
     found = Evaluation(task.name, step, deterministic, seed, tuple(scores))
@@ -213,14 +214,16 @@ def _play_all(
     )
 
 
-def _score(split: str, policy: str, played: Played, at_random: Played | None, task: Task) -> Score:
-    mean, interval = _mean(played.returns)
-    above: tuple[float | None, float | None] = (None, None)
-    if at_random is not None and at_random is not played:
-        above = _mean(played.returns - at_random.returns)
+def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task) -> Score:
+    played = all_played[policy]
+    above = {
+        other: _mean(played.returns - all_played[other].returns)
+        for other in BASELINES
+        if other != policy and other in all_played
+    }
     success = float(played.success.double().mean()) if task.goal.success is not None else None
     length = float(played.lengths.double().mean())
-    return Score(split, policy, len(played.returns), mean, interval, success, length, *above)
+    return Score(split, policy, len(played.returns), *_mean(played.returns), success, length, above)
 
 
 def _mean(values: Tensor) -> tuple[float, float | None]:

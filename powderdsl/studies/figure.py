@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from powderdsl.bench.plot import require_matplotlib
 from powderdsl.studies.results import Cell, Finding, findings
-from powderdsl.studies.running import Outcome
 from powderdsl.studies.study import Study
+from powderdsl.studies.study_run import Outcome
 from powderdsl.worlds.files import replacing
 
 if TYPE_CHECKING:

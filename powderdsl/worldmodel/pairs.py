@@ -16,6 +16,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.worldmodel.rulesets import RulesetSource, VariedWorlds, Variety
 from powderdsl.worldmodel.watched import Watched, watched
 from powderdsl.worlds.files import failure
 
@@ -45,6 +46,11 @@ class DataConfig:
     states: int = 1_000_000
     steps: int = 8
     pairs: int = 16
+    rulesets: int = 0
+    """How many rulesets are drawn around `rules`; world s runs under number `first_ruleset` + s mod `rulesets`. 0: none."""
+    first_ruleset: int = 0
+    variety: Variety = field(default_factory=Variety)
+    """How they differ."""
     capacity: int = 1024 * 256
     refresh: int = 256
 
@@ -53,13 +59,16 @@ class DataConfig:
         for name in ("states", "steps", "pairs", "capacity", "refresh"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be 1 or more, found {getattr(self, name)}")
+        if self.rulesets < 0 or self.first_ruleset < 0:
+            raise ValueError("rulesets and first_ruleset must be 0 or more")
         if self.states > TEST_SEEDS:
             raise ValueError(f"states must be at most {TEST_SEEDS:,}: tests begin there")
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> DataConfig:
         """From what JSON gave back. Raises TypeError, ValueError."""
-        return DataConfig(**{**values, "only": tuple(values.get("only", ()))})
+        variety = Variety.of(values.get("variety", {}))
+        return DataConfig(**{**values, "only": tuple(values.get("only", ())), "variety": variety})
 
 
 class HasIds(Protocol):
@@ -99,6 +108,11 @@ class TaskWorlds:
         return self.program.task.size
 
     @property
+    def device(self) -> torch.device:
+        """Where worlds are run."""
+        return self.program.simulator.device
+
+    @property
     def fingerprint(self) -> str:
         """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
         return fingerprint(self.program.task.splits)
@@ -124,7 +138,7 @@ def task_worlds(
     threads: int = 1,
     backend: str = "auto",
     partly: bool = False,
-) -> TaskWorlds:
+) -> TaskWorlds | VariedWorlds:
     """The worlds that a configuration speaks of, ready to run.
 
     Args:
@@ -139,6 +153,19 @@ def task_worlds(
     check_split(task, config.split)
     rules = task.ruleset if own else load(config.rules, params=config.params)
     _check_packs(config.only, rules)
+    if config.rulesets:
+        source = RulesetSource(config.rules or rules.name, config.variety, config.params)
+        return VariedWorlds(
+            task,
+            config.split,
+            source,
+            config.rulesets,
+            first=config.first_ruleset,
+            only=config.only,
+            backend=backend,
+            device=device,
+            threads=threads,
+        )
     found = watched(task, config.split, rules, config.only, partly=partly)
     program = compile_task(found.task, split=config.split, backend=backend, device=device, threads=threads)
     return TaskWorlds(program, found)

@@ -16,6 +16,7 @@ from powderdsl.compiler import read, set_params
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl
+from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -240,6 +241,16 @@ class VariedWorlds:
     @property
     def size(self) -> tuple[int, int]:
         return self._task.size
+
+    @property
+    def device(self) -> torch.device:
+        """Where worlds are run."""
+        return torch.device(self._machine["device"])
+
+    @property
+    def fingerprint(self) -> str:
+        """A name for how these worlds start, as `TaskWorlds.fingerprint`."""
+        return fingerprint(self.found.task.splits)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from powderdsl.worldmodel.pairs import (
     task_worlds,
     unseen_seeds,
 )
+from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, VariedWorlds
 from powderdsl.worldmodel.training import HERE, Machine, Network, Trained, check_palette, load_rules_of
 
 TOGETHER = 1 << 17
@@ -177,6 +178,7 @@ def evaluate(
     only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
     worlds: int | None = None,
+    rulesets: int = 0,
     machine: Machine = HERE,
 ) -> Tested:
     """Test a network beside both baselines, on worlds that no training takes.
@@ -185,13 +187,22 @@ def evaluate(
         task, rules: those of the training data unless others are given.
         only, knobs: likewise; knobs are only those of the training data where the task is.
         worlds: worlds of a split, or random futures of each of its stands; 32 and 4 unless said otherwise.
+        rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
+            which training takes. 0: the rules as they are.
 
     Raises:
         CompileError: as `task_worlds`; PD623 if the rules have elements that the network has no slots for.
     """
     fit = _counted(trained, machine)
     found = unseen_worlds(
-        trained, task=task, split=split, rules=rules, only=only, knobs=knobs, machine=machine
+        trained,
+        task=task,
+        split=split,
+        rules=rules,
+        only=only,
+        knobs=knobs,
+        rulesets=rulesets,
+        machine=machine,
     )
     data = trained.config.data
     slots, names = len(trained.palette), found.names
@@ -229,8 +240,9 @@ def unseen_worlds(
     rules: str | None = None,
     only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
+    rulesets: int = 0,
     machine: Machine = HERE,
-) -> TaskWorlds:
+) -> TaskWorlds | VariedWorlds:
     """The worlds that `evaluate` tests on, which says what the arguments are and what is raised.
 
     Worlds that the rules cannot have are left out, as long as others remain.
@@ -244,6 +256,8 @@ def unseen_worlds(
         params=data.params if rules is None else {},
         only=data.only if only is None else only,
         knobs=(data.knobs if task is None else {}) if knobs is None else knobs,
+        rulesets=rulesets,
+        first_ruleset=UNSEEN_RULESETS,
     )
     check_palette(trained.run.path, trained.palette, load_rules_of(tested_on))
     return task_worlds(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from powderdsl.draw import contact_sheet, palette, rgb, scale
 from powderdsl.model.types import Ruleset
 from powderdsl.worldmodel.pairs import TaskWorlds, unseen_seeds
+from powderdsl.worldmodel.rulesets import VariedWorlds
 from powderdsl.worldmodel.training import Network
 
 RIGHT, WRONG = (235, 235, 235), (200, 30, 30)
@@ -33,15 +35,18 @@ class Strip:
 
 
 @torch.no_grad()
-def strips(predict: Network, worlds: TaskWorlds, *, step: int, times: int = 1, after: int = 0) -> list[Strip]:
+def strips(
+    predict: Network, worlds: TaskWorlds | VariedWorlds, *, step: int, times: int = 1, after: int = 0
+) -> list[Strip]:
     """A strip for each variant of a split.
 
     Args:
         step: steps that the network was trained to predict. times: how often it is applied to what it predicted.
         after: steps that worlds have run before.
     """
-    seeds = unseen_seeds(1, len(worlds.names)).to(worlds.program.simulator.device)
-    world = worlds.later(worlds.start(seeds), after)
+    seeds = unseen_seeds(1, len(worlds.names)).to(worlds.device)
+    begun: Any = worlds.start(seeds)
+    world: Any = worlds.later(begun, after)
     predicted = world.ids
     for _ in range(times):
         predicted = predict(predicted).argmax(1).to(torch.uint8)

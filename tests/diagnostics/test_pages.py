@@ -26,11 +26,13 @@ from PIL import Image
 
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics
+from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.ledgers.book import ledger
 from powderdsl.properties.refute import refuted
+from powderdsl.rl import preset
 from powderdsl.runs import does_not_fit, find_run, open_run
 from powderdsl.studies.study_file import load_study
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
@@ -245,6 +247,13 @@ def write_into_no_folder() -> None:
         pass
 
 
+def record_with_another_seed() -> None:
+    from powderdsl.datasets import record
+
+    for seed in (0, 1):
+        record("herd-gas", "nothing", "recorded", episodes=1, seed=seed, max_episode_steps=1, backend="dense")
+
+
 def open_a_run_of_another_seed() -> None:
     open_run("runs/dunes", "ppo", {"seed": 1})
     open_run("runs/dunes", "ppo", {"seed": 2})
@@ -278,6 +287,9 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD622": train_in_one_folder_twice,
     "PD623": use_a_run_that_does_not_fit,
     "PD624": learn_too_fast,
+    "PD630": lambda: read_manifest(Path("recorded")),
+    "PD631": record_with_another_seed,
+    "PD640": lambda: preset("paper", "sand-pushing", batch=1),
     "PD801": lambda: load_task("sand-pulling"),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }

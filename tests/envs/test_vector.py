@@ -21,6 +21,7 @@ from powderdsl.envs.single import PowderEnv
 from powderdsl.envs.tensor_env import TensorEnv, world_seeds
 from powderdsl.envs.vector import PowderVectorEnv
 from powderdsl.tasks.episodes import TaskProgram, compile_task, load_task
+from tests.states import same
 
 ENVS, STEPS = 5, 16
 MODES = tuple(AutoresetMode)
@@ -358,3 +359,48 @@ def test_programs_are_shared(task_file: Path) -> None:
     assert TensorEnv(program).program is TensorEnv(program, 2).program is program
     with pytest.raises(ValueError, match="load_task"):
         TensorEnv(program.task, knobs={"disks": 1})
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_saved_environment_goes_on_as_it_would_have(small: TaskProgram, mode: AutoresetMode) -> None:
+    def made() -> TensorEnv:
+        return TensorEnv(small, ENVS, observation="compact", autoreset_mode=mode)
+
+    def stepped(env: TensorEnv, action: torch.Tensor, over: torch.Tensor) -> tuple[Any, ...]:
+        if mode is AutoresetMode.DISABLED and bool(over.any()):
+            env.reset(options={"reset_mask": over})
+        return env.step(action)
+
+    first, second, third = made(), made(), made()
+    first.reset(seed=3, options={"params": {"water.melt": [0.1, 0.9, 0.5, 0.0, 1.0]}})
+    actions, over = torch.from_numpy(actions_of(small)), torch.zeros(ENVS, dtype=torch.bool)
+    for action in actions[:4]:
+        over = torch.logical_or(*stepped(first, action, over)[2:4])
+    saved = first.state()
+    assert first.episodes is not None
+    assert torch.equal(second.restore(copy.deepcopy(saved)), first.observation.of(first.episodes.world))
+    third.restore(saved)
+    for action in actions[4:]:
+        found, expected = (stepped(env, action, over) for env in (second, first))
+        assert same(found, expected)
+        over = expected[2] | expected[3]
+    fourth = made()
+    fourth.restore(saved)  # what was saved has not been written to
+    assert same(fourth.state(), third.state())
+
+
+def test_what_was_saved_elsewhere_is_refused(small: TaskProgram, tmp_path: Path) -> None:
+    env = TensorEnv(small, ENVS)
+    with pytest.raises(ResetNeeded):
+        env.state()
+    env.reset(seed=0)
+    before = env.state()
+    other = TensorEnv(small, ENVS + 1)
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match="6 worlds were saved"):
+        env.restore(other.state())
+    state = env.state()
+    state["episodes"]["state"].pop("element")
+    with pytest.raises(ValueError, match="another state"):
+        env.restore(state)
+    assert same(env.state(), before)

@@ -13,9 +13,9 @@ from powderdsl.cli.study_command import commands
 from powderdsl.diagnostics import CompileError, Reporter, Source
 from powderdsl.studies.figure import write_figure
 from powderdsl.studies.results import as_data, as_markdown, findings, interval, shown
-from powderdsl.studies.running import Outcome, StudyRun
 from powderdsl.studies.study import Point, Study
 from powderdsl.studies.study_file import load_study, read_study, shipped_studies
+from powderdsl.studies.study_run import Outcome, StudyRun
 
 KNOWN: Mapping[tuple[str, ...], frozenset[str]] = {
     ("train",): frozenset({"run", "seed", "steps", "knob"}),

@@ -333,3 +333,22 @@ def test_unknown_names(torch):
     with pytest.raises(CompileError) as caught:
         load_task("destroying", knobs={"lnies": 3, "disks": 65})
     assert [one.code for one in caught.value.diagnostics] == ["PD803", "PD803"]
+
+
+def test_nobody_acts_and_all_steps_are_seen(torch, program_of):
+    text = NOISE + "agent: {may: [sand, blow], speed: 20, actions: 2, steps_per_action: 3, free_steps: 2}\n"
+    program = program_of(text + "reward: {each: painted + placed + blown, final: taken}\n")
+    episodes = program.start(torch.arange(2))
+    seen = []
+    after, reward, _, _ = program.act(episodes, None, seen=seen.append)
+    assert reward.tolist() == [0, 0]
+    alone = program.simulator.step(episodes.world, 3)
+    assert torch.equal(seen[0].ids, episodes.world.ids)
+    assert torch.equal(seen[-1].ids, alone.ids)
+    assert torch.equal(after.world["velocity"], alone["velocity"])
+    assert len(seen) == 4
+    action = torch.tensor([[3, 8, 0, 2, 1], [0, 15, 1, 0, 2]])
+    shown, fast = (program.act(after, action, seen=one)[0] for one in (seen.append, None))
+    assert torch.equal(shown.world.ids, fast.world.ids)
+    assert len(seen) == 4 + 1 + 3 + 2
+    assert torch.equal(seen[-1].ids, fast.world.ids)

@@ -1,0 +1,288 @@
+"""Reading recorded episodes: one at a time, or endless random minibatches of transitions and sequences."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from powderdsl.backends.torch_random import MASK, mix
+from powderdsl.datasets.manifest import Manifest, Recipe, damaged, differences, many_damaged, read_manifest
+from powderdsl.datasets.recipes import check_count, recipe_of
+from powderdsl.datasets.shards import Shard, open_shard
+from powderdsl.diagnostics import CompileError, Diagnostic
+from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.worlds.files import failure
+
+Array = NDArray[Any]
+
+MAX_OPEN = 4096
+"""Shards that are mapped at once."""
+MEANING = ("observation", "channels", "shape", "palette", "action_nvec", "choices")
+"""What of a recipe says what the numbers of observations and actions mean."""
+
+
+class Batch(NamedTuple):
+    """Transitions, or sequences of them: tensors [B, …], or [B, L, …].
+
+    `observation` and `next_observation` are uint8, `action` int16, `reward` float32, the others bool. The next
+    observation of an episode's last transition is the one that the episode ended with.
+    """
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    next_observation: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    success: Tensor
+
+
+class Episode(NamedTuple):
+    """One episode of T actions: `observation` is uint8 [T + 1, C, H, W], the others [T, …] as in `Batch`."""
+
+    number: int
+    world: int
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    success: Tensor
+
+
+class Dataset:
+    """The episodes of a folder. Made by `Dataset.open`.
+
+    Shards are looked at when they are first needed: their size, their SHA-256, their arrays. Those that are not
+    compressed stay on disk, and the system keeps in memory what it has room for.
+    """
+
+    def __init__(self, folder: Path, manifest: Manifest, memory: int):
+        self.folder, self.manifest, self.memory = folder, manifest, memory
+        self.recipe: Recipe = manifest.recipe
+        self._ends = np.cumsum([row.transitions for row in manifest.shards], dtype=np.int64)
+        self._shards: OrderedDict[int, Shard] = OrderedDict()
+
+    @classmethod
+    def open(cls, folder: str | Path, *, memory: int = 1 << 30) -> Dataset:
+        """The dataset of a folder.
+
+        Args:
+            memory: bytes that unpacked shards may take, where the dataset is compressed. One shard is always kept.
+
+        Raises:
+            CompileError: PD630: there is none, it is damaged, or not all of it has been recorded.
+        """
+        place = Path(folder)
+        manifest = read_manifest(place)
+        missing = manifest.recipe.shards - len(manifest.shards)
+        if missing:
+            reason = f"{missing} of {manifest.recipe.shards} shards are missing"
+            raise damaged(f"{place} is not complete", reason, "the command that began it completes it")
+        problems = []
+        for row in manifest.shards:
+            try:
+                size = (place / row.file).stat().st_size
+            except OSError as error:
+                problems.append(f"{row.file}: {error.strerror}")
+            else:
+                if size != row.bytes:
+                    problems.append(f"{row.file}: {size:,} bytes instead of {row.bytes:,}")
+        if problems:
+            raise many_damaged(place, problems)
+        return cls(place, manifest, memory)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopened, (str(self.folder), self.memory)  # for workers, without what is mapped
+
+    def __len__(self) -> int:
+        """How many episodes there are."""
+        return self.recipe.episodes
+
+    @property
+    def steps(self) -> int:
+        """How many transitions there are."""
+        return self.manifest.transitions
+
+    def require(self, env: TensorEnv, *, same_rules: bool = False) -> None:
+        """Refuse an environment in which these observations and actions mean something else.
+
+        Args:
+            same_rules: also refuse other rules, parameters, or another task.
+
+        Raises:
+            CompileError: PD631, naming each difference.
+        """
+        other = recipe_of(env)
+        names = (*MEANING, "params", "ruleset_fingerprint", "task_fingerprint") if same_rules else MEANING
+        found = [one for one in differences(self.recipe, other) if one.split(":")[0].split(".")[0] in names]
+        if found:
+            message = f"{self.folder} does not fit {env.task.name}"
+            raise failure("PD631", message, notes=tuple(found[:20]))
+
+    def check(self) -> None:
+        """Read every byte of every shard.
+
+        Raises:
+            CompileError: PD630, one for each shard that is damaged.
+        """
+        found: list[Diagnostic] = []
+        for number, row in enumerate(self.manifest.shards):
+            self._shards.pop(number, None)
+            try:
+                shard = self._shard(number)
+                if not self._known_ids(shard):
+                    raise damaged(
+                        f"the shard {self.folder / row.file} is damaged", "it has ids that its palette lacks"
+                    )
+            except CompileError as error:
+                found.extend(error.diagnostics)
+        if found:
+            raise CompileError(found)
+
+    def _known_ids(self, shard: Shard) -> bool:
+        known = np.zeros(256, bool)
+        known[[int(number) for number in self.recipe.palette]] = True
+        where = self.recipe.channels.index("element") if "element" in self.recipe.channels else 0
+        rows = shard.arrays["observation"][:, where]
+        return all(bool(known[rows[at : at + 256]].all()) for at in range(0, len(rows), 256))
+
+    def episode(self, number: int) -> Episode:
+        """One episode. Raises IndexError for a number that there is not."""
+        if not 0 <= number < len(self):
+            raise IndexError(f"no episode {number}: there are {len(self)}")
+        shard = self._shard(number // self.recipe.shard)
+        place = number % self.recipe.shard
+        first, length = int(shard.starts[place]), int(shard.arrays["length"][place])
+        rows = np.arange(first, first + length)
+        values = {name: _tensor(shard.arrays[name][rows]) for name in Batch._fields if name in shard.arrays}
+        values["observation"] = _tensor(
+            shard.arrays["observation"][np.arange(first + place, first + place + length + 1)]
+        )
+        return Episode(number, int(shard.arrays["world"][place]), **values)
+
+    def transitions(
+        self, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
+    ) -> Iterator[Batch]:
+        """Endless minibatches of `batch` transitions, all equally likely, drawn with replacement.
+
+        Minibatch n hangs on `seed` and n alone. `start` is the first one's number, to go on where one stopped.
+        """
+        _check_draw(batch, seed, start)
+        return self._batches(1, self._ends, batch, seed, device, start, lambda found: found[:, 0])
+
+    def sequences(
+        self, length: int, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
+    ) -> Iterator[Batch]:
+        """Endless minibatches [B, L, …] of `length` transitions in a row of one episode, all equally likely.
+
+        Raises:
+            ValueError: no episode is that long.
+        """
+        check_count("length", length, self.recipe.actions)
+        _check_draw(batch, seed, start)
+        windows = [np.maximum(0, one - length + 1).sum() for one in self._lengths]
+        ends = np.cumsum(windows, dtype=np.int64)
+        if not ends[-1]:
+            longest = max(int(one.max()) for one in self._lengths)
+            raise ValueError(f"no episode has {length} actions; the longest has {longest}")
+        return self._batches(length, ends, batch, seed, device, start, lambda found: found)
+
+    # Drawing
+
+    def _batches(
+        self,
+        length: int,
+        ends: Array,
+        batch: int,
+        seed: int,
+        device: str | torch.device,
+        start: int,
+        shape: Callable[[Tensor], Tensor],
+    ) -> Iterator[Batch]:
+        """Minibatches of windows of `length` transitions; `ends` says how many windows there are up to each shard."""
+        while True:
+            found = self._gather(drawn(seed, start, batch, int(ends[-1])), ends, length)
+            yield Batch(*(shape(torch.from_numpy(value)).to(device) for value in found))
+            start += 1
+
+    def _gather(self, windows: Array, ends: Array, length: int) -> list[Array]:
+        """The arrays of `Batch` of windows, [B, length, …]."""
+        shape = self.recipe.shape
+        sizes = {"observation": shape, "next_observation": shape, "action": (5,)}
+        dtypes = {
+            "observation": np.uint8,
+            "next_observation": np.uint8,
+            "action": np.int16,
+            "reward": np.float32,
+        }
+        out = {
+            name: np.empty((len(windows), length, *sizes.get(name, ())), dtypes.get(name, np.bool_))
+            for name in Batch._fields
+        }
+        number = np.searchsorted(ends, windows, side="right")
+        for one in np.unique(number).tolist():
+            rows = np.flatnonzero(number == one)
+            shard = self._shard(one)
+            window = windows[rows] - (ends[one - 1] if one else 0)
+            count = np.maximum(0, shard.arrays["length"].astype(np.int64) - length + 1)
+            place = np.searchsorted(np.cumsum(count), window, side="right")
+            within = window - (np.cumsum(count) - count)[place]
+            at = (shard.starts[place] + within)[:, None] + np.arange(length)
+            for name in Batch._fields:
+                if name in ("observation", "next_observation"):
+                    shown = at + place[:, None] + (name == "next_observation")
+                    out[name][rows] = shard.arrays["observation"][shown]
+                else:
+                    out[name][rows] = shard.arrays[name][at]
+        return list(out.values())
+
+    @cached_property
+    def _lengths(self) -> list[Array]:
+        """The lengths of the episodes of each shard."""
+        return [
+            np.array(self._shard(number).arrays["length"], np.int64) for number in range(self.recipe.shards)
+        ]
+
+    def _shard(self, number: int) -> Shard:
+        """A shard, kept as long as there is room."""
+        if number not in self._shards:
+            row = self.manifest.shards[number]
+            self._shards[number] = open_shard(self.folder, self.recipe, row)
+            while len(self._shards) > 1 and (
+                len(self._shards) > MAX_OPEN or sum(one.loaded for one in self._shards.values()) > self.memory
+            ):
+                self._shards.popitem(last=False)
+        self._shards.move_to_end(number)
+        return self._shards[number]
+
+
+def drawn(seed: int, number: int, count: int, below: int) -> Array:
+    """Whole numbers 0 … below − 1, hashes of `seed` and `number`: int64 [count]."""
+    key = torch.zeros(2, dtype=torch.int64) + torch.tensor([0x243F6A88, 0x85A308D3])
+    for part in (seed & MASK, seed >> 32, number & MASK, number >> 32):
+        key = mix((key + part) & MASK)
+    halves = mix((key[:, None] + mix(torch.arange(1, count + 1))) & MASK)
+    return np.asarray((((halves[0] << 31) | (halves[1] >> 1)) % below).numpy())
+
+
+def _check_draw(batch: int, seed: int, start: int) -> None:
+    check_count("batch", batch, 1 << 24)
+    check_count("seed", seed, (1 << 62) - 1, least=0)
+    check_count("start", start, (1 << 62) - 1, least=0)
+
+
+def _tensor(rows: Array) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(rows))
+
+
+def _reopened(folder: str, memory: int) -> Dataset:
+    return Dataset.open(folder, memory=memory)

@@ -1,0 +1,195 @@
+"""Shards: whole episodes as flat arrays in one .npz, written whole or not at all, read where they lie on disk.
+
+An episode of T actions has T rows of `action`, `reward`, `terminated`, `truncated`, `success`, and T + 1 of
+`observation`; episodes follow one another. So row t of an episode's observations is what its action t was taken at,
+and row t + 1 what came of it, also at its end. Arrays that are not compressed are mapped, not read. No torch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.datasets.manifest import Recipe, ShardRow, damaged, shard_file
+from powderdsl.worlds.files import failure, replacing
+
+Array = NDArray[Any]
+
+DTYPES = {
+    "observation": "|u1",
+    "action": "<i2",
+    "reward": "<f4",
+    "terminated": "|b1",
+    "truncated": "|b1",
+    "success": "|b1",
+    "length": "<i4",
+    "world": "<i8",
+}
+LEVEL = 1
+"""Of deflate. Higher levels take three to five times as long for a quarter less."""
+
+
+def shapes(recipe: Recipe, number: int, transitions: int) -> dict[str, tuple[int, ...]]:
+    """What shapes the arrays of a shard have."""
+    episodes = len(recipe.episodes_of(number))
+    flat = dict.fromkeys(("reward", "terminated", "truncated", "success"), (transitions,))
+    return {
+        "observation": (transitions + episodes, *recipe.shape),
+        "action": (transitions, 5),
+        **flat,
+        "length": (episodes,),
+        "world": (episodes,),
+    }
+
+
+def write_shard(
+    folder: Path, number: int, parts: Mapping[str, Sequence[Array]], *, compress: bool
+) -> ShardRow:
+    """Write a shard, each array in parts one behind another. Equal arrays make equal files.
+
+    Raises:
+        CompileError: PD613 if the place cannot be written, or the disk is full.
+    """
+    path = folder / shard_file(number)
+    with replacing(path) as temporary:
+        try:
+            with zipfile.ZipFile(temporary, "w") as archive:
+                for name, dtype in DTYPES.items():
+                    # Without a date, so that the bytes follow from the arrays alone.
+                    entry = zipfile.ZipInfo(f"{name}.npy")
+                    entry.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+                    entry._compresslevel = LEVEL  # type: ignore[attr-defined]
+                    values = [np.ascontiguousarray(part, dtype) for part in parts[name]]
+                    shape = (sum(map(len, values)), *values[0].shape[1:])
+                    header = {"descr": dtype, "fortran_order": False, "shape": shape}
+                    with archive.open(entry, "w", force_zip64=True) as member:
+                        np.lib.format.write_array_header_1_0(member, header)
+                        for value in values:
+                            member.write(value.data)
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            size = temporary.stat().st_size
+        except OSError as error:
+            raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
+    return ShardRow(number, digest, size, sum(map(len, parts["action"])))
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The arrays of a shard, as `DTYPES` and `shapes` have them; read-only."""
+
+    arrays: dict[str, Array]
+    loaded: int
+    """Bytes of these arrays that are in memory, and not mapped."""
+
+    @cached_property
+    def starts(self) -> Array:
+        """The first transition of each episode: int64 [episodes]. Its first observation is `starts` + its place."""
+        length = self.arrays["length"].astype(np.int64)
+        return np.cumsum(length) - length
+
+
+def is_whole(folder: Path, row: ShardRow) -> bool:
+    """Whether a shard's file is there, and what the manifest says it is."""
+    try:
+        with (folder / row.file).open("rb") as file:
+            if os.fstat(file.fileno()).st_size != row.bytes:
+                return False
+            return hashlib.file_digest(file, "sha256").hexdigest() == row.sha256
+    except OSError:
+        return False
+
+
+def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
+    """A shard, after looking at every byte of it once.
+
+    Raises:
+        CompileError: PD630, naming the shard and what is wrong with it.
+    """
+    path = folder / row.file
+    try:
+        if path.stat().st_size != row.bytes:
+            raise _Wrong(f"{path.stat().st_size:,} bytes instead of {row.bytes:,}")
+        if not is_whole(folder, row):
+            raise _Wrong("its SHA-256 is another than the manifest's")
+        shard = _read(path, shapes(recipe, row.number, row.transitions))
+        _check_episodes(shard.arrays, recipe)
+    except _Wrong as error:
+        raise _bad_shard(path, str(error)) from None
+    except OSError as error:
+        raise _bad_shard(path, error.strerror or str(error)) from None
+    except Exception as error:  # a damaged archive raises whatever its codec likes
+        raise _bad_shard(path, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
+    return shard
+
+
+class _Wrong(Exception):
+    """What is wrong with a shard."""
+
+
+def _bad_shard(path: Path, reason: str) -> Exception:
+    return damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it anew")
+
+
+def _read(path: Path, expected: dict[str, tuple[int, ...]]) -> Shard:
+    """The arrays of an archive that has just the expected ones."""
+    arrays: dict[str, Array] = {}
+    loaded = 0
+    whole = np.memmap(path, np.uint8, "r")
+    with zipfile.ZipFile(path) as archive:
+        if sorted(archive.namelist()) != sorted(f"{name}.npy" for name in expected):
+            raise _Wrong(f"it must hold {', '.join(expected)}, and nothing else")
+        for name, shape in expected.items():
+            entry = archive.getinfo(f"{name}.npy")
+            dtype = np.dtype(DTYPES[name])
+            size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+            with archive.open(entry) as member:
+                version = np.lib.format.read_magic(member)
+                if version != (1, 0):
+                    raise _Wrong(f"`{name}` has the npy version {version}")
+                header = np.lib.format.read_array_header_1_0(member, max_header_size=10_000)
+                if header != (shape, False, dtype):
+                    raise _Wrong(f"`{name}` is {header[2]} {list(header[0])}, not {dtype} {list(shape)}")
+                ahead = member.tell()
+                if entry.file_size != ahead + size:
+                    raise _Wrong(f"`{name}` has {entry.file_size - ahead:,} bytes, not {size:,}")
+                if entry.compress_type == zipfile.ZIP_STORED:
+                    start = _data_offset(whole, entry) + ahead
+                    arrays[name] = np.ndarray(shape, dtype, buffer=whole, offset=start)
+                else:
+                    arrays[name] = np.frombuffer(member.read(), dtype).reshape(shape)
+                    loaded += size
+    return Shard(arrays, loaded)
+
+
+def _data_offset(whole: Array, entry: zipfile.ZipInfo) -> int:
+    """Where a member's bytes begin: behind its local header, whose name and extra field have lengths of their own."""
+    at = entry.header_offset
+    name, extra = np.frombuffer(whole[at + 26 : at + 30].tobytes(), "<u2").tolist()
+    return int(at + 30 + name + extra)
+
+
+def _check_episodes(arrays: dict[str, Array], recipe: Recipe) -> None:
+    """Whether episodes end where they should, and actions are actions."""
+    length, action = arrays["length"].astype(np.int64), arrays["action"]
+    if length.min() < 1 or length.max() > recipe.actions or length.sum() != len(action):
+        raise _Wrong("the lengths of its episodes do not fit")
+    ended = arrays["terminated"].astype(np.int64) + arrays["truncated"]
+    last = np.zeros_like(ended)
+    last[np.cumsum(length) - 1] = 1
+    if not np.array_equal(ended, last):
+        raise _Wrong("episodes do not end where their lengths say")
+    if (action < 0).any() or (action >= np.array(recipe.action_nvec)).any():
+        raise _Wrong("it has actions out of range")
+    if (arrays["world"] < 0).any():
+        raise _Wrong("it has worlds out of range")

@@ -1,0 +1,177 @@
+"""`powderdsl record`."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from powderdsl.datasets import Dataset, record
+from powderdsl.envs import TensorEnv
+from powderdsl.envs.acting import action_keys
+from powderdsl.rl.policies import load_policy
+from powderdsl.tasks.episodes import compile_task
+from tests.cli.commands import command_line, environment_with, powderdsl
+from tests.envs.conftest import SMALL
+from tests.processes import waited
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> Path:
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL, encoding="utf-8")
+    return path
+
+
+def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    command = (
+        "record",
+        task,
+        "--out",
+        out,
+        "--episodes",
+        10,
+        "--shard",
+        4,
+        "--seed",
+        2,
+        "--backend",
+        "planes",
+    )
+    more = ("--knob", "disks=2", "--set", "water.melt=50%", "--split", "test", "--worlds", 5)
+    done = powderdsl(*command, *more, "--policy", "nothing", "--observation", "compact", "--compress")
+    assert done.exit_code == 0, done.stderr
+    assert done.stderr.startswith(f"{out}: 10 episodes, ")
+    recipe = Dataset.open(out).recipe
+    assert (recipe.knobs["disks"], recipe.params["water.melt"]) == (2, 0.5)
+    assert (recipe.split, recipe.worlds, recipe.policy, recipe.seed) == ("test", 5, "nothing", 2)
+    assert (recipe.observation, recipe.compress, recipe.shard) == ("compact", True, 4)
+    verified = powderdsl("record", "--verify", out)
+    assert verified.exit_code == 0
+    assert "10 episodes of small (test, nothing)" in verified.stdout
+    refused = powderdsl(*command, *more)
+    assert refused.exit_code == 2
+    for line in (
+        "policy: 'nothing', not 'random'",
+        "observation: 'compact', not 'ids'",
+        "compress: True, not False",
+    ):
+        assert line in refused.stderr
+    (out / "shard-000001.npz").write_bytes(b"no shard")
+    broken = powderdsl("record", "--verify", out)
+    assert broken.exit_code == 2
+    assert "shard-000001.npz: 8 bytes instead of" in broken.stderr
+
+
+def test_all_mistakes_are_told_at_once(task: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    found = powderdsl(
+        "record", task, "--out", tmp_path, "--split", "tst", "--knob", "disks", "--knob", "squares=3"
+    )
+    assert found.exit_code == 2
+    for words in (
+        "PD630",
+        "holds notes.txt",
+        "PD803",
+        "`squares`",
+        "missing --episodes",
+        "write --knob NAME=N",
+    ):
+        assert words in found.stderr
+    found = powderdsl(
+        "record", "destroying", "--out", tmp_path / "a/b", "--split", "tst", "--policy", "nothing"
+    )
+    assert found.exit_code == 2
+    for words in ("PD613", "PD801", "did you mean `test`", "missing --episodes", "may neither `blow`"):
+        assert words in found.stderr
+    found = powderdsl("record")
+    assert (found.exit_code, found.stderr) == (2, "error: missing TASK, --out, --episodes\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--verify", "gone"), "PD630"),
+        (("small", "--verify", "gone"), "--verify takes a folder"),
+        (("--seed", "-1"), "no whole number"),
+        (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
+        (("--observation", "matrix"), "matrix"),
+        (("sand-pushing", "--out", "d", "--episodes", "1", "--device", "tpu"), "PD701"),
+        (("sand-pushing", "--out", "d", "--episodes", "1", "--shard", "100000"), "may take"),
+    ],
+)
+def test_bad_values(
+    arguments: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = powderdsl("record", *arguments)
+    assert found.exit_code == 2
+    assert words in found.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+EPISODES = 600
+
+
+def recording(task: Path, out: Path) -> subprocess.Popen[str]:
+    """A process that has just written a shard and has many before it."""
+    given = ("--episodes", EPISODES, "--shard", 3, "--envs", 8, "--backend", "planes")
+    running = subprocess.Popen(
+        command_line("record", task, "--out", out, *given),
+        env=environment_with(),
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    seen = len(list(out.glob("shard-*")))
+    if not waited(lambda: len(list(out.glob("shard-*"))) > seen):
+        running.kill()
+        pytest.fail(f"nothing is recorded: {running.communicate()[1]}")
+    return running
+
+
+@pytest.mark.slow
+def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> None:
+    """Ctrl-C, SIGKILL at several moments, then what is left: the same bytes as without any of it."""
+    out, other = tmp_path / "data", tmp_path / "other"
+    running = recording(task, out)
+    running.send_signal(signal.SIGINT)
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert f"of {EPISODES} episodes" in said
+    assert "the same command goes on" in said
+    for delay in (0.0, 0.013, 0.037):
+        running = recording(task, out)
+        time.sleep(delay)
+        running.kill()
+        running.communicate()
+    program = compile_task(str(task), backend="planes")
+    for folder in (out, other):
+        record(program, "random", folder, episodes=EPISODES, shard=3)
+    names = sorted(path.name for path in out.glob("*shard*"))
+    assert len(names) == 200
+    assert [(out / name).read_bytes() for name in names] == [(other / name).read_bytes() for name in names]
+
+
+def test_a_trained_agent_is_recorded(task: Path, tmp_path: Path) -> None:
+    """It acts as it does elsewhere: on what it was trained to see, by the keys of the episode."""
+    run, out = tmp_path / "dunes", tmp_path / "data"
+    few = ("--preset", "small", "--observation", "compact", "--envs", 2, "--rollout", 4, "--batch", 8)
+    trained = powderdsl("train", task, "--run", run, *few, "--steps", 8, "--epochs", 1, "--backend", "planes")
+    assert trained.exit_code == 0, trained.stderr
+    command = ("record", task, "--out", out, "--episodes", 3, "--backend", "planes", "--policy", run)
+    assert powderdsl(*command).exit_code == 0
+    data = Dataset.open(out)
+    assert data.recipe.policy.startswith("dunes, checkpoint 000000000008-")
+    env = TensorEnv(str(task), 1, observation="compact", backend="planes", autoreset_mode="disabled")
+    policy = load_policy(run, env)
+    for number in range(3):
+        observed, _ = env.reset(seed=number)
+        for step, action in enumerate(data.episode(number).action):
+            acted = policy(observed, action_keys(0, torch.tensor([number]), step))
+            assert acted[0].tolist() == action.tolist()
+            observed = env.step(acted)[0]

@@ -1,0 +1,104 @@
+"""`train`, `evaluate` and `watch` as people type them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli.commands import powderdsl as run
+from tests.processes import waited
+from tests.rl.tiny_tasks import write_task
+
+QUICK = (
+    "--preset",
+    "small",
+    "--envs",
+    "4",
+    "--rollout",
+    "8",
+    "--batch",
+    "16",
+    "--epochs",
+    "1",
+    "--features",
+    "8",
+)
+
+
+def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_task(tmp_path)
+    trained = run("train", "task.yaml", *QUICK, "--backend", "planes", "--steps", "0.4e2", "--knob", "size=3")
+    assert trained.exit_code == 0, trained.output
+    assert "runs/task-seed0: 64 interactions" in trained.output
+    about = json.loads(Path("runs/task-seed0/run.json").read_text())
+    assert about["config"]["knobs"] == {"size": 3}
+    more = run("train", "--resume", "task-seed0", "--steps", "1e2")
+    assert "128 interactions" in more.output
+    table = run("evaluate", "task-seed0", "--episodes", "4", "--splits", "test").output
+    assert "after 128 interactions" in table
+    assert [line.split()[1] for line in table.splitlines()[-3:]] == ["trained", "random", "nothing"]
+    other = run("evaluate", "task.yaml", "--episodes", "4", "--format", "json", "--out", "found.json")
+    assert json.loads(Path("found.json").read_text()) == json.loads(other.output)
+    splits = json.loads(other.output)["splits"]
+    assert {name: list(scores) for name, scores in splits.items()} == {
+        name: ["random", "nothing"] for name in ("train", "test")
+    }
+
+
+def test_all_mistakes_are_said_at_once() -> None:
+    result = run("train", "sand-pushing", "--epochs", "0", "--batch", "1", "--gamma", "7", "--steps", "0")
+    assert result.exit_code == 2
+    assert result.output.count("error[PD640]") == 4
+    assert "4 errors" in result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("train",), "TASK"),
+        (("train", "sand-pulling"), "sand-pushing"),
+        (("train", "sand-pushing", "--steps", "1.5"), "1.5"),
+        (("train", "sand-pushing", "--split", "tset"), "no split"),
+        (("train", "sand-pushing", "--n-lines", "99"), "lines"),
+        (("train", "keep-ice", "--complexity", "3"), "no knob `complexity`"),
+        (("train", "sand-pushing", "--network", "paper", "--observation", "rgb"), "rgb"),
+        (("train", "--resume", "nowhere"), "nowhere"),
+        (("train", "sand-pushing", "--resume", "nowhere"), "--resume goes without TASK"),
+        (("train", "--resume", "nowhere", "--seed", "2"), "only steps"),
+        (("evaluate", "nowhere"), "PD620"),
+        (("evaluate", "sand-pushing", "--policies", "trained"), "random, nothing"),
+        (("evaluate", "nowhere", "--knob", "lines=2"), "a run has its own"),
+        (("watch", "nowhere"), "PD620"),
+        (("watch", "sand-pushing", "--policy", "trained"), "no trained policy"),
+        (("watch", "sand-pushing", "--out", "x.png"), ".gif .mp4"),
+        (("watch", "sand-pushing", "--scale", "32", "--worlds", "64", "--out", "no/x.gif"), "PD613"),
+    ],
+)
+def test_what_cannot_be_done(
+    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert said in result.output
+    assert not list(tmp_path.rglob("*.pt"))
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "powderdsl", "train", str(write_task(tmp_path)), *QUICK]
+    command += ["--run", str(tmp_path / "run"), "--steps", "1e9", "--backend", "planes"]
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    lines = tmp_path / "run" / "metrics.jsonl"
+    assert waited(lambda: lines.exists() and lines.read_text().count("\n") > 2)
+    child.send_signal(signal.SIGINT)
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == 130, said
+    assert f"powderdsl train --resume {tmp_path / 'run'}" in said
+    assert list((tmp_path / "run" / "checkpoints").glob("*.pt"))

@@ -1,0 +1,213 @@
+"""Minibatches are transitions that were recorded, drawn uniformly; they never reach over an episode's end."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from powderdsl.datasets import Dataset
+from powderdsl.datasets.dataset import Batch, drawn
+from powderdsl.datasets.flat import flat
+from powderdsl.datasets.manifest import Recipe, new_manifest, write_manifest
+from powderdsl.datasets.shards import write_shard
+from powderdsl.diagnostics import CompileError
+from powderdsl.envs import TensorEnv
+from powderdsl.tasks.episodes import TaskProgram, compile_task
+
+
+def numbered(folder: Path, recipe: Recipe, lengths: list[int], shard: int, *, compress: bool) -> Dataset:
+    """A dataset whose observations are (episode, number of the observation)."""
+    recipe = replace(
+        recipe,
+        episodes=len(lengths),
+        shard=shard,
+        shape=(1, 1, 2),
+        actions=max(lengths),
+        compress=compress,
+    )
+    rows = []
+    for number in range(recipe.shards):
+        parts = []
+        for episode in recipe.episodes_of(number):
+            length = lengths[episode]
+            ended = np.arange(length) == length - 1
+            parts.append(
+                {
+                    "observation": np.array([[[[episode, t]]] for t in range(length + 1)]),
+                    "action": np.zeros((length, 5)),
+                    "reward": np.arange(length) + 100 * episode,
+                    "terminated": ended & (episode % 2 == 0),
+                    "truncated": ended & (episode % 2 == 1),
+                    "success": ended,
+                    "length": np.array([length]),
+                    "world": np.array([episode]),
+                }
+            )
+        arrays = {name: [part[name] for part in parts] for name in parts[0]}
+        rows.append(write_shard(folder, number, arrays, compress=compress))
+    write_manifest(folder, replace(new_manifest(recipe), shards=tuple(rows)))
+    return Dataset.open(folder, memory=1)
+
+
+def windows_of(batch: Batch, lengths: list[int]) -> set[tuple[int, int]]:
+    """The (episode, first action) of each row of sequences [B, L], after checking that all its parts belong together."""
+    episode, t = batch.observation[..., 0, 0, 0], batch.observation[..., 0, 0, 1]
+    steps = torch.arange(t.shape[1])
+    assert (episode == episode[:, :1]).all(), "a sequence reaches over an episode's end"
+    assert (t == t[:, :1] + steps).all()
+    assert (batch.next_observation[..., 0, 0, 0] == episode).all()
+    assert (batch.next_observation[..., 0, 0, 1] == t + 1).all()
+    assert (batch.reward == t + 100 * episode.float()).all()
+    last = t + 1 == torch.tensor(lengths)[episode.long()]
+    assert (batch.terminated == (last & (episode % 2 == 0))).all()
+    assert (batch.truncated == (last & (episode % 2 == 1))).all()
+    assert (batch.success == last).all()
+    return {(int(a), int(b)) for a, b in zip(episode[:, 0], t[:, 0], strict=True)}
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    lengths=st.lists(st.integers(1, 9), min_size=1, max_size=12),
+    shard=st.integers(1, 5),
+    length=st.integers(1, 9),
+    seed=st.integers(0, (1 << 62) - 1),
+    compress=st.booleans(),
+)
+def test_sequences_are_all_windows_and_no_others(
+    lengths: list[int],
+    shard: int,
+    length: int,
+    seed: int,
+    compress: bool,
+    recorded: Dataset,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    data = numbered(tmp_path_factory.mktemp("n"), recorded.recipe, lengths, shard, compress=compress)
+    wanted = {(e, t) for e, n in enumerate(lengths) for t in range(n - length + 1)}
+    if not wanted:
+        with pytest.raises(ValueError, match=r"no episode has|length must be"):
+            data.sequences(length, 4, seed=seed)
+        return
+    found = windows_of(next(data.sequences(length, 3000, seed=seed)), lengths)
+    assert found == wanted
+    if length == 1:
+        one = next(data.transitions(3000, seed=seed))
+        assert one.reward.shape == (3000,)
+        assert windows_of(Batch(*(value[:, None] for value in one)), lengths) == wanted
+
+
+def test_transitions_are_those_that_were_recorded(recorded: Dataset) -> None:
+    known = set()
+    for number in range(len(recorded)):
+        one = recorded.episode(number)
+        for t in range(len(one.action)):
+            rest = (one.action[t], one.reward[t], one.observation[t + 1], one.terminated[t], one.truncated[t])
+            known.add(tuple(part.numpy().tobytes() for part in (one.observation[t], *rest)))
+    seen = set()
+    for batch in islice(recorded.transitions(64, seed=1), 30):
+        for row in zip(*(part.numpy() for part in batch[:6]), strict=True):
+            seen.add(tuple(part.tobytes() for part in row))
+    assert seen == known
+    assert [str(part.dtype) for part in batch] == [
+        "torch.uint8",
+        "torch.int16",
+        "torch.float32",
+        "torch.uint8",
+        "torch.bool",
+        "torch.bool",
+        "torch.bool",
+    ]
+
+
+def test_draws_are_uniform() -> None:
+    for below in (1, 7, 1000):
+        counts = np.bincount(drawn(5, 2, 50_000, below), minlength=below)
+        assert len(counts) == below
+        assert (abs(counts - 50_000 / below) < 5.5 * np.sqrt(50_000 / below)).all()
+    large = drawn(5, 2, 1000, 1 << 60)
+    assert len(set(large.tolist())) == 1000
+    assert large.max() > 1 << 59
+
+
+def test_minibatches_follow_from_seed_and_number(recorded: Dataset) -> None:
+    four = list(islice(recorded.transitions(16, seed=9), 4))
+    (again,) = islice(recorded.transitions(16, seed=9, start=3), 1)
+    assert all(torch.equal(a, b) for a, b in zip(four[3], again, strict=True))
+    (other,) = islice(recorded.transitions(16, seed=10), 1)
+    assert not torch.equal(four[0].observation, other.observation)
+    assert not torch.equal(four[0].observation, four[1].observation)
+
+
+def test_what_was_read_can_be_written_to(recorded: Dataset) -> None:
+    before = recorded.episode(0).observation.clone()
+    recorded.episode(0).observation.zero_()
+    next(recorded.transitions(500)).observation.zero_()
+    assert torch.equal(recorded.episode(0).observation, before)
+
+
+def test_workers_get_the_folder(recorded: Dataset) -> None:
+    next(recorded.transitions(4))
+    text = pickle.dumps(recorded)
+    assert len(text) < 1000
+    again = pickle.loads(text)
+    assert torch.equal(again.episode(7).observation, recorded.episode(7).observation)
+
+
+def test_numbers_that_there_are_not(recorded: Dataset) -> None:
+    for number in (-1, 20):
+        with pytest.raises(IndexError, match="there are 20"):
+            recorded.episode(number)
+    for call in (
+        lambda: recorded.transitions(0),
+        lambda: recorded.transitions(4, seed=-1),
+        lambda: recorded.sequences(7, 4),
+    ):
+        with pytest.raises(ValueError, match="must be a whole number"):
+            call()
+
+
+def test_data_of_another_meaning_is_refused(recorded: Dataset, small: TaskProgram) -> None:
+    recorded.require(TensorEnv(small, 1), same_rules=True)
+    with pytest.raises(CompileError) as caught:
+        recorded.require(TensorEnv("ice-bridge", 1, observation="compact", backend="dense"))
+    (found,) = caught.value.diagnostics
+    assert found.code == "PD631"
+    names = {note.split(":")[0].split(".")[0] for note in found.notes}
+    assert {"observation", "channels", "shape", "palette", "action_nvec", "choices"} <= names
+    melting = compile_task(
+        replace(
+            small.task,
+            ruleset=replace(
+                small.task.ruleset,
+                params=tuple(replace(one, default=1) for one in small.task.ruleset.params),
+            ),
+        ),
+        backend="dense",
+    )
+    recorded.require(TensorEnv(melting, 1))
+    with pytest.raises(CompileError, match="PD631"):
+        recorded.require(TensorEnv(melting, 1), same_rules=True)
+
+
+def test_the_flat_layouts(recorded: Dataset) -> None:
+    rows = flat(recorded)
+    raw = flat(recorded, "ogbench")
+    assert {name: len(value) for name, value in rows.items()} == dict.fromkeys(rows, recorded.steps)
+    assert (rows["terminals"] | rows["timeouts"]).sum() == len(recorded)
+    # OGBench's reader drops the rows where `terminals` is 1; the next observation is that of the row behind.
+    kept = raw["terminals"] == 0
+    assert np.array_equal(raw["observations"][kept], rows["observations"])
+    assert np.array_equal(raw["observations"][1:][kept[:-1]], rows["next_observations"])
+    assert np.array_equal(raw["actions"][kept], rows["actions"])
+    assert np.array_equal(raw["rewards"][kept], rows["rewards"])
+    assert np.array_equal(raw["masks"][kept] == 0, rows["terminals"])
+    with pytest.raises(ValueError, match="d4rl, ogbench"):
+        flat(recorded, "minari")

@@ -1,0 +1,167 @@
+"""Evaluating and watching: the same numbers as a loop by hand, in the worlds that were asked for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.draw import OUTLINES
+from powderdsl.envs.acting import action_keys, random_policy, uniforms
+from powderdsl.envs.observations import observation_of
+from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.rl import evaluate, load_policy, train
+from powderdsl.rl.films import HAND, film
+from powderdsl.rl.policy_evaluation import play
+from powderdsl.runs import RunFolder
+from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.shipped_tasks import load_task
+from tests.rl.tiny_tasks import quick, write_task
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    folder = tmp_path_factory.mktemp("runs")
+    return train(quick(write_task(folder), steps=32), folder / "run")
+
+
+@pytest.fixture(scope="module")
+def program(run: RunFolder) -> TaskProgram:
+    return compile_task(str(run.config["task"]), backend="planes")
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_scores_are_those_of_a_loop_by_hand(
+    run: RunFolder, program: TaskProgram, deterministic: bool
+) -> None:
+    found = evaluate(run, episodes=6, splits=["train"], deterministic=deterministic, seed=9)
+    policy = load_policy(run, TensorEnv(program, 1), deterministic=deterministic)
+    sight = observation_of("ids", program.simulator, program.task.size)
+    acts = {"trained": policy, "random": random_policy(program.action_nvec), "nothing": None}
+    by_hand = {}
+    for name, act in acts.items():
+        returns = []
+        for world in range(6):  # one by one: no policy's draws hang on the batch
+            episodes, total = program.start(torch.tensor([world])), 0.0
+            for step in range(4):
+                key = action_keys(9, torch.tensor([world]), step)
+                actions = None if act is None else act(sight.of(episodes.world), key)
+                episodes, reward, _, over = program.act(episodes, actions)
+                total += float(reward[0])
+                if over[0]:
+                    break
+            returns.append(total)
+        by_hand[name] = np.array(returns)
+    for score in found.scores:
+        returns = by_hand[score.policy]
+        assert score.mean == pytest.approx(returns.mean(), abs=1e-6)
+        assert score.interval == pytest.approx(1.96 * returns.std(ddof=1) / 6**0.5, abs=1e-6)
+        assert set(score.above) == {"random", "nothing"} - {score.policy}
+        for other, (mean, half) in score.above.items():
+            above = returns - by_hand[other]
+            assert mean == pytest.approx(above.mean(), abs=1e-6)
+            assert half == pytest.approx(1.96 * above.std(ddof=1) / 6**0.5, abs=1e-6)
+    assert by_hand["random"].std() > 0
+    assert json.loads((run.path / "evaluation.json").read_text()) == json.loads(json.dumps(found.as_json()))
+
+
+def test_all_splits_are_played_unless_some_are_asked_for(run: RunFolder) -> None:
+    found = evaluate(run, episodes=2, policies=["nothing"])
+    assert [(one.split, one.policy) for one in found.scores] == [("train", "nothing"), ("test", "nothing")]
+    assert found.step is None
+    task = load_task(str(run.config["task"]), knobs={"size": 3})
+    assert [one.policy for one in evaluate(task, episodes=2, splits=["test"]).scores] == ["random", "nothing"]
+    with pytest.raises(ValueError, match="trained"):
+        evaluate(task, policies=["trained"])
+    with pytest.raises(CompileError, match="no split"):
+        evaluate(run, splits=["tset"])
+
+
+def test_the_training_split_has_the_worlds_that_were_trained_on(tmp_path: Path) -> None:
+    run = train(quick(write_task(tmp_path), steps=32, worlds=2), tmp_path / "run")
+    score = evaluate(run, episodes=6, splits=["train"], policies=["nothing"]).scores[0]
+    program = compile_task(str(run.config["task"]), backend="planes")
+    assert score.mean == pytest.approx(float(play(program, None, torch.arange(2)).returns.mean()))
+
+
+def test_doing_nothing_is_what_the_rules_do_alone(program: TaskProgram) -> None:
+    worlds = torch.arange(3)
+    episodes = program.start(worlds)
+    alone = program.simulator.step(episodes.world, 4 * 2 + 3)
+    last = []
+    play(program, None, worlds, seen=last.append)
+    assert torch.equal(last[-1].ids, alone.ids)
+    assert torch.equal(last[-1]["velocity"], alone["velocity"])
+
+
+def test_draws_of_a_policy_are_even_and_hang_on_seed_episode_and_step() -> None:
+    numbers = torch.arange(2000)
+    keys = torch.stack([action_keys(seed, numbers, step) for seed in (0, 1) for step in (0, 1)])
+    assert len(keys.unique()) == keys.numel()
+    drawn = uniforms(keys.flatten(), 5)
+    assert float(drawn.min()) >= 0
+    assert float(drawn.max()) < 1
+    assert torch.allclose(drawn.mean(0), torch.full((5,), 0.5, dtype=torch.float64), atol=0.02)
+    assert float(torch.corrcoef(drawn.T).fill_diagonal_(0).abs().max()) < 0.05
+
+
+def test_sampled_actions_follow_the_policy(run: RunFolder, program: TaskProgram) -> None:
+    env = TensorEnv(program, 1)
+    policy = load_policy(run, env)
+    observed = env.reset(seed=0)[0].expand(4000, -1, -1, -1)
+    actions = policy(observed, action_keys(0, torch.arange(4000), 0))
+    assert actions.shape == (4000, 5)
+    wanted = policy.network.get_distribution(observed[:1].float()).distribution
+    for column, one in enumerate(wanted):  # type: ignore[arg-type]  # a list: one of each number of an action
+        found = torch.bincount(actions[:, column], minlength=env.action_nvec[column]) / 4000
+        assert torch.allclose(found, one.probs[0], atol=0.04)
+    likeliest = load_policy(run, env, deterministic=True)(observed[:1], torch.zeros(1, dtype=torch.int64))
+    assert likeliest[0].tolist() == [int(one.probs.argmax()) for one in wanted]  # type: ignore[union-attr]
+
+
+def test_a_policy_of_another_environment_is_refused(run: RunFolder, program: TaskProgram) -> None:
+    with pytest.raises(CompileError) as error:
+        load_policy(run, TensorEnv(program, 1, observation="compact"))
+    assert error.value.diagnostics[0].code == "PD623"
+    with pytest.raises(CompileError) as error:
+        load_policy(run, TensorEnv("keep-ice", 1, backend="torch"))
+    assert error.value.diagnostics[0].code == "PD623"
+
+
+def test_a_film_has_each_action_and_each_step(program: TaskProgram) -> None:
+    policy = random_policy(program.action_nvec)
+    played, pictures = film(program, policy, torch.arange(3), factor=4)
+    frames = list(pictures)
+    assert len(frames) == 1 + 4 * (1 + 2) + 3
+    assert {frame.shape for frame in frames} == {(2 + 64 + 14 + 2, 3 * (64 + 2) + 2, 3)}
+    assert torch.equal(played.returns, play(program, policy, torch.arange(3)).returns)
+    assert not (frames[0] == HAND).all(-1).any()
+    assert (frames[1] == HAND).all(-1).sum() >= 3 * (4 * 15 // 2)  # a corner's block has two edges at least
+    ids = program.start(torch.arange(3)).world.ids
+    colors = {element.id: element.color for element in program.task.ruleset.elements}
+    for world in range(3):
+        corner = frames[0][2 + 4 * 9, 2 + world * 66 + 4 * 7]
+        assert "#" + bytes(corner).hex().upper() == colors[int(ids[world, 9, 7])].upper()
+
+
+def test_films_show_regions(tmp_path: Path) -> None:
+    text = write_task(tmp_path).read_text()
+    path = write_task(
+        tmp_path, text.replace("generate:", "regions: {pit: box rows 4:8 columns 4:8}\ngenerate:", 1)
+    )
+    _, pictures = film(compile_task(str(path), backend="planes"), None, torch.arange(1), factor=3)
+    assert (next(pictures) == OUTLINES[0]).all(-1).sum() == 4 * (12 - 1)
+
+
+def test_a_film_is_written(run: RunFolder, tmp_path: Path) -> None:
+    from tests.cli.commands import powderdsl
+
+    result = powderdsl("watch", str(run.path), "--worlds", "2", "--backend", "planes", "--scale", "2")
+    assert result.exit_code == 0, result.output
+    with Image.open(run.path / "watch.gif") as image:
+        assert image.n_frames == 1 + 4 * (1 + 2) + 3  # type: ignore[attr-defined]

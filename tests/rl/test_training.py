@@ -1,0 +1,180 @@
+"""Training: what was killed goes on bit by bit, what does not fit is refused, and agents learn."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.rl import evaluate, preset, train
+from powderdsl.rl.ppo_config import HOW, from_json
+from powderdsl.runs import RunFolder, read_run
+from powderdsl.runs.metrics import read_metrics
+from tests.rl.tiny_tasks import PLACE, quick, write_task
+from tests.states import same
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> Path:
+    return write_task(tmp_path)
+
+
+def lasting(run: RunFolder) -> dict[str, Any]:
+    """The newest state without times of day."""
+    state = dict(run.checkpoint().state)
+    state["episodes"] = [one[:2] for one in state["episodes"]]
+    state["logged"] = {name: one for name, one in state["logged"].items() if not name.startswith("time/")}
+    return state
+
+
+def logged(run: RunFolder) -> list[dict[str, Any]]:
+    """The metrics without times of day, and without the count of rollouts since the last start."""
+    return [
+        {name: value for name, value in line.items() if not name.startswith("time/")}
+        for line in read_metrics(run.path)
+    ]
+
+
+@pytest.mark.parametrize("network", ["small", "paper"])
+def test_a_run_in_parts_is_a_run_at_once(task: Path, tmp_path: Path, network: str) -> None:
+    whole = train(quick(task, network=network), tmp_path / "whole")
+    for steps in (10, 33, 96):
+        parts = train(quick(task, network=network, steps=steps), tmp_path / "parts")
+    assert parts.checkpoint().step == whole.checkpoint().step == 96
+    assert same(lasting(parts), lasting(whole))
+    assert logged(parts) == logged(whole)
+    assert [line["step"] for line in logged(whole)] == [32, 64, 96]
+
+
+def test_other_seeds_give_other_weights(task: Path, tmp_path: Path) -> None:
+    runs = [train(quick(task, seed=seed, steps=32), tmp_path / str(seed)) for seed in (0, 1)]
+    assert not same(*(lasting(run)["policy"] for run in runs))
+
+
+def test_a_run_that_is_done_stays_as_it_is(task: Path, tmp_path: Path) -> None:
+    run = train(quick(task, steps=32), tmp_path / "run")
+    path, when = run.checkpoint().path, run.checkpoint().path.stat().st_mtime_ns
+    train(quick(task, steps=32), tmp_path / "run")
+    assert run.checkpoint().path == path
+    assert path.stat().st_mtime_ns == when
+
+
+TRAINING = """
+import json, sys
+from powderdsl.rl import train
+from powderdsl.rl.ppo_config import from_json
+train(from_json(json.loads(sys.argv[2])), sys.argv[1], progress=lambda step, mean: print(step, flush=True))
+"""
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_ends_as_if_it_had_not_been(task: Path, tmp_path: Path) -> None:
+    config, chance = quick(task, steps=640), random.Random(3)
+    folder, gone_on = tmp_path / "killed", []
+    command = [sys.executable, "-c", TRAINING, str(folder), json.dumps(config.as_json())]
+    for _ in range(3):
+        child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert child.stdout is not None
+        gone_on.append(int(child.stdout.readline()))
+        for _ in range(chance.randint(10, 50)):
+            child.stdout.readline()
+        time.sleep(chance.uniform(0, 0.05))  # in the middle of an update or of saving, now and then
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+        assert child.returncode == -signal.SIGKILL
+    assert gone_on[0] == 4  # worlds
+    assert 4 < gone_on[1] < gone_on[2] < 640
+    run, whole = train(config, folder), train(config, tmp_path / "whole")
+    assert run.checkpoint().step == whole.checkpoint().step == 640
+    assert same(lasting(run), lasting(whole))
+    assert logged(run) == logged(whole)
+
+
+def test_an_interrupted_run_saves_what_it_has(task: Path, tmp_path: Path) -> None:
+    def stop(step: int, mean: float | None) -> None:
+        if step >= 76:
+            raise KeyboardInterrupt
+
+    config = quick(task, checkpoint_minutes=60.0)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path / "run", progress=stop)
+    assert read_run(tmp_path / "run").checkpoint().step == 64
+    assert same(lasting(train(config, tmp_path / "run")), lasting(train(config, tmp_path / "whole")))
+
+
+def test_a_damaged_checkpoint_is_passed_over(task: Path, tmp_path: Path) -> None:
+    config = quick(task)
+    run = train(config, tmp_path / "run")
+    expected = lasting(run)
+    newest = run.checkpoint().path
+    newest.write_bytes(newest.read_bytes()[:-1000])
+    assert run.checkpoint().step == 64
+    assert same(lasting(train(config, tmp_path / "run")), expected)
+
+
+def test_another_configuration_is_refused(task: Path, tmp_path: Path) -> None:
+    config = quick(task, steps=32)
+    train(config, tmp_path / "run")
+    with pytest.raises(CompileError) as error:
+        train(quick(task, steps=32, seed=1, epochs=3), tmp_path / "run")
+    assert [one.code for one in error.value.diagnostics] == ["PD621"]
+    assert [note.split(" ")[0] for note in error.value.diagnostics[0].notes] == ["`epochs`", "`seed`"]
+    task.write_text(task.read_text().replace("/ 10", "/ 20"))
+    with pytest.raises(CompileError) as error:
+        train(config, tmp_path / "run")
+    assert "task_fingerprint" in error.value.diagnostics[0].notes[0]
+
+
+def test_random_numbers_of_the_caller_stay(task: Path, tmp_path: Path) -> None:
+    random.seed(1), np.random.seed(1), torch.manual_seed(1)
+    expected = random.random(), np.random.rand(), torch.rand(1).item()
+    random.seed(1), np.random.seed(1), torch.manual_seed(1)
+    train(quick(task, steps=32), tmp_path / "run")
+    assert (random.random(), np.random.rand(), torch.rand(1).item()) == expected
+
+
+def test_all_mistakes_are_named() -> None:
+    with pytest.raises(CompileError) as error:
+        preset("smal", "dig", batch=1, epochs=0.5, gamma=float("nan"), network="big", envz=3, task_=0)
+    text = " ".join(one.message for one in error.value.diagnostics)
+    assert {one.code for one in error.value.diagnostics} == {"PD640"}
+    for word in ("`smal`", "`batch` is 1", "`epochs` is 0.5", "`gamma` is nan", "`network`", "`envz`"):
+        assert word in text
+    assert len(error.value.diagnostics) == 7
+
+
+def test_settings_survive_json() -> None:
+    config = preset("small", "dig", knobs={"size": 3}, params={"wind.x": "5%"}, network="paper")
+    assert config.observation == "compact"
+    assert from_json(json.loads(json.dumps(config.as_json()))) == config
+    assert not set(HOW) & config.identity.keys()
+
+
+def test_an_agent_learns(tmp_path: Path) -> None:
+    config = quick(write_task(tmp_path, PLACE), steps=1536, envs=16, batch=64, learning_rate=1e-2)
+    run = train(config, tmp_path / "run")
+    trained, at_random, nothing = evaluate(run, episodes=128).scores
+    assert (trained.policy, at_random.policy, nothing.policy) == ("trained", "random", "nothing")
+    assert trained.mean > 1.8  # of 2
+    assert at_random.mean < 1.2
+    mean, half = trained.above["random"]
+    assert half is not None
+    assert mean - half > 0.5
+    assert nothing.mean == 0
+
+
+def test_training_leaves_nothing_half_written(task: Path, tmp_path: Path) -> None:
+    run = train(quick(task, steps=32), tmp_path / "run")
+    assert not [name for name in os.listdir(run.path / "checkpoints") if not name.endswith(".pt")]
+    assert run.about["config"]["epochs"] == 2

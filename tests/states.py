@@ -1,0 +1,18 @@
+"""Comparing nested states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two nests of tensors and values are equal, bit by bit."""
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return bool(a == b)
