@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -90,7 +90,7 @@ def _score(predict: Network, starts: Tensor, ends: Tensor, slots: int) -> Score:
 class Table:
     """A baseline: log-probabilities of what a cell becomes, by what it holds. A callable as networks are.
 
-    `chances` is float [slots, slots]: a row for each start element, which sums to 1.
+    `chances` is float64 [slots, slots]: a row for each start element, which sums to 1.
     """
 
     def __init__(self, chances: Tensor):
@@ -109,25 +109,26 @@ def outcomes(pairs: Iterable[Pairs], slots: int) -> Tensor:
     return counts
 
 
-def still(counts: Tensor, elements: int) -> Table:
+def still(counts: Tensor, ids: Sequence[int]) -> Table:
     """ "Nothing changes": a cell stays with one chance, and becomes each of the other elements with an equal share.
 
     The chance is the one with the lowest cross-entropy on the counted pairs: the share of cells that stayed, with one
-    cell that stayed and one that did not counted besides.
+    cell that stayed and one that did not counted besides. `ids` are those of the elements that there are.
     """
-    slots, cells = len(counts), int(counts.sum())
-    stays = (int(counts.diagonal().sum()) + 1) / (cells + 2)
-    chances = torch.full((slots, slots), (1 - stays) / max(elements - 1, 1), dtype=torch.float64)
+    stays = (int(counts.diagonal().sum()) + 1) / (int(counts.sum()) + 2)
+    chances = torch.zeros(len(counts), len(counts), dtype=torch.float64)
+    chances[:, list(ids)] = (1 - stays) / max(len(ids) - 1, 1)
     return Table(chances.fill_diagonal_(stays))
 
 
-def frequent(counts: Tensor, elements: int) -> Table:
+def frequent(counts: Tensor, ids: Sequence[int]) -> Table:
     """ "Most frequent outcome": for each start element the counted shares of what it became.
 
-    One cell is counted besides for each element that it may become, so that no chance is 0.
+    One cell is counted besides for each element that it may become, those of `ids`, so that no chance of these is 0.
     """
-    seen = counts.double() + 1
-    return Table(seen / (counts.sum(1, keepdim=True) + elements))
+    seen = counts.double()
+    seen[:, list(ids)] += 1
+    return Table(seen / seen.sum(1, keepdim=True))
 
 
 @dataclass(frozen=True)
@@ -205,11 +206,11 @@ def evaluate(
     )
     data = trained.config.data
     slots, names = len(trained.palette), found.names
-    elements = len(found.rules.elements)
+    ids = [element.id for element in found.rules.elements]
     predictors: dict[str, Network] = {
         MODEL: trained.network,
-        STILL: still(fit, elements),
-        FREQUENT: frequent(fit, elements),
+        STILL: still(fit, ids),
+        FREQUENT: frequent(fit, ids),
     }
     many = worlds or (4 if len(names) > 1 else 32)
     scores = {}

@@ -1,0 +1,272 @@
+"""Training: what is learned, that kills change nothing, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.runs import RunFolder
+from powderdsl.runs.metrics import read_metrics
+from powderdsl.worldmodel import (
+    DataConfig,
+    Machine,
+    TrainConfig,
+    evaluate,
+    finetuned,
+    load_trained,
+    train,
+)
+from powderdsl.worldmodel.training import Moment
+from tests.processes import waited
+
+HERE = Machine(backend="dense")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def tiny(task: str, **changes: object) -> TrainConfig:
+    data = DataConfig(task=task, states=500, steps=2, pairs=4, capacity=64, refresh=3)
+    config = TrainConfig(data, width=4, iterations=30, batch=4, learning_rate=0.005, seed=3)
+    return replace(config, **changes)  # type: ignore[arg-type]
+
+
+def few(config: TrainConfig) -> TrainConfig:
+    """On worlds that all fit into the buffer: no time goes into making others."""
+    return replace(config, data=replace(config.data, states=60, capacity=240))
+
+
+def weights(run: RunFolder) -> dict[str, Tensor]:
+    found: dict[str, Tensor] = run.checkpoint().state["model"]
+    return found
+
+
+def same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def lines(run: RunFolder) -> list[tuple[int, float]]:
+    return [(line["step"], line["loss/train"]) for line in read_metrics(run.path)]
+
+
+def codes(error: pytest.ExceptionInfo[CompileError]) -> list[str]:
+    return [one.code for one in error.value.diagnostics]
+
+
+def test_a_network_learns_what_baselines_cannot_know(garden: str, tmp_path: Path) -> None:
+    config = few(tiny(garden, width=6, iterations=250, batch=8))
+    trained = load_trained(train(config, tmp_path / "run", machine=HERE))
+    tested = evaluate(trained, split="train", worlds=8, machine=HERE)
+    (scores,) = tested.scores.values()
+    losses = {name: one.loss for name, one in scores.items()}
+    assert losses["model"] < 0.3 * min(losses["nothing changes"], losses["most frequent outcome"]), losses
+    assert (scores["model"].changed_accuracy or 0) > 0.9
+
+
+def test_an_interrupted_run_goes_on_as_if_nothing_had_been(dunes: str, tmp_path: Path) -> None:
+    config = tiny(dunes)
+    whole = train(config, tmp_path / "whole", machine=HERE)
+
+    for stop in (7, 13, 14):
+
+        def interrupt(now: Moment, stop: int = stop) -> None:
+            if now.done == stop:
+                signal.raise_signal(signal.SIGINT)
+
+        with pytest.raises(KeyboardInterrupt):
+            train(config, tmp_path / "parts", machine=HERE, tell=interrupt)
+    parts = train(config, tmp_path / "parts", machine=HERE)
+    assert same(weights(parts), weights(whole))
+    assert lines(parts) == lines(whole)
+    assert [step for step, _ in lines(whole)] == [10, 20, 30]
+    assert same(weights(train(config, tmp_path / "parts", machine=HERE)), weights(whole))  # it is done
+
+
+CHILD = """
+import json, sys, time, torch
+from powderdsl.worldmodel import Machine, TrainConfig, train
+torch.set_num_threads(1)
+config = TrainConfig.of(json.loads(sys.argv[1]))
+train(config, sys.argv[2], machine=Machine(backend="dense"), save_seconds=0.1, tell=lambda now: time.sleep(0.01))
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> None:
+    config = tiny(dunes, iterations=100)
+    folder = tmp_path / "killed"
+    for kill in range(3):
+        command = [sys.executable, "-c", CHILD, json.dumps(asdict(config)), str(folder)]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE)
+        before = {path.name for path in (folder / "checkpoints").glob("*.pt")}
+        seen = waited(lambda: {path.name for path in (folder / "checkpoints").glob("*.pt")} - before, 120)  # noqa: B023
+        time.sleep(0.037 * kill)
+        assert seen, process.communicate()
+        assert process.poll() is None, "it ended before it could be killed"
+        process.kill()
+        process.communicate()
+    run = train(config, folder, machine=HERE)
+    whole = train(config, tmp_path / "whole", machine=HERE)
+    assert same(weights(run), weights(whole))
+    assert lines(run) == lines(whole)
+
+
+def test_a_run_can_go_on_longer_only_as_another(dunes: str, tmp_path: Path) -> None:
+    config = tiny(dunes, iterations=2)
+    train(config, tmp_path / "run", machine=HERE)
+    with pytest.raises(CompileError) as error:
+        train(replace(config, seed=4, width=5), tmp_path / "run", machine=HERE)
+    assert codes(error) == ["PD621"]
+    assert error.value.diagnostics[0].notes == (
+        "`seed` is 3 there, 4 here",
+        "`width` is 4 there, 5 here",
+    )
+
+
+def test_a_changed_task_file_is_another_run(dunes: str, tmp_path: Path) -> None:
+    config = tiny(dunes, iterations=1)
+    train(config, tmp_path / "run", machine=HERE)
+    path = Path(dunes)
+    path.write_text(path.read_text(encoding="utf-8").replace("half 1..4", "half 1..5"), encoding="utf-8")
+    with pytest.raises(CompileError) as error:
+        train(config, tmp_path / "run", machine=HERE)
+    assert codes(error) == ["PD621"]
+    assert "`worlds`" in error.value.diagnostics[0].notes[0]
+
+
+class Own(nn.Module):
+    """Somebody's network."""
+
+    def __init__(self, slots: int):
+        super().__init__()
+        self.table = nn.Embedding(256, slots)
+
+    def forward(self, ids: Tensor) -> Tensor:
+        found: Tensor = self.table(ids.long()).permute(0, 3, 1, 2)
+        return found
+
+
+def test_other_networks_are_trained_and_tested_too(dunes: str, tmp_path: Path) -> None:
+    config = few(tiny(dunes, iterations=100, learning_rate=0.05))
+    run = train(config, tmp_path / "run", machine=HERE, network=Own(10))
+    tested = evaluate(load_trained(run, network=Own(10)), split="train", worlds=8, machine=HERE)
+    # A table of elements can learn one thing: each one's most frequent outcome.
+    assert tested.mean("model") == pytest.approx(tested.mean("most frequent outcome"), rel=0.25)
+    with pytest.raises(ValueError, match=r"logits \[4, 10, 14, 18\], found \[4, 9, 14, 18\]"):
+        train(config, tmp_path / "other", machine=HERE, network=Own(9))
+    with pytest.raises(CompileError) as error:
+        load_trained(run)
+    assert codes(error) == ["PD623"]
+    assert "weights are those of another network" in error.value.diagnostics[0].notes[0]
+
+
+def test_held_out_packs_are_plugged_in(dunes: str, tmp_path: Path) -> None:
+    config = few(tiny(dunes, iterations=40))
+    config = replace(config, data=replace(config.data, rules="core+sand+water", knobs={"kinds": 1}))
+    trained = load_trained(train(config, tmp_path / "run", machine=HERE))
+    assert trained.palette[9] == "stone.stone"
+    tuned = finetuned(trained, ["stone"], iterations=60)
+    assert (tuned.data.rules, tuned.data.only, tuned.data.knobs) == ("core+sand+water+stone", ("stone",), {})
+    assert tuned.parent == trained.checkpoint.path.name
+    parent = trained.checkpoint
+    run = train(tuned, tmp_path / "tuned", machine=HERE, parent=parent)
+    before = evaluate(trained, split="train", rules=tuned.data.rules, only=("stone",), knobs={}, machine=HERE)
+    after = evaluate(load_trained(run), split="train", machine=HERE)
+    assert (before.rules, before.only) == (after.rules, after.only)
+    assert after.mean("nothing changes") == pytest.approx(before.mean("nothing changes"), rel=0.5)
+    assert after.mean("model") < before.mean("model")
+    assert "stone.stone" in after.plain()["elements"]
+    assert "sand.sand" not in {name for name, one in after.plain()["elements"].items() if one["cells"]}
+    # The parent's weights are where it began.
+    again = train(
+        replace(tuned, iterations=1, learning_rate=1e-12), tmp_path / "still", machine=HERE, parent=parent
+    )
+    assert all(torch.allclose(weights(again)[n], w, atol=1e-9) for n, w in weights(trained.run).items())
+
+
+def test_stands_are_tested_one_by_one(dunes: str, tmp_path: Path) -> None:
+    trained = load_trained(train(tiny(dunes, iterations=2), tmp_path / "run", machine=HERE))
+    tested = evaluate(trained, split="two", worlds=3, machine=HERE)
+    assert list(tested.scores) == ["falling", "lying"]
+    assert all(one["model"].cells == 3 * 4 * 14 * 18 for one in tested.scores.values())
+    plain = json.loads(json.dumps(tested.plain()))
+    losses = [plain["tests"][name]["model"]["loss"] for name in ("falling", "lying")]
+    assert plain["mean"]["model"]["loss"] == pytest.approx(sum(losses) / 2)
+    without = evaluate(trained, split="two", rules="core+sand+water", worlds=1, machine=HERE)
+    assert list(without.scores) == ["falling"]
+    assert without.plain()["left_out"] == {"lying": ["stone"]}
+
+
+def test_rules_of_other_elements_are_refused(dunes: str, garden: str, tmp_path: Path) -> None:
+    trained = load_trained(train(tiny(dunes, iterations=1), tmp_path / "run", machine=HERE))
+    with pytest.raises(CompileError) as error:
+        evaluate(trained, split="train", rules="core+lava+cloner", machine=HERE)
+    assert codes(error) == ["PD623"]
+    assert error.value.diagnostics[0].notes == (
+        "id 10 is `lava.lava` here; there are 10 slots there",
+        "id 13 is `cloner.cloner` here; there are 10 slots there",
+    )
+    moss = Path(garden).with_name("moss.yaml")
+    moss.write_text(moss.read_text(encoding="utf-8").replace("id: 5", "id: 2"), encoding="utf-8")
+    with pytest.raises(CompileError) as error:
+        evaluate(trained, split="train", rules=f"core+{moss}", machine=HERE)
+    assert error.value.diagnostics[0].notes == ("id 2 is `sand.sand` there, `moss.moss` here",)
+
+
+def test_damaged_runs_are_refused(dunes: str, tmp_path: Path) -> None:
+    run = train(tiny(dunes, iterations=1), tmp_path / "run", machine=HERE)
+    (path,) = (run.path / "checkpoints").glob("*.pt")
+    data = path.read_bytes()
+    path.write_bytes(data[:-20])
+    with pytest.raises(CompileError) as error:
+        load_trained(run.path)
+    assert codes(error) == ["PD620"]
+    path.write_bytes(data)
+    about = json.loads((run.path / "run.json").read_text())
+    for change in ({"width": 8}, {"palette": ["a", "b"]}):
+        (run.path / "run.json").write_text(json.dumps({**about, "config": {**about["config"], **change}}))
+        with pytest.raises(CompileError) as error:
+            load_trained(run.path)
+        assert codes(error) == ["PD623"]
+    for change in ({"width": "wide"}, {"data": 3}, {"palette": 1}, {"width": 10**9}):
+        (run.path / "run.json").write_text(json.dumps({**about, "config": {**about["config"], **change}}))
+        with pytest.raises(CompileError) as error:
+            load_trained(run.path)
+        assert codes(error) == ["PD620"]
+    with pytest.raises(CompileError) as error:
+        load_trained(tmp_path / "nowhere")
+    assert codes(error) == ["PD620"]
+
+
+def test_a_loss_that_is_no_number_ends_a_run(dunes: str, tmp_path: Path) -> None:
+    with pytest.raises(CompileError) as error:
+        train(tiny(dunes, learning_rate=1e30), tmp_path / "run", machine=HERE)
+    assert codes(error) == ["PD624"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"width": 0},
+        {"iterations": 0},
+        {"batch": -1},
+        {"learning_rate": 0.0},
+        {"learning_rate": float("nan")},
+        {"seed": -1},
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        TrainConfig(**wrong)  # type: ignore[arg-type]

@@ -1,0 +1,134 @@
+"""Worlds under other rules: elements keep their ids, draws keep to what is there."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import powderdsl
+from powderdsl.diagnostics import CompileError
+from powderdsl.tasks.episodes import compile_task
+from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.worldmodel import DataConfig, task_worlds
+from powderdsl.worldmodel.rule_words import add, keep, leave_out
+from powderdsl.worldmodel.training import palette_of
+from powderdsl.worldmodel.watched import watched
+
+PAPER = ("empty", "sand", "water", "wall", "plant", "fire", "wood", "ice", "lava", "dust", "cloner")
+
+
+def ids_in(config: DataConfig, seeds: int = 60) -> set[str]:
+    """Names of the elements that start worlds hold."""
+    worlds = task_worlds(config, backend="reference")
+    found = worlds.start(torch.arange(seeds)).ids.unique().tolist()
+    return {element.name for element in worlds.rules.elements if element.id in found}
+
+
+def test_under_its_own_rules_a_task_is_as_it_was() -> None:
+    worlds = task_worlds(DataConfig(), backend="reference")
+    seeds = torch.arange(20)
+    same = compile_task("world-model", backend="reference").start(seeds)
+    assert torch.equal(worlds.start(seeds).ids, same.world.ids)
+
+
+def test_packs_that_are_left_out_are_never_drawn_and_channels_stay() -> None:
+    config = DataConfig(rules="powderworld-gas-stone-acid")
+    assert ids_in(config) == set(PAPER)
+    rules = powderdsl.load("powderworld")
+    palette = palette_of(config, powderdsl.load(config.rules))
+    assert len(palette) == 14
+    assert palette == [one.qualified for one in sorted(rules.elements, key=lambda one: one.id)]
+
+
+def test_only_some_packs_are_drawn() -> None:
+    assert ids_in(DataConfig(only=("gas", "stone", "acid"))) == {"empty", "wall", "gas", "stone", "acid"}
+    assert ids_in(DataConfig(split="held_out")) == {"empty", "wall", "gas", "stone", "acid"}
+    assert ids_in(DataConfig(only=("lava",))) == {"empty", "wall", "lava"}
+
+
+def test_kinds_say_how_many_elements_there_are() -> None:
+    for kinds in (1, 4):
+        assert ids_in(DataConfig(knobs={"kinds": kinds})) == {"wall", *PAPER[: kinds + 1]}
+
+
+def test_stands_that_rules_cannot_have_are_left_out_or_refused() -> None:
+    config = DataConfig(split="designed", rules="powderworld-gas-stone-acid")
+    found = task_worlds(config, backend="reference", partly=True)
+    assert found.names == ("sand-on-water", "ice-and-plants", "burning-vines", "water-flowing")
+    assert {name: lacking for name, lacking, _ in found.found.missing} == {
+        "stone-arches": ("stone",),
+        "acid-on-wood": ("acid",),
+        "dust-on-lava": ("stone",),
+        "gas-flowing": ("gas",),
+    }
+    full = task_worlds(DataConfig(split="designed"), backend="reference")
+    kept = [full.names.index(name) for name in found.names]
+    assert torch.equal(found.start(torch.arange(4)).ids, full.start(torch.arange(8)).ids[kept])
+    with pytest.raises(CompileError) as error:
+        task_worlds(config, backend="reference")
+    assert [one.code for one in error.value.diagnostics] == ["PD604"] * 4
+
+
+def test_a_draw_without_elements_is_refused_at_its_line() -> None:
+    with pytest.raises(CompileError) as error:
+        task_worlds(DataConfig(split="held_out", rules="core+sand"), backend="reference")
+    (found,) = error.value.diagnostics
+    assert found.code == "PD604"
+    assert found.primary.span is not None
+    assert "(gas, stone, acid)" in found.primary.span.text
+    assert found.notes == ("they need gas, stone, acid",)
+
+
+def test_ids_follow_names_where_rules_number_them_otherwise(tmp_path, garden: str) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "other").mkdir()
+    other = tmp_path / "other" / "moss.yaml"
+    other.write_text((tmp_path / "moss.yaml").read_text().replace("id: 5", "id: 9"))
+    own = task_worlds(DataConfig(task=garden), backend="reference")
+    moved = task_worlds(DataConfig(task=garden, rules=f"core+{other}"), backend="reference")
+    seeds = torch.arange(5)
+    before, after = own.start(seeds).ids, moved.start(seeds).ids
+    assert (before == 5).any()
+    assert torch.equal(torch.where(before == 5, 9, before), after)
+
+
+def test_an_unknown_pack_is_refused() -> None:
+    with pytest.raises(CompileError) as error:
+        task_worlds(DataConfig(only=("gass",)), backend="reference")
+    (found,) = error.value.diagnostics
+    assert (found.code, found.helps) == ("PD304", ("did you mean `gas`?",))
+
+
+@pytest.mark.parametrize(
+    ("made", "rules"),
+    [
+        (leave_out("powderworld", ["lava"]), "powderworld-lava"),
+        (leave_out("powderworld-gas", ["lava", "gas"]), "powderworld-gas-lava"),
+        (add("powderworld-gas-stone-acid", ["stone", "gas"]), "powderworld-acid"),
+        (add("core+sand", ["sand", "water"]), "core+sand+water"),
+        (add("core+sand-sand", ["sand"]), "core+sand"),
+    ],
+)
+def test_packs_come_and_go_in_what_stands_for_rules(made: str, rules: str) -> None:
+    assert powderdsl.load(made).packs == powderdsl.load(rules).packs
+    assert made.count("-") == rules.count("-")
+
+
+def test_some_packs_of_rules_keep_their_channels() -> None:
+    rules = powderdsl.load(keep("powderworld", ["core", "sand", "water"]))
+    assert (rules.packs, rules.slots) == (("core", "sand", "water"), 14)
+
+
+def test_any_pack_can_be_the_held_out_one_that_no_other_needs() -> None:
+    task = load_task("world-model")
+    refused = []
+    for pack in task.ruleset.packs:
+        try:
+            rules = powderdsl.load(leave_out("powderworld", [pack]))
+        except CompileError as error:
+            refused.append((pack, error.diagnostics[0].code))
+            continue
+        variant = watched(task, "train", rules).task.splits[0].variants[0]
+        drawn = {rules_id for group in variant.groups for one in group.drawings for rules_id in one.ids}
+        assert drawn == {element.id for element in task.ruleset.elements if element.pack != pack}
+    assert [pack for pack, _ in refused] == ["core", "water"]
+    assert ("water", "PD305") in refused  # another pack needs it

@@ -1,0 +1,142 @@
+"""`powderdsl wm` from end to end, on worlds that take no time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from powderdsl.compiler import load
+from tests.cli.commands import ROOT
+from tests.cli.commands import powderdsl as run
+from tests.processes import waited
+
+QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 100, "--backend", "dense")
+
+
+def begin(task: str, folder: Path, *more: object) -> tuple[object, ...]:
+    return "wm", "train", "--task", task, "--run", folder, *QUICK, *more
+
+
+def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
+    folder, tuned = tmp_path / "run", tmp_path / "tuned"
+    trained = run(*begin(dunes, folder, "--held-out", "stone", "--iterations", 5, "--knob", "squares=2"))
+    assert trained.exit_code == 0, trained.output
+    about = json.loads((folder / "run.json").read_text())
+    assert load(about["config"]["data"]["rules"]).packs == ("core", "sand", "water")
+    assert about["config"]["data"]["knobs"] == {"squares": 2}
+    assert about["config"]["palette"][9] == "stone.stone"
+    assert about["versions"]["torch"]
+    assert (folder / "metrics.jsonl").read_text().count("loss/train") == 1
+
+    told = run("wm", "eval", folder, "--split", "two", "--worlds", 1, "--backend", "dense")
+    assert told.exit_code == 0, told.output
+    assert "falling" in told.stdout
+    assert "left out: lying, which needs stone" in told.stdout
+    kept = json.loads((folder / "evaluation.json").read_text())
+    assert list(kept["tests"]) == ["falling"]
+
+    result = run(
+        *(
+            "wm",
+            "finetune",
+            folder,
+            "--packs",
+            "stone",
+            "--iterations",
+            3,
+            "--run",
+            tuned,
+            "--backend",
+            "dense",
+        )
+    )
+    assert result.exit_code == 0, result.output
+    about = json.loads((tuned / "run.json").read_text())
+    assert about["config"]["data"]["only"] == ["stone"]
+    assert about["config"]["parent"] in {path.name for path in (folder / "checkpoints").iterdir()}
+    assert about["parent"] == {"path": str(folder), "iterations": 5}
+    found = run(
+        *("wm", "eval", tuned, "--split", "train", "--worlds", 2, "--format", "json", "--backend", "dense")
+    )
+    data = json.loads(found.stdout)
+    assert (data["only"], data["iterations"]) == (["stone"], 3)
+    assert set(data["mean"]) == {"model", "nothing changes", "most frequent outcome"}
+
+    out = tmp_path / "strips.png"
+    shown = run("wm", "show", tuned, "--split", "two", "--steps", 16, "--out", out, "--backend", "dense")
+    assert shown.exit_code == 0, shown.output
+    assert [line.split(":")[0] for line in shown.stdout.splitlines()] == ["1  falling", "2  lying"]
+    # Two strips of four pictures of 14×18 cells, two pixels a cell, four between and around.
+    assert np.asarray(Image.open(out)).shape == (2 * 32 + 4, 4 * 40 + 4, 3)
+
+
+def test_packs_take_all_words_up_to_the_next_option(dunes: str, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    result = run(*begin(dunes, folder, "--packs", "core", "sand", "--iterations", 1))
+    assert result.exit_code == 0, result.output
+    data = json.loads((folder / "run.json").read_text())["config"]["data"]
+    assert load(data["rules"]).packs == ("core", "sand")
+
+
+def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -> None:
+    folder = tmp_path / "run"
+    run(*begin(dunes, folder, "--preset", "paper", "--elements", 2, "--iterations", 1, "--seed", 5))
+    config = json.loads((folder / "run.json").read_text())["config"]
+    assert (config["learning_rate"], config["seed"], config["batch"]) == (0.005, 5, 4)
+    assert config["data"]["knobs"] == {"kinds": 2}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("train", "--packs", "core", "--held-out", "sand"), "give one of them"),
+        (("train", "--held-out", "snad"), "did you mean `sand`?"),
+        (("train", "--rules", "core+snad"), "PD304"),
+        (("train", "--elements", "99"), "the knob `kinds` must lie in 0..4"),
+        (("train", "--knob", "lines=2"), "no knob `lines`"),
+        (("train", "--iterations", "0"), "no whole number"),
+        (("train", "--device", "cuda:77"), "PD701"),
+        (("finetune", "nowhere", "--packs", "sand"), "PD620"),
+        (("finetune", "nowhere"), "--packs names what is to be learned"),
+        (("eval", "nowhere"), "PD620"),
+        (("show", "nowhere", "--out", "x.gif"), "strips are a .png file"),
+        (("show", "nowhere", "--out", "no/where.png"), "PD613"),
+    ],
+)
+def test_bad_input_is_said_and_nothing_is_begun(
+    words: tuple[str, ...], said: str, dunes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    task = ("--task", dunes) if words[0] == "train" else ()
+    result = run("wm", *words, *task)
+    assert result.exit_code == 2, result.output
+    assert said in result.output
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = [str(word) for word in begin(dunes, folder, "--iterations", 100_000)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "powderdsl", *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    lines = folder / "metrics.jsonl"
+    assert waited(lambda: lines.exists() and "loss/train" in lines.read_text(), 120)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130, told
+    assert f"stopped; the same command goes on with {folder}" in told
+    assert "Traceback" not in told
+    assert len(list((folder / "checkpoints").glob("*.pt"))) == 1
