@@ -398,7 +398,7 @@ def _telling(total: int) -> Iterator[Callable[[Moment], None]]:
         nonlocal last
         if time.monotonic() - last > TELL_SECONDS:
             last = time.monotonic()
-            click.echo(f"{now.done:,} of {now.of:,}  {_loss(now)}", err=True)
+            click.echo(f"{now.done:,} of {now.of:,}  {_loss(now)}".rstrip(), err=True)
 
     yield tell
 
