@@ -70,8 +70,10 @@ class Evaluation:
         """For JSON: scores by split and policy."""
         splits: dict[str, dict[str, Any]] = {}
         for score in self.scores:
-            numbers = {
-                name: value for name, value in asdict(score).items() if name not in ("split", "policy")
+            numbers = asdict(score)
+            del numbers["split"], numbers["policy"]
+            numbers["above"] = {
+                other: {"mean": mean, "interval": half} for other, (mean, half) in score.above.items()
             }
             splits.setdefault(score.split, {})[score.policy] = numbers
         about = {name: value for name, value in asdict(self).items() if name != "scores"}

@@ -114,6 +114,26 @@ def open_run(
                 helps=("choose another folder with `--run`, or go on with that run's own settings",),
             )
         return found
+    new_folder(folder)
+    about = {
+        "format": FORMAT,
+        "kind": kind,
+        "config": plain,
+        **(note or {}),
+        "versions": versions(),
+        "command": sys.argv,
+        "began": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_json(folder / ABOUT, about)
+    return read_run(folder, kind)
+
+
+def new_folder(folder: Path) -> None:
+    """Make a folder for something that will be written there, unless it is there and empty.
+
+    Raises:
+        CompileError: PD621 where it holds files; PD613 where it cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         others = sorted(name for name in os.listdir(folder) if not name.startswith("."))
@@ -126,17 +146,6 @@ def open_run(
             notes=(f"such as {others[0]}",),
             helps=("choose a folder that is empty or not there yet",),
         )
-    about = {
-        "format": FORMAT,
-        "kind": kind,
-        "config": plain,
-        **(note or {}),
-        "versions": versions(),
-        "command": sys.argv,
-        "began": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    write_json(folder / ABOUT, about)
-    return read_run(folder, kind)
 
 
 def read_run(path: str | Path, kind: str | None = None) -> RunFolder:

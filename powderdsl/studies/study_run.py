@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from powderdsl.runs.folder import read_json, write_json
+from powderdsl.runs.folder import new_folder, read_json, write_json
 from powderdsl.studies.study import Measure, Point, Step, Study, filled
 from powderdsl.worlds.files import failure
 
@@ -62,13 +62,7 @@ class StudyRun:
                 helps = ("choose another folder with `--out`",)
                 raise failure("PD621", f"{self.folder} holds {what}", helps=helps)
             return
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            others = sorted(name for name in os.listdir(self.folder) if not name.startswith("."))
-        except OSError as error:
-            raise failure("PD613", f"cannot write {self.folder}", notes=(str(error.strerror),)) from None
-        if others:
-            raise failure("PD621", f"{self.folder} holds other files", notes=(f"such as {others[0]}",))
+        new_folder(self.folder)
         write_json(kept, about)
 
     def run(

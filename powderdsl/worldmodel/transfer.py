@@ -20,7 +20,7 @@ def finetuned(
     """The configuration that goes on from a network, on worlds in which elements of `packs` alone are drawn.
 
     The rules are those of the run with the packs added; ids and channels stay where they are. A knob for the number of
-    elements is left at its default, for its list may end before the packs' elements.
+    elements is left at its default, for its list may end before the packs' elements. Rulesets are not varied.
 
     Args:
         changes: other fields of `TrainConfig`.
@@ -32,7 +32,7 @@ def finetuned(
     data = config.data
     rules = add(data.rules or load_task(data.task).ruleset.name, packs)
     knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
-    data = replace(data, rules=rules, only=tuple(packs), knobs=knobs)
+    data = replace(data, rules=rules, only=tuple(packs), knobs=knobs, rulesets=0)
     check_palette(trained.run.path, trained.palette, load_rules_of(data))
     values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
     return replace(config, data=data, **values)

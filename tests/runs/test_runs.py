@@ -164,7 +164,7 @@ with run.locked():
 
 def test_no_kill_leaves_an_unreadable_checkpoint(tmp_path: Path) -> None:
     chance, last = random.Random(5), 0
-    for _ in range(6):
+    for _ in range(4):
         child = subprocess.Popen(
             [sys.executable, "-c", SAVING, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True
         )

@@ -10,7 +10,9 @@ import torch
 import powderdsl
 from powderdsl.diagnostics import CompileError
 from powderdsl.tasks.shipped_tasks import load_task
-from powderdsl.worldmodel.rulesets import RulesetSource, VariedWorlds, Variety
+from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, load_trained, task_worlds, train
+from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, RulesetSource, VariedWorlds, Variety
+from powderdsl.worldmodel.scores import unseen_worlds
 
 TASK = """
 task: mixed
@@ -107,6 +109,27 @@ def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[n
         part = next(iter(world.parts.values()))
         own = alone.world(part.ids, part.seed, index=part.index)
         assert torch.equal(alone.step(own, 16).ids[0], end.ids[place])
+
+
+def test_training_and_tests_draw_different_rulesets(dunes: str, tmp_path: Path) -> None:
+    data = DataConfig(
+        task=dunes, states=12, steps=2, pairs=2, rulesets=3, variety=MANY, capacity=24, refresh=1
+    )
+    machine = Machine(backend="dense")
+    config = TrainConfig(data, width=4, iterations=3, batch=4)
+    run = train(config, tmp_path / "run", machine=machine)
+    trained = load_trained(run)
+    assert trained.config == config  # variety and all, through run.json
+    worlds = task_worlds(data, backend="dense")
+    assert isinstance(worlds, VariedWorlds)
+    assert [one.number for one in worlds.drawn] == [0, 1, 2]
+    unseen = unseen_worlds(trained, split="train", rulesets=5, machine=machine)
+    assert isinstance(unseen, VariedWorlds)
+    assert [one.number for one in unseen.drawn] == [UNSEEN_RULESETS + number for number in range(5)]
+    found = evaluate(trained, split="train", worlds=5, rulesets=5, machine=machine)
+    assert found.mean("model") > 0
+    plain = unseen_worlds(trained, split="train", machine=machine)
+    assert not isinstance(plain, VariedWorlds)  # without being asked, the rules as they are
 
 
 def test_unknown_properties_and_bad_numbers_are_refused() -> None:
