@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 
-def waited(condition: Callable[[], object], seconds: float = 60.0) -> bool:
+def waited(condition: Callable[[], object], seconds: float = 240.0) -> bool:
     """Whether something comes true in time."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:

@@ -29,13 +29,14 @@ class Cell:
 
 @dataclass(frozen=True)
 class Finding:
-    """A measure over all combinations. `trend` compares the last with the first, seed by seed, where all seeds have
-    both: mean difference and half width."""
+    """A measure over all combinations. `trend` compares the last with the first, seed by seed: mean difference and half
+    width. `agreeing`: in how many seeds it goes as expected, and how many have both. `ordered`: all means do."""
 
     measure: Measure
     cells: tuple[Cell, ...]
     trend: tuple[float, float] | None
     ordered: bool
+    agreeing: tuple[int, int] = (0, 0)
 
     @property
     def verdict(self) -> str:
@@ -47,9 +48,10 @@ class Finding:
         ends = f"last − first: {difference:+.4g} ± {width:.2g}"
         if sign * difference <= 0:
             return f"does not {self.measure.expect[:-1]} ({ends})"
-        sure = "" if sign * difference > width else ", within the noise of these seeds"
+        sure = "" if sign * difference > width else ", but the interval holds zero"
         every = "at every point" if self.ordered else "not at every point"
-        return f"{self.measure.expect} {every}{sure} ({ends})"
+        seeds = "{} of {} seeds".format(*self.agreeing)
+        return f"{self.measure.expect} {every}, in {seeds}{sure} ({ends})"
 
 
 def interval(samples: Sequence[float]) -> tuple[float, float]:
@@ -75,16 +77,17 @@ def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
     for values, by_seed in groups.items():
         samples = tuple(value for _, value in sorted(by_seed.items()))
         cells.append(Cell(values, *interval(samples), samples))
-    trend, ordered = None, False
+    trend, ordered, agreeing = None, False, (0, 0)
     if len(cells) > 1 and measure.expect is not None:
         first, *_, last = groups.values()
         both = sorted(first.keys() & last.keys())
-        if both:
-            trend = interval([last[seed] - first[seed] for seed in both])
         sign = 1 if measure.expect == "rises" else -1
+        if both:
+            steps = [last[seed] - first[seed] for seed in both]
+            trend, agreeing = interval(steps), (sum(sign * step > 0 for step in steps), len(steps))
         means = [sign * cell.mean for cell in cells]
         ordered = all(one < two for one, two in itertools.pairwise(means))
-    return Finding(measure, tuple(cells), trend, ordered)
+    return Finding(measure, tuple(cells), trend, ordered, agreeing)
 
 
 def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
     while not state.exists() and running.poll() is None:  # it is written every ten seconds
         time.sleep(0.2)
     running.send_signal(signal.SIGINT)
-    told, _ = running.communicate(timeout=60)
+    told, _ = running.communicate(timeout=240)
     assert running.returncode == 0
     next_seed = json.loads(state.read_text())["next"]
     assert next_seed > 0

@@ -167,7 +167,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, name):
             time.sleep(0.05)
         time.sleep(0.2)
         running.send_signal(signal.SIGINT)
-        _, errors = running.communicate(timeout=60)
+        _, errors = running.communicate(timeout=240)
     assert running.returncode == 130
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []

@@ -140,7 +140,7 @@ def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> 
     out, other = tmp_path / "data", tmp_path / "other"
     running = recording(task, out)
     running.send_signal(signal.SIGINT)
-    _, said = running.communicate(timeout=60)
+    _, said = running.communicate(timeout=240)
     assert running.returncode == 130
     assert f"of {EPISODES} episodes" in said
     assert "the same command goes on" in said

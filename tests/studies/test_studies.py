@@ -154,9 +154,9 @@ def test_numbers_have_the_places_they_deserve(mean: float, width: float, text: s
 def test_what_was_found_is_said_as_it_is() -> None:
     study = read(TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", ""))
     (rose,) = findings(study, outcomes(study, {("100",): (1.0, 1.1, 0.9), ("200",): (2.0, 2.1, 2.0)}))
-    assert rose.verdict.startswith("rises at every point (last − first: +1.03")
+    assert rose.verdict.startswith("rises at every point, in 3 of 3 seeds (last − first: +1.03")
     (noise,) = findings(study, outcomes(study, {("100",): (1.0, 3.0, 0.9), ("200",): (2.0, 2.1, 2.0)}))
-    assert "within the noise" in noise.verdict
+    assert "in 2 of 3 seeds, but the interval holds zero" in noise.verdict
     (fell,) = findings(study, outcomes(study, {("100",): (2.0, 2.0, 2.0), ("200",): (1.0, 1.0, 1.0)}))
     assert fell.verdict.startswith("does not rise")
 

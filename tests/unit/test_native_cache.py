@@ -274,9 +274,9 @@ def test_a_killed_builder_takes_its_compiler_along_and_harms_nobody(tmp_path: Pa
     assert alive(compiler)
     fake(tmp_path, "cc", "g++ 1")
     first.send_signal(how)
-    first.communicate(timeout=60)
+    first.communicate(timeout=240)
     assert waited(lambda: not alive(worker) and not alive(compiler))
-    assert second.communicate(timeout=60)[0] == "// source\n\n"
+    assert second.communicate(timeout=240)[0] == "// source\n\n"
     assert len(calls(tmp_path)) == 2
 
 

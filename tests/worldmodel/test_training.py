@@ -111,7 +111,7 @@ def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> 
         command = [sys.executable, "-c", CHILD, json.dumps(asdict(config)), str(folder)]
         process = subprocess.Popen(command, stderr=subprocess.PIPE)
         before = {path.name for path in (folder / "checkpoints").glob("*.pt")}
-        seen = waited(lambda: {path.name for path in (folder / "checkpoints").glob("*.pt")} - before, 120)  # noqa: B023
+        seen = waited(lambda: {path.name for path in (folder / "checkpoints").glob("*.pt")} - before, 240)  # noqa: B023
         time.sleep(0.037 * kill)
         assert seen, process.communicate()
         assert process.poll() is None, "it ended before it could be killed"

@@ -133,9 +133,9 @@ def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     lines = folder / "metrics.jsonl"
-    assert waited(lambda: lines.exists() and "loss/train" in lines.read_text(), 120)
+    assert waited(lambda: lines.exists() and "loss/train" in lines.read_text(), 240)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    _, told = process.communicate(timeout=240)
     assert process.returncode == 130, told
     assert f"stopped; the same command goes on with {folder}" in told
     assert "Traceback" not in told
