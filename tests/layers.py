@@ -46,7 +46,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
     "runs": ("diagnostics", "worlds"),
-    "datasets": (*_SCREEN, "tasks", "envs"),
+    "datasets": (*_SCREEN, "tasks", "envs", "runs"),
     "rl": (*_SCREEN, "tasks", "envs", "runs"),
     "worldmodel": (*_SCREEN, "tasks", "runs"),
     "studies": (*_MODEL, "compiler", "worlds", "runs", "bench"),  # calls commands, in processes of their own

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from powderdsl.datasets.dataset import Dataset
@@ -32,6 +31,7 @@ from powderdsl.datasets.shards import is_whole, write_shard
 from powderdsl.envs.acting import Policy, action_keys
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.runs.folder import held
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 from powderdsl.worlds.files import failure
@@ -116,18 +116,11 @@ def _held(folder: Path) -> Iterator[None]:
     check_place(folder)
     try:
         folder.mkdir(exist_ok=True)
-        lock = FileLock(folder / ".lock", timeout=0)
-        lock.acquire()
-    except Timeout:
-        helps = ("wait for it, or choose another folder",)
-        raise failure("PD622", f"another process works on {folder}", helps=helps) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise failure("PD613", f"cannot write {folder}", notes=(reason,)) from None
-    try:
+    with held(folder):
         yield
-    finally:
-        lock.release()
 
 
 def _begun(folder: Path, recipe: Recipe) -> Manifest:

@@ -67,6 +67,7 @@ def write_shard(
                     # Without a date, so that the bytes follow from the arrays alone.
                     entry = zipfile.ZipInfo(f"{name}.npy")
                     entry.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+                    # `open` takes the level from here alone, and ZipInfo has no public name for it before 3.13.
                     entry._compresslevel = LEVEL  # type: ignore[attr-defined]
                     values = [np.ascontiguousarray(part, dtype) for part in parts[name]]
                     shape = (sum(map(len, values)), *values[0].shape[1:])

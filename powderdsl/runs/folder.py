@@ -48,19 +48,8 @@ class RunFolder:
         Raises:
             CompileError: PD622 if another one does.
         """
-        lock = FileLock(self.path / ".lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise failure(
-                "PD622",
-                f"another process works on {self.path}",
-                helps=("wait for it, or choose another folder",),
-            ) from None
-        try:
+        with held(self.path):
             yield
-        finally:
-            lock.release()
 
     def latest_checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint | None:
         """The newest checkpoint that is whole; None if there is none."""
@@ -126,6 +115,30 @@ def open_run(
     }
     write_json(folder / ABOUT, about)
     return read_run(folder, kind)
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing to a folder.
+
+    Raises:
+        CompileError: PD622 if another one does; PD613 if the folder cannot be written to.
+    """
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise failure(
+            "PD622",
+            f"another process works on {folder}",
+            helps=("wait for it, or choose another folder",),
+        ) from None
+    except OSError as error:
+        raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def new_folder(folder: Path) -> None:
