@@ -1,8 +1,9 @@
-"""What all tests share: golden files, and one thread for torch."""
+"""What all tests share: golden files, one thread for torch, and processes that Ctrl-C reaches."""
 
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,10 @@ import pytest
 
 # Before torch is imported anywhere: tests run in several processes; small tensors gain nothing from threads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# A shell starts `make test &` with SIGINT ignored, and processes hand that on to those that they start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
