@@ -1,10 +1,23 @@
-"""Waiting for processes in tests."""
+"""Processes in tests: starting them, and waiting for what they do."""
 
 from __future__ import annotations
 
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """A process that does not outlive the block, however that ends."""
+    with subprocess.Popen(command, text=True, **options) as running:
+        try:
+            yield running
+        finally:
+            running.kill()
 
 
 def waited(condition: Callable[[], object], seconds: float = 240.0) -> bool:

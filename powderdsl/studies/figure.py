@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -47,14 +46,23 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
         lines.setdefault(", ".join(f"{name} {value}" for name, value in cell.values[1:]), []).append(cell)
     for label, cells in lines.items():
         across = [numbers[ticks.index(cell.values[0][1])] for cell in cells]
-        widths = [cell.half_width if math.isfinite(cell.half_width) else 0.0 for cell in cells]
+        found = [cell.over_seeds for cell in cells]
+        below = [
+            one.mean - one.low if len(cell.samples) > 1 else 0.0
+            for one, cell in zip(found, cells, strict=True)
+        ]
+        above = [
+            one.high - one.mean if len(cell.samples) > 1 else 0.0
+            for one, cell in zip(found, cells, strict=True)
+        ]
         axes.errorbar(
-            across, [cell.mean for cell in cells], widths, marker="o", capsize=3, label=label or None
+            across, [one.mean for one in found], [below, above], marker="o", capsize=3, label=label or None
         )
         for place, cell in zip(across, cells, strict=True):
             axes.plot([place] * len(cell.samples), cell.samples, "k.", markersize=3, alpha=0.4)
     if min(numbers) > 0 and max(numbers) >= 20 * min(numbers):
         axes.set_xscale("log")
+    axes.set_yscale(finding.measure.scale)
     axes.set_xticks(numbers, ticks, minor=False)
     axes.set_xlabel(first.about)
     axes.set_ylabel(finding.measure.about)

@@ -17,24 +17,35 @@ T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 
 
 @dataclass(frozen=True)
+class Interval:
+    """A mean over seeds, and the ends of its 95 % interval by Student's t: not finite for a single value.
+
+    On the scale ``log`` the mean is the geometric one, and the ends are as many times smaller and larger.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class Cell:
-    """A measure at one combination: its mean over seeds, half the width of the 95 % interval (Student's t), and all
-    values. The half width is not finite for a single value."""
+    """A measure at one combination: over seeds, and the value of each."""
 
     values: tuple[tuple[str, str], ...]
-    mean: float
-    half_width: float
+    over_seeds: Interval
     samples: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A measure over all combinations. `trend` compares the last with the first, seed by seed: mean difference and half
-    width. `agreeing`: in how many seeds it goes as expected, and how many have both. `ordered`: all means do."""
+    """A measure over all combinations. `trend` compares the last with the first, seed by seed: their difference, on the
+    scale ``log`` their ratio. `agreeing`: in how many seeds it goes as expected, and how many have both. `ordered`: all
+    means do."""
 
     measure: Measure
     cells: tuple[Cell, ...]
-    trend: tuple[float, float] | None
+    trend: Interval | None
     ordered: bool
     agreeing: tuple[int, int] = (0, 0)
 
@@ -44,23 +55,29 @@ class Finding:
         if self.measure.expect is None or self.trend is None:
             return ""
         sign = 1 if self.measure.expect == "rises" else -1
-        difference, width = self.trend
-        ends = f"last − first: {difference:+.4g} ± {width:.2g}"
-        if sign * difference <= 0:
+        log = self.measure.scale == "log"
+        same = 1.0 if log else 0.0
+        plus = "+" if not log and self.trend.mean > 0 else ""
+        ends = f"last {'/' if log else '−'} first: {plus}{shown(self.trend, self.measure.scale)}"
+        if sign * (self.trend.mean - same) <= 0:
             return f"does not {self.measure.expect[:-1]} ({ends})"
-        sure = "" if sign * difference > width else ", but the interval holds zero"
+        sure = f", but the interval holds {same:.0f}" if self.trend.low <= same <= self.trend.high else ""
         every = "at every point" if self.ordered else "not at every point"
         seeds = "{} of {} seeds".format(*self.agreeing)
         return f"{self.measure.expect} {every}, in {seeds}{sure} ({ends})"
 
 
-def interval(samples: Sequence[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval by Student's t; infinite for one sample."""
+def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
+    """Mean and 95 % interval of samples, which are above 0 on the scale ``log``."""
+    if scale == "log":
+        found = interval([math.log(sample) for sample in samples])
+        return Interval(math.exp(found.mean), math.exp(found.low), math.exp(found.high))
     mean = statistics.fmean(samples)
     if len(samples) < 2:
-        return mean, math.inf
+        return Interval(mean, -math.inf, math.inf)
     quantile = T_975[min(len(samples) - 1, len(T_975)) - 1]  # a little wide for more than 11
-    return mean, quantile * statistics.stdev(samples) / math.sqrt(len(samples))
+    half = quantile * statistics.stdev(samples) / math.sqrt(len(samples))
+    return Interval(mean, mean - half, mean + half)
 
 
 def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
@@ -76,16 +93,19 @@ def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
     cells = []
     for values, by_seed in groups.items():
         samples = tuple(value for _, value in sorted(by_seed.items()))
-        cells.append(Cell(values, *interval(samples), samples))
+        cells.append(Cell(values, interval(samples, measure.scale), samples))
     trend, ordered, agreeing = None, False, (0, 0)
     if len(cells) > 1 and measure.expect is not None:
         first, *_, last = groups.values()
         both = sorted(first.keys() & last.keys())
         sign = 1 if measure.expect == "rises" else -1
         if both:
-            steps = [last[seed] - first[seed] for seed in both]
-            trend, agreeing = interval(steps), (sum(sign * step > 0 for step in steps), len(steps))
-        means = [sign * cell.mean for cell in cells]
+            agreeing = sum(sign * (last[seed] - first[seed]) > 0 for seed in both), len(both)
+            if measure.scale == "log":
+                trend = interval([last[seed] / first[seed] for seed in both], "log")
+            else:
+                trend = interval([last[seed] - first[seed] for seed in both])
+        means = [sign * cell.over_seeds.mean for cell in cells]
         ordered = all(one < two for one, two in itertools.pairwise(means))
     return Finding(measure, tuple(cells), trend, ordered, agreeing)
 
@@ -109,7 +129,11 @@ def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, A
                 "measure": one.measure.name,
                 "verdict": one.verdict,
                 "cells": [
-                    {**asdict(cell), "values": dict(cell.values), "half_width": _finite(cell.half_width)}
+                    {
+                        "values": dict(cell.values),
+                        **{key: _finite(value) for key, value in asdict(cell.over_seeds).items()},
+                        "samples": cell.samples,
+                    }
                     for cell in one.cells
                 ],
             }
@@ -128,7 +152,7 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
     counts: dict[tuple[tuple[str, str], ...], int] = {}
     for one in found:
         for cell in one.cells:
-            rows.setdefault(cell.values, []).append(shown(cell.mean, cell.half_width))
+            rows.setdefault(cell.values, []).append(shown(cell.over_seeds, one.measure.scale))
             counts[cell.values] = len(cell.samples)
     for values, numbers in rows.items():
         words = [*(value for _, value in values), *numbers, str(counts[values])]
@@ -141,12 +165,15 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
     return "\n".join(text) + "\n"
 
 
-def shown(mean: float, half_width: float) -> str:
-    """`0.1234 ± 0.0056`: as many places as the interval deserves."""
-    if not math.isfinite(half_width):
-        return f"{mean:.4g}"
-    places = 4 if half_width <= 0 else min(max(1 - math.floor(math.log10(half_width)), 0), 6)
-    return f"{mean:.{places}f} ± {half_width:.{places}f}"
+def shown(found: Interval, scale: str = "linear") -> str:
+    """`0.1234 ± 0.0056`, or `0.123 (0.118 to 0.129)` on the scale ``log``: as many places as the interval deserves."""
+    half = (found.high - found.low) / 2
+    if not math.isfinite(half):
+        return f"{found.mean:.4g}"
+    places = 4 if half <= 0 else min(max(1 - math.floor(math.log10(half)), 0), 6)
+    if scale == "log":
+        return f"{found.mean:.{places}f} ({found.low:.{places}f} to {found.high:.{places}f})"
+    return f"{found.mean:.{places}f} ± {half:.{places}f}"
 
 
 def _finite(number: float) -> float | None:

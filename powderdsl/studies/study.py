@@ -9,6 +9,7 @@ from string import Template
 
 SIZES = ("small", "paper")
 EXPECTED = ("rises", "falls")
+SCALES = ("linear", "log")
 SEED, SIZE = "seed", "size"
 
 
@@ -38,13 +39,17 @@ class Axis:
 
 @dataclass(frozen=True)
 class Measure:
-    """A number out of the ``evaluation.json`` of a step's run: the keys that lead to it, with ``$NAME`` as above."""
+    """A number out of the ``evaluation.json`` of a step's run: the keys that lead to it, with ``$NAME`` as above.
+
+    `scale` is one of `SCALES`. On ``log`` numbers are compared by their ratios: means are geometric ones.
+    """
 
     name: str
     step: str
     keys: tuple[str, ...]
     about: str
     expect: str | None
+    scale: str = "linear"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from string import Template
 from powderdsl.compiler import read_source, shipped
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.model.schema import Key, Reader
-from powderdsl.studies.study import EXPECTED, SEED, SIZE, SIZES, Axis, Measure, Step, Study
+from powderdsl.studies.study import EXPECTED, SCALES, SEED, SIZE, SIZES, Axis, Measure, Step, Study
 from powderdsl.syntax import yaml_tree
 
 STUDY_KEYS: dict[str, dict[str, Key]] = {
@@ -33,6 +33,7 @@ STUDY_KEYS: dict[str, dict[str, Key]] = {
         "expect": Key(
             "word", "what the number is expected to do along the first setting: `rises` or `falls`"
         ),
+        "scale": Key("word", "`log` where ratios count, such as those of losses; otherwise `linear`"),
     },
 }
 
@@ -188,6 +189,7 @@ class _StudyReader:
         entries = self.reader.mapping(node, "measure", "a measure")
         of, value = self.reader.scalar(entries, "of"), self.reader.scalar(entries, "value")
         expect = self.reader.choice(entries, "expect", EXPECTED)
+        scale = self.reader.choice(entries, "scale", SCALES) or "linear"
         if of is None or value is None:
             return None
         names = [step.name for step in self.steps if step.makes_run]
@@ -196,7 +198,8 @@ class _StudyReader:
             self.reporter.error("PD806", f"no step `{of.text}` that makes a run", of.span, helps=helps)
         self.check_names(value.text, value.span)
         keys = tuple(value.text.split("/"))
-        return Measure(key.text, of.text, keys, self.reader.text(entries, "about") or key.text, expect)
+        about = self.reader.text(entries, "about") or key.text
+        return Measure(key.text, of.text, keys, about, expect, scale)
 
     def check_names(self, text: str, span: Span) -> None:
         """Report ``$NAME`` that is not varied."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,22 +49,28 @@ class StudyRun:
         self._running: set[subprocess.Popen[bytes]] = set()
 
     def prepare(self) -> None:
-        """Make the folder, or come back to it.
+        """Make the folder, or come back to it. Values, seeds and measures may have changed since, but no step.
 
         Raises:
             CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
         """
-        about = {"study": self.study.name, "size": self.size, "text": self.study.text}
+        decides: dict[str, Any] = {
+            "study": self.study.name,
+            "size": self.size,
+            "varied": [axis.name for axis in self.study.axes],
+            "steps": [asdict(step) for step in self.study.steps],
+        }
+        decides = json.loads(json.dumps(decides))  # as it will be read
         kept = self.folder / "study.json"
         if kept.exists():
             found = read_json(kept)
-            if found != about:
-                what = "another study, or this one as it was before its file changed"
+            if not isinstance(found, dict) or any(found.get(key) != value for key, value in decides.items()):
+                what = "another study, or this one as it was before its steps changed"
                 helps = ("choose another folder with `--out`",)
                 raise failure("PD621", f"{self.folder} holds {what}", helps=helps)
-            return
-        new_folder(self.folder)
-        write_json(kept, about)
+        else:
+            new_folder(self.folder)
+        write_json(kept, {**decides, "text": self.study.text})
 
     def run(
         self, points: Sequence[Point], jobs: int, told: Callable[[Outcome], None] | None = None
@@ -92,23 +99,31 @@ class StudyRun:
 
     def _point(self, point: Point) -> Outcome:
         kept = self.folder / "done" / f"{point.name}.json"
-        values = read_json(kept)
-        if isinstance(values, dict) and values.keys() == {one.name for one in self.study.measures}:
-            return Outcome(point, values)
         place = self.folder / "runs" / point.name
+        known = read_json(
+            kept
+        )  # by where they come from, so that measures may change; runs may have been deleted
         try:
-            place.mkdir(parents=True, exist_ok=True)
-            kept.parent.mkdir(exist_ok=True)
-            for step in self.study.steps:
-                problem = self._step(step, point, place)
-                if problem is not None:
-                    return Outcome(point, {}, problem)
-            values = {
-                one.name: value_of(one, place / one.step, point, self.size) for one in self.study.measures
-            }
+            if not isinstance(known, dict):
+                place.mkdir(parents=True, exist_ok=True)
+                kept.parent.mkdir(exist_ok=True)
+                for step in self.study.steps:
+                    problem = self._step(step, point, place)
+                    if problem is not None:
+                        return Outcome(point, {}, problem)
+                known = {}
+            values, found = {}, dict(known)
+            for one in self.study.measures:
+                key = "/".join((one.step, *one.keys))
+                if key not in found:
+                    found[key] = value_of(one, place / one.step, point, self.size)
+                values[one.name] = found[key]
+                if one.scale == "log" and not found[key] > 0:
+                    raise ValueError(f"{key} is {found[key]}; the scale `log` needs numbers above 0")
+            if found != known:
+                write_json(kept, found)
         except (OSError, Cancelled, ValueError) as error:
             return Outcome(point, {}, str(error) or "stopped")
-        write_json(kept, values)
         return Outcome(point, values)
 
     def command(self, step: Step, point: Point, place: Path) -> list[str]:

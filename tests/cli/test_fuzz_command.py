@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from powderdsl.testing import differential
 from powderdsl.testing.case_files import read_case, write_case
 from powderdsl.testing.reducer import reduce_case
 from tests.cli.commands import command_line, environment_with, powderdsl, process
+from tests.processes import started, waited
 
 
 @pytest.mark.slow
@@ -40,14 +40,11 @@ def test_a_run_reports_saves_its_state_and_goes_on(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
     line = command_line("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path)
-    running = subprocess.Popen(
-        [*line, "--seeds", "0..100000"], env=environment_with(), stdout=subprocess.PIPE, text=True
-    )
     state = tmp_path / "state.json"
-    while not state.exists() and running.poll() is None:  # it is written every ten seconds
-        time.sleep(0.2)
-    running.send_signal(signal.SIGINT)
-    told, _ = running.communicate(timeout=240)
+    with started([*line, "--seeds", "0..100000"], env=environment_with(), stdout=subprocess.PIPE) as running:
+        assert waited(lambda: state.exists() or running.poll() is not None)  # it is written every ten seconds
+        running.send_signal(signal.SIGINT)
+        told, _ = running.communicate(timeout=240)
     assert running.returncode == 0
     next_seed = json.loads(state.read_text())["next"]
     assert next_seed > 0

@@ -9,10 +9,12 @@ import signal
 import subprocess
 import sys
 import time
+from select import select
 
 import pytest
 
 from tests.cli.commands import command_line, environment_with
+from tests.processes import started
 
 START_LIMIT = 1.0
 """Seconds of processor time. Ours is less than half of that; processors differ."""
@@ -65,18 +67,21 @@ def test_commands_import_only_what_they_need(arguments, unwanted):
 def on_terminal(*arguments: str, interrupt: str = "", **environment: str) -> tuple[int, str]:
     """The exit code, and what a terminal received. Ctrl-C is sent once `interrupt` has been seen."""
     leader, follower = pty.openpty()
-    running = subprocess.Popen(
-        command_line(*arguments),
-        env=environment_with(TERM="xterm", **environment),
-        stdin=follower,
-        stdout=follower,
-        stderr=follower,
-        start_new_session=True,
-    )
-    os.close(follower)
-    received = b""
-    with os.fdopen(leader, "rb", buffering=0) as terminal:
+    received, end = b"", time.monotonic() + 240
+    with (
+        os.fdopen(leader, "rb", buffering=0) as terminal,
+        started(
+            command_line(*arguments),
+            env=environment_with(TERM="xterm", **environment),
+            stdin=follower,
+            stdout=follower,
+            stderr=follower,
+            start_new_session=True,
+        ) as running,
+    ):
+        os.close(follower)
         while True:
+            assert select([terminal], [], [], end - time.monotonic())[0], received.decode()
             try:
                 piece = terminal.read(65536)
             except OSError:  # Linux says so when the other end has been closed
@@ -87,7 +92,7 @@ def on_terminal(*arguments: str, interrupt: str = "", **environment: str) -> tup
             if interrupt and interrupt.encode() in received:
                 interrupt = ""
                 running.send_signal(signal.SIGINT)
-    return running.wait(timeout=60), received.decode()
+        return running.wait(timeout=60), received.decode()
 
 
 SMALL = ("--backend", "reference", "--size", "8x8")
@@ -153,12 +158,11 @@ def test_pages_are_laid_out_on_terminals():
 def test_ctrl_c_leaves_nothing_behind(tmp_path, name):
     if name.endswith("mp4"):
         pytest.importorskip("imageio_ffmpeg")
-    with subprocess.Popen(
+    with started(
         command_line("run", "life", *SMALL, "--steps", "100000000", "--out", str(tmp_path / name)),
         env=environment_with(),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        text=True,
     ) as running:
         deadline = time.monotonic() + 60
         while not list(tmp_path.iterdir()):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,7 +19,7 @@ from powderdsl.rl.policies import load_policy
 from powderdsl.tasks.episodes import compile_task
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.envs.conftest import SMALL
-from tests.processes import waited
+from tests.processes import started, waited
 
 
 @pytest.fixture
@@ -118,37 +120,30 @@ def test_bad_values(
 EPISODES = 600
 
 
-def recording(task: Path, out: Path) -> subprocess.Popen[str]:
+@contextmanager
+def recording(task: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
     """A process that has just written a shard and has many before it."""
     given = ("--episodes", EPISODES, "--shard", 3, "--envs", 8, "--backend", "planes")
-    running = subprocess.Popen(
-        command_line("record", task, "--out", out, *given),
-        env=environment_with(),
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = command_line("record", task, "--out", out, *given)
     seen = len(list(out.glob("shard-*")))
-    if not waited(lambda: len(list(out.glob("shard-*"))) > seen):
-        running.kill()
-        pytest.fail(f"nothing is recorded: {running.communicate()[1]}")
-    return running
+    with started(command, env=environment_with(), stderr=subprocess.PIPE) as running:
+        assert waited(lambda: len(list(out.glob("shard-*"))) > seen)
+        yield running
 
 
 @pytest.mark.slow
 def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> None:
     """Ctrl-C, SIGKILL at several moments, then what is left: the same bytes as without any of it."""
     out, other = tmp_path / "data", tmp_path / "other"
-    running = recording(task, out)
-    running.send_signal(signal.SIGINT)
-    _, said = running.communicate(timeout=240)
+    with recording(task, out) as running:
+        running.send_signal(signal.SIGINT)
+        _, said = running.communicate(timeout=240)
     assert running.returncode == 130
     assert f"of {EPISODES} episodes" in said
     assert "the same command goes on" in said
     for delay in (0.0, 0.013, 0.037):
-        running = recording(task, out)
-        time.sleep(delay)
-        running.kill()
-        running.communicate()
+        with recording(task, out):
+            time.sleep(delay)
     program = compile_task(str(task), backend="planes")
     for folder in (out, other):
         record(program, "random", folder, episodes=EPISODES, shard=3)

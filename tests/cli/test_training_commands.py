@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.commands import powderdsl as run
-from tests.processes import waited
+from tests.processes import started, waited
 from tests.rl.tiny_tasks import write_task
 
 QUICK = (
@@ -94,11 +94,11 @@ def test_what_cannot_be_done(
 def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "powderdsl", "train", str(write_task(tmp_path)), *QUICK]
     command += ["--run", str(tmp_path / "run"), "--steps", "1e9", "--backend", "planes"]
-    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     lines = tmp_path / "run" / "metrics.jsonl"
-    assert waited(lambda: lines.exists() and lines.read_text().count("\n") > 2)
-    child.send_signal(signal.SIGINT)
-    _, said = child.communicate(timeout=240)
+    with started(command, stderr=subprocess.PIPE) as child:
+        assert waited(lambda: lines.exists() and lines.read_text().count("\n") > 2)
+        child.send_signal(signal.SIGINT)
+        _, said = child.communicate(timeout=240)
     assert child.returncode == 130, said
     assert f"powderdsl train --resume {tmp_path / 'run'}" in said
     assert list((tmp_path / "run" / "checkpoints").glob("*.pt"))

@@ -21,6 +21,7 @@ from powderdsl.rl import evaluate, preset, train
 from powderdsl.rl.ppo_config import HOW, from_json
 from powderdsl.runs import RunFolder, read_run
 from powderdsl.runs.metrics import read_metrics
+from tests.processes import started
 from tests.rl.tiny_tasks import PLACE, quick, write_task
 from tests.states import same
 
@@ -84,14 +85,12 @@ def test_a_run_that_is_killed_ends_as_if_it_had_not_been(task: Path, tmp_path: P
     folder, gone_on = tmp_path / "killed", []
     command = [sys.executable, "-c", TRAINING, str(folder), json.dumps(config.as_json())]
     for _ in range(3):
-        child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert child.stdout is not None
-        gone_on.append(int(child.stdout.readline()))
-        for _ in range(chance.randint(10, 50)):
-            child.stdout.readline()
-        time.sleep(chance.uniform(0, 0.05))  # in the middle of an update or of saving, now and then
-        child.send_signal(signal.SIGKILL)
-        child.communicate()
+        with started(command, stdout=subprocess.PIPE) as child:
+            assert child.stdout is not None
+            gone_on.append(int(child.stdout.readline()))
+            for _ in range(chance.randint(10, 50)):
+                child.stdout.readline()
+            time.sleep(chance.uniform(0, 0.05))  # in the middle of an update or of saving, now and then
         assert child.returncode == -signal.SIGKILL
     assert gone_on[0] == 4  # worlds
     assert 4 < gone_on[1] < gone_on[2] < 640

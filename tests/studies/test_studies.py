@@ -12,7 +12,7 @@ import pytest
 from powderdsl.cli.study_command import commands
 from powderdsl.diagnostics import CompileError, Reporter, Source
 from powderdsl.studies.figure import write_figure
-from powderdsl.studies.results import as_data, as_markdown, findings, interval, shown
+from powderdsl.studies.results import Interval, as_data, as_markdown, findings, interval, shown
 from powderdsl.studies.study import Point, Study
 from powderdsl.studies.study_file import load_study, read_study, shipped_studies
 from powderdsl.studies.study_run import Outcome, StudyRun
@@ -98,6 +98,7 @@ def test_a_step_becomes_a_command(tmp_path: Path) -> None:
         ("squares: [0, 5]", "seed: [0, 5]", "PD111", "seed"),
         ("of: trained", "of: tested", "PD806", "tested"),
         ("expect: rises", "expect: grows", "PD110", "grows"),
+        ("expect: rises", "scale: square", "PD110", "square"),
         ("paper: [1000, 2000, 4000]", f"paper: [{', '.join(map(str, range(2000)))}]", "PD806", "patience"),
     ],
 )
@@ -132,14 +133,18 @@ def test_shipped_studies_are_right(name: str) -> None:
 
 
 def test_an_interval_is_that_of_student() -> None:
-    mean, width = interval([1.0, 2.0, 3.0, 4.0])
-    assert mean == 2.5
-    assert width == pytest.approx(3.182 * math.sqrt(5 / 3) / 2, rel=1e-6)
-    assert interval([7.0]) == (7.0, math.inf)
+    found = interval([1.0, 2.0, 3.0, 4.0])
+    half = 3.182 * math.sqrt(5 / 3) / 2
+    assert found.mean == 2.5
+    assert (found.low, found.high) == pytest.approx((2.5 - half, 2.5 + half), rel=1e-6)
+    assert interval([7.0]) == Interval(7.0, -math.inf, math.inf)
+    ratios = interval([2.0, 8.0], "log")
+    factor = 2 ** (12.706 * math.sqrt(2) / math.sqrt(2))
+    assert (ratios.mean, ratios.low, ratios.high) == pytest.approx((4.0, 4 / factor, 4 * factor), rel=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("mean", "width", "text"),
+    ("mean", "half", "text"),
     [
         (0.12345, 0.0067, "0.1235 ± 0.0067"),
         (12.3, 3.4, "12.3 ± 3.4"),
@@ -147,8 +152,12 @@ def test_an_interval_is_that_of_student() -> None:
         (250.0, 31.0, "250 ± 31"),
     ],
 )
-def test_numbers_have_the_places_they_deserve(mean: float, width: float, text: str) -> None:
-    assert shown(mean, width) == text
+def test_numbers_have_the_places_they_deserve(mean: float, half: float, text: str) -> None:
+    assert shown(Interval(mean, mean - half, mean + half)) == text
+
+
+def test_factors_are_shown_with_both_ends() -> None:
+    assert shown(Interval(0.5, 0.25, 1.0), "log") == "0.50 (0.25 to 1.00)"
 
 
 def test_what_was_found_is_said_as_it_is() -> None:
@@ -156,9 +165,19 @@ def test_what_was_found_is_said_as_it_is() -> None:
     (rose,) = findings(study, outcomes(study, {("100",): (1.0, 1.1, 0.9), ("200",): (2.0, 2.1, 2.0)}))
     assert rose.verdict.startswith("rises at every point, in 3 of 3 seeds (last − first: +1.03")
     (noise,) = findings(study, outcomes(study, {("100",): (1.0, 3.0, 0.9), ("200",): (2.0, 2.1, 2.0)}))
-    assert "in 2 of 3 seeds, but the interval holds zero" in noise.verdict
+    assert "in 2 of 3 seeds, but the interval holds 0" in noise.verdict
     (fell,) = findings(study, outcomes(study, {("100",): (2.0, 2.0, 2.0), ("200",): (1.0, 1.0, 1.0)}))
     assert fell.verdict.startswith("does not rise")
+
+
+def test_ratios_are_compared_on_the_scale_log() -> None:
+    text = TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", "")
+    study = read(text.replace("expect: rises", "expect: rises, scale: log"))
+    (rose,) = findings(study, outcomes(study, {("100",): (1.0, 2.0, 4.0), ("200",): (2.0, 4.0, 8.0)}))
+    assert rose.verdict == "rises at every point, in 3 of 3 seeds (last / first: 2.0000 (2.0000 to 2.0000))"
+    assert rose.cells[0].over_seeds.mean == pytest.approx(2.0)
+    (noise,) = findings(study, outcomes(study, {("100",): (1.0, 2.0, 4.0), ("200",): (2.0, 1.0, 9.0)}))
+    assert "but the interval holds 1" in noise.verdict
 
 
 def test_a_table_names_what_did_not_finish(tmp_path: Path) -> None:
@@ -212,13 +231,20 @@ measures:
     again.prepare()
     assert again.run(points, jobs=1) == found
     assert {path: path.stat().st_mtime_ns for path in logs} == logs
-    other = StudyRun(
-        read_study(Source("study.yaml", text + "\n# changed\n"), Reporter(), commands()),
-        tmp_path / "out",
-        "small",
-    )
+
+    def changed(old: str, new: str) -> StudyRun:
+        assert old in text
+        file = Source("study.yaml", text.replace(old, new))
+        return StudyRun(read_study(file, Reporter(), commands()), tmp_path / "out", "small")
+
+    renamed = changed("reward:", "mean: {of: trained, value: splits/test/random/mean, scale: log}\n  reward:")
+    renamed.prepare()
+    more = renamed.run(points, jobs=1)
+    assert [one.values["reward"] for one in more] == [one.values["reward"] for one in found]
+    assert all(one.values["mean"] > 0 for one in more)
+    assert {path: path.stat().st_mtime_ns for path in logs} == logs
     with pytest.raises(CompileError) as error:
-        other.prepare()
+        changed("episodes: 4", "episodes: 5").prepare()
     assert error.value.diagnostics[0].code == "PD621"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
@@ -27,7 +26,7 @@ from powderdsl.worldmodel import (
     train,
 )
 from powderdsl.worldmodel.training import Moment
-from tests.processes import waited
+from tests.processes import started, waited
 
 HERE = Machine(backend="dense")
 
@@ -109,14 +108,11 @@ def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> 
     folder = tmp_path / "killed"
     for kill in range(3):
         command = [sys.executable, "-c", CHILD, json.dumps(asdict(config)), str(folder)]
-        process = subprocess.Popen(command, stderr=subprocess.PIPE)
         before = {path.name for path in (folder / "checkpoints").glob("*.pt")}
-        seen = waited(lambda: {path.name for path in (folder / "checkpoints").glob("*.pt")} - before, 240)  # noqa: B023
-        time.sleep(0.037 * kill)
-        assert seen, process.communicate()
-        assert process.poll() is None, "it ended before it could be killed"
-        process.kill()
-        process.communicate()
+        with started(command) as process:
+            assert waited(lambda: {path.name for path in (folder / "checkpoints").glob("*.pt")} - before)  # noqa: B023
+            time.sleep(0.037 * kill)
+            assert process.poll() is None, "it ended before it could be killed"
     run = train(config, folder, machine=HERE)
     whole = train(config, tmp_path / "whole", machine=HERE)
     assert same(weights(run), weights(whole))

@@ -16,7 +16,7 @@ from PIL import Image
 from powderdsl.compiler import load
 from tests.cli.commands import ROOT
 from tests.cli.commands import powderdsl as run
-from tests.processes import waited
+from tests.processes import started, waited
 
 QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 100, "--backend", "dense")
 
@@ -126,16 +126,13 @@ def test_bad_input_is_said_and_nothing_is_begun(
 def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     words = [str(word) for word in begin(dunes, folder, "--iterations", 100_000)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "powderdsl", *words],
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
     lines = folder / "metrics.jsonl"
-    assert waited(lambda: lines.exists() and "loss/train" in lines.read_text(), 240)
-    process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=240)
+    command = [sys.executable, "-m", "powderdsl", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with started(command, stderr=subprocess.PIPE, env=environment) as process:
+        assert waited(lambda: lines.exists() and "loss/train" in lines.read_text())
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=240)
     assert process.returncode == 130, told
     assert f"stopped; the same command goes on with {folder}" in told
     assert "Traceback" not in told
