@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -17,8 +14,9 @@ from powderdsl.bench.measure import measure_events
 from powderdsl.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.bench.plot import require_matplotlib, write_plot
 from powderdsl.bench.tables import report_text
-from powderdsl.cli.exits import INTERRUPTED, OK, colour_wanted, user_values
+from powderdsl.cli.exits import INTERRUPTED, OK, user_values
 from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules, set_option
+from powderdsl.cli.progress import progress
 from powderdsl.compiler import BACKENDS
 
 
@@ -174,35 +172,15 @@ def _measured(plan: Plan) -> Report:
     events: list[Event] = []
     interrupted = False
     try:
-        with _progress(plan) as show:
+        with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
             for event in measure_events(plan):
                 events.append(event)
-                show(event)
+                what = event.what if isinstance(event, Started) else "measure"
+                done = sum(not isinstance(one, Started) for one in events)
+                show(done, f"{what} {event.cell.backend}, batch {event.cell.batch}")
     except KeyboardInterrupt:
         interrupted = True
     return make_report(plan, machine, events, load_average(), interrupted=interrupted)
-
-
-@contextmanager
-def _progress(plan: Plan) -> Iterator[Callable[[Event], None]]:
-    """Shows events as a bar on stderr, which goes at the end; on terminals only."""
-    if not colour_wanted(sys.stderr):
-        yield lambda event: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=len(plan.cells) * (1 + plan.rounds + plan.profile))
-
-        def show(event: Event) -> None:
-            what = event.what if isinstance(event, Started) else "measure"
-            bar.update(task, description=f"{what} {event.cell.backend}, batch {event.cell.batch}")
-            if not isinstance(event, Started):
-                bar.advance(task)
-
-        yield show
 
 
 def _write_json(path: Path, report: Report) -> None:

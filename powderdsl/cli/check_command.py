@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK, counted, write_diagnostics
-from powderdsl.cli.show_command import table
+from powderdsl.cli.plain_table import table
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short

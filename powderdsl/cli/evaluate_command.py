@@ -10,7 +10,7 @@ import click
 
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import WholeType, check_writable, set_option
-from powderdsl.cli.show_command import table
+from powderdsl.cli.plain_table import table
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import BACKENDS
 from powderdsl.tasks.task_names import is_task

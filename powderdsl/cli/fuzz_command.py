@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,6 +12,7 @@ import click
 
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.options import WholeType
+from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
     from powderdsl.testing.campaign import Tally
@@ -174,13 +173,15 @@ def _campaign(
     until = began + (seconds if seconds is not None else float("inf"))
     events = run_campaign(plan, tally, iter(left), jobs, folder, until)
     interrupted = False
-    with _bar("fuzz", len(left) if seconds is None else None, seconds) as advance:
+    done = 0
+    with progress(_title(seconds), len(left) if seconds is None else None) as show:
         try:
             for event in events:
                 if isinstance(event, Path):
                     click.echo(f"found: {event}", err=True)
                 else:
-                    advance()
+                    done += 1
+                    show(done)
         except KeyboardInterrupt:
             interrupted = True
         finally:
@@ -224,11 +225,11 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
     trials = run_trials(iter(wanted), jobs, folder, began + (seconds or float("inf")))
     kinds: Counter[str] = Counter()
     accepted, slowest, largest, found = 0, 0.0, 0.0, []
-    with _bar("fuzz", len(wanted) if seconds is None else None, seconds) as advance:
+    with progress(_title(seconds), len(wanted) if seconds is None else None) as show:
         try:
             for trial in trials:
-                advance()
                 kinds[trial.kind] += 1
+                show(kinds.total())
                 accepted += trial.accepted
                 slowest, largest = max(slowest, trial.seconds), max(largest, trial.megabytes)
                 if trial.problem is not None:
@@ -249,13 +250,5 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
     return FAILED if found else OK
 
 
-@contextmanager
-def _bar(title: str, total: int | None, seconds: int | None) -> Iterator[Any]:
-    """A progress bar on stderr, which goes when the run ends; its function is called once a seed."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(title if seconds is None else f"{title} for {seconds} s", total=total)
-        yield lambda: progress.advance(task)
+def _title(seconds: int | None) -> str:
+    return "fuzz" if seconds is None else f"fuzz for {seconds} s"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,12 @@ from powderdsl.cli.exits import (
     INTERRUPTED,
     OK,
     BadInput,
-    colour_wanted,
     counted,
     user_values,
     write_diagnostics,
 )
 from powderdsl.cli.options import WholeType, backend_option, set_option
+from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
 from powderdsl.diagnostics import CompileError, Diagnostic
@@ -120,7 +119,7 @@ def command(
     from powderdsl.datasets.recorder import record
 
     try:
-        with user_values(), _progress(found.name) as progress:
+        with user_values(), progress(found.name, episodes, lines=True) as show:
             act = _policy(policy, found, split, backend, device)
             dataset = record(
                 found,
@@ -134,7 +133,7 @@ def command(
                 envs=envs,
                 policy_name=act.name,
                 sees=act.sees,
-                progress=progress,
+                progress=lambda done, total: show(done, "episodes", total=total),
                 split=split,
                 worlds=worlds,
                 backend=backend,
@@ -268,23 +267,3 @@ def _say_how_to_go_on(out: Path, episodes: int) -> None:
         f"stopped with {there:,} of {episodes:,} episodes in {shlex.quote(str(out))}: the same command goes on",
         err=True,
     )
-
-
-@contextmanager
-def _progress(name: str) -> Iterator[Callable[[float, int], Any]]:
-    """Shows how far it is as a bar on stderr, which goes at the end; on terminals only."""
-    if not colour_wanted(sys.stderr):
-        yield lambda done, total: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f} episodes"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        shown = bar.add_task(name)
-        yield lambda done, total: bar.update(shown, completed=done, total=total)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import colour_wanted, counted, user_values
+from powderdsl.cli.exits import counted, user_values
 from powderdsl.cli.options import (
     SizeType,
     WholeType,
@@ -21,6 +20,7 @@ from powderdsl.cli.options import (
     rules_argument,
     set_option,
 )
+from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
     from powderdsl.simulator import Simulator, World
@@ -163,10 +163,8 @@ class _Run:
         if self.plan.watch:
             with LiveView(self.sim.ruleset.elements) as self.view:
                 self._consume(self._watched(self._worlds()))
-        elif colour_wanted(sys.stderr):
-            self._consume(self._with_progress(self._worlds()))
         else:
-            self._consume(self._worlds())
+            self._consume(self._with_progress(self._worlds()))
         if self.plan.out is None and not self.plan.watch:
             with LiveView(self.sim.ruleset.elements) as view:
                 view.show(*first_world(self.world))
@@ -229,12 +227,7 @@ class _Run:
 
     def _with_progress(self, moments: Iterator[int]) -> Iterator[int]:
         """A progress bar on stderr, which goes when the run ends."""
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task(self.sim.ruleset.name, total=self.plan.steps)
+        with progress(self.sim.ruleset.name, self.plan.steps) as show:
             for step in moments:
-                progress.update(task, completed=step)
+                show(step)
                 yield step

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import click
 
 from powderdsl.cli.exits import BadInput, colour_wanted
 from powderdsl.cli.options import WholeType, load_rules, set_option
+from powderdsl.cli.plain_table import table
 from powderdsl.diagnostics import Span
 from powderdsl.model.reactions import reactions
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
@@ -88,29 +89,6 @@ def _text(ruleset: Ruleset, colour: bool) -> Iterator[str]:
         yield ""
         yield title
         yield from table(rows)
-
-
-def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines with aligned columns, the first row as heading; numbers stand to the right."""
-    if len(rows) < 2:
-        yield "  none"
-        return
-    widths = [max(_width(row[i]) for row in rows) for i in range(len(rows[0]))]
-    right = [all(_bare(row[i]).isdigit() for row in rows[1:]) for i in range(len(rows[0]))]
-    for row in rows:
-        cells = []
-        for cell, width, to_right in zip(row, widths, right, strict=True):
-            gap = " " * (width - _width(cell))
-            cells.append(gap + cell if to_right else cell + gap)
-        yield ("  " + "  ".join(cells)).rstrip()
-
-
-def _bare(cell: str) -> str:
-    return click.unstyle(cell)
-
-
-def _width(cell: str) -> int:
-    return len(_bare(cell))
 
 
 def _swatch(element: Element, colour: bool) -> str:

@@ -12,6 +12,7 @@ import click
 from powderdsl.cli.commands import COMMANDS
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.options import WholeType
+from powderdsl.cli.progress import progress
 from powderdsl.studies.study import SIZES, Point, Study
 from powderdsl.studies.study_file import load_study, shipped_studies
 from powderdsl.studies.study_run import Outcome, StudyRun
@@ -112,18 +113,15 @@ def _chosen(study: Study, point: Point, only: tuple[str, ...]) -> bool:
 
 
 def _with_progress(run: StudyRun, points: list[Point], jobs: int) -> list[Outcome]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        bar = progress.add_task(run.study.name, total=len(points))
+    done = 0
+    with progress(run.study.name, len(points)) as show:
 
         def told(one: Outcome) -> None:
-            progress.advance(bar)
+            nonlocal done
+            done += 1
+            show(done)
             text = ", ".join(f"{name} {value:.4g}" for name, value in one.values.items())
-            console.print(f"{one.point.name}: {one.problem or text}", markup=False)
+            click.echo(f"{one.point.name}: {one.problem or text}", err=True)
 
         return run.run(points, jobs, told)
 

@@ -14,7 +14,7 @@ import numpy as np
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
-from powderdsl.cli.show_command import table
+from powderdsl.cli.plain_table import table
 from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, rgb, scale
 from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +10,12 @@ import click
 
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import WholeType, backend_option, set_option
+from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.rl.ppo_config import NETWORKS, OBSERVATIONS, PRESETS, TrainConfig, from_json, preset
 
 if TYPE_CHECKING:
-    from powderdsl.rl.ppo_training import Progress
+    pass
 
 KINDS = tuple(dict.fromkeys(kind for kinds in OBSERVATIONS.values() for kind in kinds))
 
@@ -136,8 +133,12 @@ def command(
     from powderdsl.rl.ppo_training import train
 
     try:
-        with _progress(config) as progress:
-            run = train(config, folder, progress=progress)
+        with progress(Path(config.task).stem, config.steps, lines=True) as show:
+
+            def tell(step: int, mean: float | None) -> None:
+                show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
+
+            run = train(config, folder, progress=tell)
     except KeyboardInterrupt:
         click.echo(f"\ninterrupted; go on with: powderdsl train --resume {folder}", err=True)
         raise
@@ -163,39 +164,3 @@ def _config_of(folder: Path, asked: dict[str, Any], more: Any) -> TrainConfig:
     latest = run.read_json(ASKED) or {}
     how = {name: latest[name] for name in HOW if name in latest}
     return from_json({**config_of(run).as_json(), **how, **asked})
-
-
-@contextmanager
-def _progress(config: TrainConfig) -> Iterator[Progress]:
-    """A bar on a terminal; elsewhere a line twice a minute."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    if sys.stderr.isatty():
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[mean]}"),
-        )
-        with Bar(*columns, console=Console(stderr=True)) as bar:
-            row = bar.add_task(Path(config.task).stem, total=config.steps, mean="")
-
-            def advance(step: int, mean: float | None) -> None:
-                text = "" if mean is None else f"return {mean:.3f}"
-                bar.update(row, completed=min(step, config.steps), mean=text)
-
-            yield advance
-        return
-    due = time.monotonic() + 30
-
-    def say(step: int, mean: float | None) -> None:
-        nonlocal due
-        if time.monotonic() >= due:
-            due = time.monotonic() + 30
-            text = "" if mean is None else f", return {mean:.3f}"
-            click.echo(f"{step:,} of {config.steps:,}{text}", err=True)
-
-    yield say

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import BadInput, colour_wanted, user_values
+from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import Decorated, WholeType, backend_option, check_writable, set_option
+from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.scores import Tested
     from powderdsl.worldmodel.training import Machine, Moment, TrainConfig
-
-TELL_SECONDS = 15
-"""How often a line says how far training is, where stderr is no terminal."""
 
 
 class ManyWords(click.Command):
@@ -368,7 +364,11 @@ def _run(config: TrainConfig, folder: Path, values: Mapping[str, Any], **more: A
 
     machine = _machine(values)
     began = time.monotonic()
-    with _telling(config.iterations) as tell:
+    with progress("wm", config.iterations, lines=True) as show:
+
+        def tell(now: Moment) -> None:
+            show(now.done, "" if now.loss is None else f"loss {now.loss:.4f}")
+
         try:
             run = train(config, folder, machine=machine, tell=tell, save_seconds=values["save_every"], **more)
         except KeyboardInterrupt:
@@ -380,35 +380,8 @@ def _run(config: TrainConfig, folder: Path, values: Mapping[str, Any], **more: A
     )
 
 
-@contextmanager
-def _telling(total: int) -> Iterator[Callable[[Moment], None]]:
-    """A bar on a terminal, a line now and then elsewhere."""
-    if colour_wanted(sys.stderr):
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task("", total=total)
-            yield lambda now: bar.update(task, completed=now.done, description=_loss(now))
-        return
-    last = time.monotonic()
-
-    def tell(now: Moment) -> None:
-        nonlocal last
-        if time.monotonic() - last > TELL_SECONDS:
-            last = time.monotonic()
-            click.echo(f"{now.done:,} of {now.of:,}  {_loss(now)}".rstrip(), err=True)
-
-    yield tell
-
-
-def _loss(now: Any) -> str:
-    return "" if now.loss is None else f"loss {now.loss:.4f}"
-
-
 def _text(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
-    from powderdsl.cli.show_command import table
+    from powderdsl.cli.plain_table import table
 
     predictors = list(plain["mean"])
     yield f"{tested.rules}, {tested.task}/{tested.split}, after {tested.step:,} iterations: loss (accuracy; of cells that change)"

@@ -8,7 +8,7 @@ from typing import Any
 from unicodedata import combining, east_asian_width
 
 from powderdsl.diagnostics.codes import Severity
-from powderdsl.diagnostics.report import Diagnostic, Label
+from powderdsl.diagnostics.diagnostic import Diagnostic, Label
 from powderdsl.diagnostics.span import Span
 
 TAB_WIDTH = 4

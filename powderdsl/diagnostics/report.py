@@ -1,12 +1,13 @@
-"""Diagnostics as data, collected by a Reporter, raised once per stage as one CompileError."""
+"""Diagnostics are collected by a Reporter, and raised once per stage as one CompileError."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from difflib import get_close_matches
 
-from powderdsl.diagnostics.codes import CODES, Severity
+from powderdsl.diagnostics.codes import Severity
+from powderdsl.diagnostics.diagnostic import Diagnostic, Label
+from powderdsl.diagnostics.render import render_text
 from powderdsl.diagnostics.span import Span
 
 MAX_ERRORS = 200
@@ -17,35 +18,6 @@ MAX_CANDIDATES = 500
 """Names among which a misspelt one is looked for; if there are more, those with its first letter."""
 
 
-@dataclass(frozen=True)
-class Label:
-    """A place and the words that finish the sentence under its caret. `span` is None where there is no text."""
-
-    span: Span | None
-    text: str = ""
-
-
-@dataclass(frozen=True)
-class Diagnostic:
-    """One mistake (or remark): a code of the table, the place, what is wrong, and how to mend it."""
-
-    code: str
-    message: str
-    primary: Label
-    secondary: tuple[Label, ...] = ()
-    notes: tuple[str, ...] = ()
-    helps: tuple[str, ...] = ()
-
-    @property
-    def severity(self) -> Severity:
-        return CODES[self.code].severity
-
-    @property
-    def sort_key(self) -> tuple[str, int, int, str]:
-        span = self.primary.span
-        return (span.source.name, span.start, span.end, self.code) if span else ("", 0, 0, self.code)
-
-
 class CompileError(Exception):
     """Bad input: rule files, worlds, tasks. `diagnostics` has everything that was found, in source order."""
 
@@ -54,8 +26,6 @@ class CompileError(Exception):
         super().__init__(self.diagnostics)
 
     def __str__(self) -> str:
-        from powderdsl.diagnostics.render import render_text
-
         return "\n".join(render_text(diagnostic) for diagnostic in self.diagnostics)
 
 

@@ -1,0 +1,30 @@
+"""Tables in plain text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import click
+
+
+def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines with aligned columns, the first row as heading; numbers stand to the right."""
+    if len(rows) < 2:
+        yield "  none"
+        return
+    widths = [max(_width(row[i]) for row in rows) for i in range(len(rows[0]))]
+    right = [all(_bare(row[i]).isdigit() for row in rows[1:]) for i in range(len(rows[0]))]
+    for row in rows:
+        cells = []
+        for cell, width, to_right in zip(row, widths, right, strict=True):
+            gap = " " * (width - _width(cell))
+            cells.append(gap + cell if to_right else cell + gap)
+        yield ("  " + "  ".join(cells)).rstrip()
+
+
+def _bare(cell: str) -> str:
+    return click.unstyle(cell)
+
+
+def _width(cell: str) -> int:
+    return len(_bare(cell))
