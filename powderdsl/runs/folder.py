@@ -238,11 +238,21 @@ def read_json(path: Path) -> Any:
 def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tuple[str, ...]:
     if found.kind != kind:
         return (f"it is of the kind `{found.kind}`, not `{kind}`",)
+    there, here = dict(_flat(found.config)), dict(_flat(config))
     return tuple(
-        f"`{name}` is {json.dumps(found.config.get(name))} there, {json.dumps(config.get(name))} here"
-        for name in sorted({*found.config, *config})
-        if found.config.get(name) != config.get(name)
+        f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
+        for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
     )
+
+
+def _flat(config: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, str]]:
+    """Each setting by its dotted name, as JSON."""
+    for name, value in config.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{within}{name}.")
+        else:
+            yield within + name, json.dumps(value)
 
 
 def _no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:

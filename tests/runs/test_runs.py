@@ -83,15 +83,18 @@ def test_loading_executes_nothing(tmp_path: Path) -> None:
 
 def test_the_same_settings_come_back_and_others_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    first = open_run(folder, "toy", {"seed": 1, "sizes": (1, 2)}, note={"of": "x"})
-    assert open_run(folder, "toy", {"seed": 1, "sizes": [1, 2]}) == first
+    first = open_run(folder, "toy", {"seed": 1, "data": {"sizes": (1, 2), "task": "dig"}}, note={"of": "x"})
+    assert open_run(folder, "toy", {"seed": 1, "data": {"sizes": [1, 2], "task": "dig"}}) == first
     assert first.about["of"] == "x"
     assert {"python", "torch", "powderdsl"} <= first.about["versions"].keys()
     with pytest.raises(CompileError) as error:
-        open_run(folder, "toy", {"seed": 2, "lines": 5})
+        open_run(folder, "toy", {"seed": 2, "data": {"sizes": [1, 3], "task": "dig"}, "lines": 5})
     assert codes(error) == ["PD621"]
-    assert "`seed` is 1 there, 2 here" in notes(error)
-    assert "`lines` is null there, 5 here" in notes(error)
+    assert error.value.diagnostics[0].notes == (
+        "`data.sizes` is [1, 2] there, [1, 3] here",
+        "`lines` is not set there, 5 here",
+        "`seed` is 1 there, 2 here",
+    )
     with pytest.raises(CompileError) as error:
         open_run(folder, "other", {"seed": 1})
     assert "of the kind `toy`" in notes(error)
