@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -78,21 +79,24 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
 
 
 def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
-    return PPO(
-        "CnnPolicy",
-        env,
-        learning_rate=config.learning_rate,
-        n_steps=config.rollout,
-        batch_size=config.batch,
-        n_epochs=config.epochs,
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
-        clip_range=config.clip,
-        ent_coef=config.entropy,
-        policy_kwargs=policy_kwargs(config, env.tensors),
-        device=config.device,
-        seed=config.seed,
-    )
+    with warnings.catch_warnings():
+        # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
+        warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
+        return PPO(
+            "CnnPolicy",
+            env,
+            learning_rate=config.learning_rate,
+            n_steps=config.rollout,
+            batch_size=config.batch,
+            n_epochs=config.epochs,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            clip_range=config.clip,
+            ent_coef=config.entropy,
+            policy_kwargs=policy_kwargs(config, env.tensors),
+            device=config.device,
+            seed=config.seed,
+        )
 
 
 class _Keeper(BaseCallback):

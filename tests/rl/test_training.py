@@ -63,6 +63,12 @@ def test_other_seeds_give_other_weights(task: Path, tmp_path: Path) -> None:
     assert not same(*(lasting(run)["policy"] for run in runs))
 
 
+def test_batches_need_not_divide_a_rollout(task: Path, tmp_path: Path) -> None:
+    """The last of an epoch is smaller, here one action, and nobody is warned."""
+    run = train(quick(task, steps=32, batch=31), tmp_path / "run")
+    assert all(one.isfinite().all() for one in run.checkpoint().state["policy"].values())
+
+
 def test_a_run_that_is_done_stays_as_it_is(task: Path, tmp_path: Path) -> None:
     run = train(quick(task, steps=32), tmp_path / "run")
     path, when = run.checkpoint().path, run.checkpoint().path.stat().st_mtime_ns
