@@ -58,8 +58,9 @@ def _data_options(function: Decorated) -> Decorated:
         click.option("--buffer", "capacity", type=WholeType(1, 1 << 32), help="Pairs that the buffer holds."),
         click.option("--refresh", type=WholeType(1, 1 << 20), help="Pairs that each iteration replaces."),
         set_option,
+        click.option("--rulesets", type=WholeType(0, 1024), help="Draw so many rulesets around the rules."),
         click.option(
-            "--rulesets", type=WholeType(0, 1 << 32), help="Draw so many rulesets around the rules."
+            "--first-ruleset", type=WholeType(0, 1 << 31), help="The number of the first.  [default: 0]"
         ),
         click.option("--chances", type=float, help="Their chances differ by up to this factor."),
         click.option("--swap", "swaps", multiple=True, metavar="PROPERTY", help="Two elements exchange it."),
@@ -167,9 +168,9 @@ def train_command(
     chosen = {name: value for name, value in named.items() if value is not None}
     config = PRESETS[preset]
     variety = _given(chances=values["chances"], swaps=swaps or None, leave_out=values["leave_out"])
-    if variety and not values["rulesets"]:
+    if (variety or values["first_ruleset"]) and not values["rulesets"]:
         raise BadInput(
-            "--chances, --swap and --leave-out say how rulesets differ: --rulesets says how many there are"
+            "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
         )
     with user_values():
         differ = Variety(**variety)
@@ -180,7 +181,9 @@ def train_command(
         knobs={**chosen, **knob_values(knobs)},
         params=settings,
         variety=differ,
-        **_given(**{name: values[name] for name in ("states", "capacity", "refresh", "rulesets")}),
+        **_given(
+            **{name: values[name] for name in ("states", "capacity", "refresh", "rulesets", "first_ruleset")}
+        ),
     )
     changes = _given(
         **{name: values[name] for name in ("width", "iterations", "batch", "learning_rate", "seed")}
@@ -227,7 +230,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 )
 @click.option(
     "--rulesets",
-    type=WholeType(0, 1 << 20),
+    type=WholeType(0, 1024),
     default=0,
     help="Test under so many rulesets that training never saw.",
 )

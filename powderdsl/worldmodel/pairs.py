@@ -16,7 +16,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped_tasks import check_split, load_task
-from powderdsl.worldmodel.rulesets import RulesetSource, VariedWorlds, Variety
+from powderdsl.worldmodel.rulesets import MAX_RULESETS, RulesetSource, VariedWorlds, Variety
 from powderdsl.worldmodel.watched import Watched, watched
 from powderdsl.worlds.files import failure
 
@@ -59,8 +59,10 @@ class DataConfig:
         for name in ("states", "steps", "pairs", "capacity", "refresh"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be 1 or more, found {getattr(self, name)}")
-        if self.rulesets < 0 or self.first_ruleset < 0:
-            raise ValueError("rulesets and first_ruleset must be 0 or more")
+        if not 0 <= self.rulesets <= MAX_RULESETS:
+            raise ValueError(f"rulesets must lie in 0..{MAX_RULESETS}, found {self.rulesets}")
+        if self.first_ruleset < 0:
+            raise ValueError("first_ruleset must be 0 or more")
         if self.states > TEST_SEEDS:
             raise ValueError(f"states must be at most {TEST_SEEDS:,}: tests begin there")
 

@@ -27,6 +27,9 @@ from powderdsl.worlds.files import failure
 TRIES = 8
 """How often a swap or a selection of packs is drawn anew where the rules would contradict themselves."""
 
+MAX_RULESETS = 1024
+"""Each is checked before the first step, and each structure compiled."""
+
 UNSEEN_RULESETS = 1 << 32
 """The first number of rulesets that models are tested on. Training takes numbers below it."""
 

@@ -139,6 +139,18 @@ def test_unknown_properties_and_bad_numbers_are_refused() -> None:
     for wrong in ({"chances": 0.5}, {"leave_out": 1.0}, {"chances": float("nan")}):
         with pytest.raises(ValueError, match=r"chances|leave_out"):
             Variety(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="rulesets must lie"):
+        DataConfig(rulesets=1025)
+
+
+def test_seeds_may_have_rulesets_of_their_own(task) -> None:  # type: ignore[no-untyped-def]
+    source = RulesetSource(RULES, MANY)
+    first, other = (
+        VariedWorlds(task, "train", source, 2, first=number, backend="dense") for number in (0, 1)
+    )
+    assert [one.number for one in other.drawn] == [1, 2]
+    assert other.drawn[0] == first.drawn[1]
+    assert other.drawn[1] not in first.drawn
 
 
 def test_without_variety_a_ruleset_is_the_base() -> None:
