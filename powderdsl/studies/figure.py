@@ -32,12 +32,14 @@ def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome
     for axes, one in zip(figure.subplots(1, len(found), squeeze=False)[0], found, strict=True):
         _draw(axes, study, size, one)
     seeds = max(len(cell.samples) for one in found for cell in one.cells)
-    figure.suptitle(f"{study.about} ({size}, {seeds} seeds)", fontsize=9, wrap=True)
+    figure.suptitle(f"{study.about} ({size}, {seeds} seeds)", fontsize=8, wrap=True)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=150)
 
 
 def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
+
     first = study.axes[0]
     ticks = list(first.values[size])
     numbers = _numbers(ticks)
@@ -46,24 +48,29 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
         lines.setdefault(", ".join(f"{name} {value}" for name, value in cell.values[1:]), []).append(cell)
     for label, cells in lines.items():
         across = [numbers[ticks.index(cell.values[0][1])] for cell in cells]
-        found = [cell.over_seeds for cell in cells]
+        means = [cell.over_seeds.mean for cell in cells]
+        several = [len(cell.samples) > 1 for cell in cells]
         below = [
-            one.mean - one.low if len(cell.samples) > 1 else 0.0
-            for one, cell in zip(found, cells, strict=True)
+            one.over_seeds.mean - one.over_seeds.low if many else 0.0
+            for one, many in zip(cells, several, strict=True)
         ]
         above = [
-            one.high - one.mean if len(cell.samples) > 1 else 0.0
-            for one, cell in zip(found, cells, strict=True)
+            one.over_seeds.high - one.over_seeds.mean if many else 0.0
+            for one, many in zip(cells, several, strict=True)
         ]
-        axes.errorbar(
-            across, [one.mean for one in found], [below, above], marker="o", capsize=3, label=label or None
-        )
+        axes.errorbar(across, means, [below, above], marker="o", capsize=3, label=label or None)
         for place, cell in zip(across, cells, strict=True):
             axes.plot([place] * len(cell.samples), cell.samples, "k.", markersize=3, alpha=0.4)
-    if min(numbers) > 0 and max(numbers) >= 20 * min(numbers):
+    if min(numbers) > 0 and max(numbers) >= 10 * min(numbers):
         axes.set_xscale("log")
-    axes.set_yscale(finding.measure.scale)
     axes.set_xticks(numbers, ticks, minor=False)
+    axes.xaxis.set_minor_locator(NullLocator())
+    if finding.measure.scale == "log":
+        axes.set_yscale("log")
+        low, high = axes.get_ylim()
+        axes.yaxis.set_major_locator(MaxNLocator(6) if high < 5 * low else LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.set_xlabel(first.about)
     axes.set_ylabel(finding.measure.about)
     axes.grid(linewidth=0.3)

@@ -166,13 +166,13 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
 
 
 def shown(found: Interval, scale: str = "linear") -> str:
-    """`0.1234 ± 0.0056`, or `0.123 (0.118 to 0.129)` on the scale ``log``: as many places as the interval deserves."""
+    """`0.1234 ± 0.0056`, as many places as the interval deserves; `0.123 (0.118 to 0.129)` on the scale ``log``."""
     half = (found.high - found.low) / 2
     if not math.isfinite(half):
         return f"{found.mean:.4g}"
-    places = 4 if half <= 0 else min(max(1 - math.floor(math.log10(half)), 0), 6)
     if scale == "log":
-        return f"{found.mean:.{places}f} ({found.low:.{places}f} to {found.high:.{places}f})"
+        return f"{found.mean:.3g} ({found.low:.3g} to {found.high:.3g})"
+    places = 4 if half <= 0 else min(max(1 - math.floor(math.log10(half)), 0), 6)
     return f"{found.mean:.{places}f} ± {half:.{places}f}"
 
 
