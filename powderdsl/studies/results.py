@@ -171,7 +171,8 @@ def shown(found: Interval, scale: str = "linear") -> str:
     if not math.isfinite(half):
         return f"{found.mean:.4g}"
     if scale == "log":
-        return f"{found.mean:.3g} ({found.low:.3g} to {found.high:.3g})"
+        mean, low, high = (f"{one:#.3g}".rstrip(".") for one in (found.mean, found.low, found.high))
+        return f"{mean} ({low} to {high})"
     places = 4 if half <= 0 else min(max(1 - math.floor(math.log10(half)), 0), 6)
     return f"{found.mean:.{places}f} ± {half:.{places}f}"
 

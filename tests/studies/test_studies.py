@@ -157,7 +157,7 @@ def test_numbers_have_the_places_they_deserve(mean: float, half: float, text: st
 
 
 def test_factors_are_shown_with_both_ends() -> None:
-    assert shown(Interval(0.5, 0.25, 1.0), "log") == "0.5 (0.25 to 1)"
+    assert shown(Interval(0.5, 0.25, 1.0), "log") == "0.500 (0.250 to 1.00)"
 
 
 def test_what_was_found_is_said_as_it_is() -> None:
@@ -174,7 +174,7 @@ def test_ratios_are_compared_on_the_scale_log() -> None:
     text = TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", "")
     study = read(text.replace("expect: rises", "expect: rises, scale: log"))
     (rose,) = findings(study, outcomes(study, {("100",): (1.0, 2.0, 4.0), ("200",): (2.0, 4.0, 8.0)}))
-    assert rose.verdict == "rises at every point, in 3 of 3 seeds (last / first: 2 (2 to 2))"
+    assert rose.verdict == "rises at every point, in 3 of 3 seeds (last / first: 2.00 (2.00 to 2.00))"
     assert rose.cells[0].over_seeds.mean == pytest.approx(2.0)
     (noise,) = findings(study, outcomes(study, {("100",): (1.0, 2.0, 4.0), ("200",): (2.0, 1.0, 9.0)}))
     assert "but the interval holds 1" in noise.verdict
