@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from string import Template
 
 SIZES = ("small", "paper")
@@ -30,11 +30,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Axis:
-    """A setting that is varied, and its values for each of `SIZES`."""
+    """A setting that is varied, and its values for each of `SIZES`.
+
+    `sets`: for each value, other names and what they stand for with it; empty if the values stand for themselves.
+    """
 
     name: str
     about: str
     values: Mapping[str, tuple[str, ...]]
+    sets: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -54,10 +58,11 @@ class Measure:
 
 @dataclass(frozen=True)
 class Point:
-    """One combination of values, and a seed."""
+    """One combination of values, and a seed. `sets`: other names, and what they stand for with these values."""
 
     values: tuple[tuple[str, str], ...]
     seed: int
+    sets: tuple[tuple[str, str], ...] = ()
 
     @property
     def name(self) -> str:
@@ -82,9 +87,15 @@ class Study:
         names = [axis.name for axis in self.axes]
         for seed in range(self.seeds if seeds is None else seeds):
             for values in itertools.product(*(axis.values[size] for axis in self.axes)):
-                yield Point(tuple(zip(names, values, strict=True)), seed)
+                chosen = tuple(zip(names, values, strict=True))
+                sets = [
+                    axis.sets.get(value, {}).items() for axis, value in zip(self.axes, values, strict=True)
+                ]
+                yield Point(chosen, seed, tuple(itertools.chain.from_iterable(sets)))
 
 
 def filled(text: str, point: Point, size: str) -> str:
     """A text with the values of a point in it."""
-    return Template(text).safe_substitute({**dict(point.values), SEED: str(point.seed), SIZE: size})
+    return Template(text).safe_substitute(
+        {**dict(point.values), **dict(point.sets), SEED: str(point.seed), SIZE: size}
+    )

@@ -25,6 +25,7 @@ STUDY_KEYS: dict[str, dict[str, Key]] = {
     "axis": {
         "about": Key("line", "what it is, for the figure"),
         **{size: Key("any", f"its values at the size `{size}`", True) for size in SIZES},
+        "sets": Key("mapping", "for each value, other names and what they stand for with it"),
     },
     "measure": {
         "of": Key("word", "the step whose run was evaluated", True),
@@ -88,6 +89,7 @@ class _StudyReader:
     def __init__(self, reader: Reader, commands: Mapping[tuple[str, ...], frozenset[str]]):
         self.reader, self.reporter, self.commands = reader, reader.reporter, commands
         self.axes: list[Axis] = []
+        self.set_names: list[str] = []
         self.steps: list[Step] = []
 
     def study(self, tree: yaml_tree.Node, text: str) -> Study:
@@ -127,12 +129,15 @@ class _StudyReader:
         return list(self.reader.named(entries.get(key, (None, None))[1], what))
 
     def axis(self, key: yaml_tree.Scalar, node: yaml_tree.Node) -> Axis:
-        if key.text in (SEED, SIZE):
+        if key.text in (SEED, SIZE, *self.set_names):
             self.reporter.error("PD111", f"`{key.text}` is given already", key.span, "choose another name")
+        sets: dict[str, dict[str, str]] = {}
         if isinstance(node, yaml_tree.Mapping):
             entries = self.reader.mapping(node, "axis", "a setting")
             lists = {size: entries[size][1] for size in SIZES if size in entries}
             about = self.reader.text(entries, "about")
+            if "sets" in entries:
+                sets = self.sets(entries["sets"][1], lists)
         else:  # one list for every size
             lists, about = dict.fromkeys(SIZES, node), ""
         values = {size: tuple(word.text for word in self.reader.words(one)) for size, one in lists.items()}
@@ -143,7 +148,40 @@ class _StudyReader:
                 if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,60}", word.text):
                     label = "letters, digits and `_.+-`: folders are named after values"
                     self.reporter.error("PD110", "this cannot be a value here", word.span, label)
-        return Axis(key.text, about or key.text, {size: values.get(size) or ("",) for size in SIZES})
+        return Axis(key.text, about or key.text, {size: values.get(size) or ("",) for size in SIZES}, sets)
+
+    def sets(self, node: yaml_tree.Node, lists: Mapping[str, yaml_tree.Node]) -> dict[str, dict[str, str]]:
+        """What each value sets: the same names for all of them."""
+        if not isinstance(node, yaml_tree.Mapping):
+            self.reader.shape(node, "a mapping", "write `VALUE: {NAME: VALUE, …}`, each on a line of its own")
+            return {}
+        taken = (SEED, SIZE, *(axis.name for axis in self.axes), *self.set_names)
+        found = {value.text: self.set_by(inner, taken) for value, inner in node.entries}
+        names = dict.fromkeys(name for one in found.values() for name in one)
+        self.set_names += names
+        for value, _ in node.entries:
+            for name in names.keys() - found[value.text].keys():
+                self.reporter.error("PD109", f"`{value.text}` does not set `{name}`", value.span, "others do")
+        for word in (one for listed in lists.values() for one in self.reader.words(listed)):
+            if word.text not in found:
+                self.reporter.error("PD109", f"`sets` does not say what `{word.text}` sets", word.span)
+        return found
+
+    def set_by(self, node: yaml_tree.Node, taken: tuple[str, ...]) -> dict[str, str]:
+        """The names and values of one entry of `sets`."""
+        if not isinstance(node, yaml_tree.Mapping):
+            self.reader.shape(node, "a mapping", "write `{NAME: VALUE, …}`")
+            return {}
+        found = {}
+        for name, word in node.entries:
+            if name.text in taken:
+                label = "choose another name"
+                self.reporter.error("PD111", f"`{name.text}` is given already", name.span, label)
+            if isinstance(word, yaml_tree.Scalar):
+                found[name.text] = word.text
+            else:
+                self.reader.shape(word, "a word")
+        return found
 
     def step(self, key: yaml_tree.Scalar, node: yaml_tree.Node) -> Step | None:
         if not isinstance(node, yaml_tree.Mapping):
@@ -203,7 +241,7 @@ class _StudyReader:
 
     def check_names(self, text: str, span: Span) -> None:
         """Report ``$NAME`` that is not varied."""
-        known = [*(axis.name for axis in self.axes), SEED, SIZE]
+        known = [*(axis.name for axis in self.axes), *self.set_names, SEED, SIZE]
         for name in Template(text).get_identifiers():
             if name not in known:
                 helps = suggest(name, known, "settings")

@@ -80,6 +80,20 @@ def test_a_step_becomes_a_command(tmp_path: Path) -> None:
     assert tested == ["evaluate", str(place / "trained"), "--episodes", "4"]
 
 
+def test_a_value_may_set_several_names() -> None:
+    several = "{small: [few, both], paper: [few], sets: {few: {l: 2, d: 0}, both: {l: 2, d: 5}}}"
+    study = read(
+        TEXT.replace("[0, 5]", several).replace("[lines=2, squares=$squares]", "[lines=$l, disks=$d]")
+    )
+    words = [
+        StudyRun(study, Path("x"), "small").command(study.steps[0], point, Path("y"))[4:8]
+        for point in study.points("small", seeds=1)
+    ]
+    few, both = (["--knob", "lines=2", "--knob", f"disks={number}"] for number in (0, 5))
+    assert words == [few, both, few, both]
+    assert next(study.points("small", seeds=1)).name == "steps=100,squares=few,seed=0"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "code", "caret"),
     [
@@ -99,6 +113,12 @@ def test_a_step_becomes_a_command(tmp_path: Path) -> None:
         ("of: trained", "of: tested", "PD806", "tested"),
         ("expect: rises", "expect: grows", "PD110", "grows"),
         ("expect: rises", "scale: square", "PD110", "square"),
+        ("[0, 5]", "{small: [a], paper: [a, b], sets: {a: {lines: 1}}}", "PD109", "b"),
+        ("[0, 5]", "{small: [a], paper: [b], sets: {a: {lines: 1}, b: {disks: 2}}}", "PD109", "a"),
+        ("[0, 5]", "{small: [a], paper: [a], sets: {a: {steps: 1}}}", "PD111", "steps"),
+        ("[0, 5]", "{small: [a], paper: [a], sets: {a: 1}}", "PD107", "1"),
+        ("[0, 5]", "{small: [a], paper: [a], sets: a}", "PD107", "a"),
+        ("[0, 5]", "{small: [a], paper: [a], sets: {a: {x: 1}}}\n  x: [1]", "PD111", "x"),
         ("paper: [1000, 2000, 4000]", f"paper: [{', '.join(map(str, range(2000)))}]", "PD806", "patience"),
     ],
 )
