@@ -43,6 +43,8 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
     first = study.axes[0]
     ticks = list(first.values[size])
     numbers = _numbers(ticks)
+    joined = "-" if numbers is not None else ""  # between words there is nothing
+    numbers = numbers or [float(place) for place in range(len(ticks))]
     lines: dict[str, list[Cell]] = {}
     for cell in finding.cells:
         lines.setdefault(", ".join(f"{name} {value}" for name, value in cell.values[1:]), []).append(cell)
@@ -58,12 +60,14 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
             one.over_seeds.high - one.over_seeds.mean if many else 0.0
             for one, many in zip(cells, several, strict=True)
         ]
-        axes.errorbar(across, means, [below, above], marker="o", capsize=3, label=label or None)
+        axes.errorbar(across, means, [below, above], fmt=f"o{joined}", capsize=3, label=label or None)
         for place, cell in zip(across, cells, strict=True):
             axes.plot([place] * len(cell.samples), cell.samples, "k.", markersize=3, alpha=0.4)
     if min(numbers) > 0 and max(numbers) >= 10 * min(numbers):
         axes.set_xscale("log")
     axes.set_xticks(numbers, ticks, minor=False)
+    if not joined and sum(map(len, ticks)) > 40:
+        axes.tick_params("x", labelrotation=25)
     axes.xaxis.set_minor_locator(NullLocator())
     if finding.measure.scale == "log":
         axes.set_yscale("log")
@@ -78,9 +82,9 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
         axes.legend(fontsize=8)
 
 
-def _numbers(words: Sequence[str]) -> list[float]:
-    """Where values stand: as the numbers that they are, or side by side."""
+def _numbers(words: Sequence[str]) -> list[float] | None:
+    """Where values stand, if they are numbers."""
     try:
         return [float(word) for word in words]
     except ValueError:
-        return [float(place) for place in range(len(words))]
+        return None

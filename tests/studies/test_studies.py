@@ -213,6 +213,16 @@ def test_a_table_names_what_did_not_finish(tmp_path: Path) -> None:
     assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
+def test_words_have_a_figure_too(tmp_path: Path) -> None:
+    study = load_study("shapes", commands())
+    found = [
+        Outcome(point, {"loss": 0.1 + 0.01 * number}) for number, point in enumerate(study.points("small"))
+    ]
+    write_figure(tmp_path / "figure.png", study, "small", found)
+    assert (tmp_path / "figure.png").stat().st_size > 1000
+    assert "| lines+disks | 0.191 (" in as_markdown(study, "small", found)
+
+
 TINY = """
 task: dig
 rules: core+sand
