@@ -170,13 +170,13 @@ def _measured(plan: Plan) -> Report:
     """The report of a plan, or of as much of it as was done when Ctrl-C came."""
     machine = this_machine(plan.device)
     events: list[Event] = []
-    interrupted = False
+    interrupted, done = False, 0
     try:
         with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
             for event in measure_events(plan):
                 events.append(event)
                 what = event.what if isinstance(event, Started) else "measure"
-                done = sum(not isinstance(one, Started) for one in events)
+                done += not isinstance(event, Started)
                 show(done, f"{what} {event.cell.backend}, batch {event.cell.batch}")
     except KeyboardInterrupt:
         interrupted = True

@@ -16,9 +16,9 @@ SECONDS = 30
 
 
 class Show(Protocol):
-    """Says how much is done, with words that stand beside it. `total`: if it is known only now."""
+    """Says how much is done, with words that stand beside it."""
 
-    def __call__(self, done: float, words: str = "", *, total: float | None = None) -> None: ...
+    def __call__(self, done: float, words: str = "") -> None: ...
 
 
 @contextmanager
@@ -48,20 +48,20 @@ def progress(title: str, total: float | None = None, *, lines: bool = False) -> 
     with Progress(*columns, TextColumn("{task.fields[words]}"), console=console, transient=True) as bar:
         task = bar.add_task(title, total=total, words="")
 
-        def show(done: float, words: str = "", *, total: float | None = None) -> None:
-            bar.update(task, completed=done, words=words, total=total)
+        def show(done: float, words: str = "") -> None:
+            bar.update(task, completed=done, words=words)
 
         yield show
 
 
-def _silent(done: float, words: str = "", *, total: float | None = None) -> None:
+def _silent(done: float, words: str = "") -> None:
     pass
 
 
 def _lines(total: float | None) -> Show:
     last, of = time.monotonic(), "" if total is None else f" of {total:,.0f}"
 
-    def show(done: float, words: str = "", *, total: float | None = None) -> None:
+    def show(done: float, words: str = "") -> None:
         nonlocal last
         if time.monotonic() - last > SECONDS:
             last = time.monotonic()

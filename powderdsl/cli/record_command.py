@@ -133,7 +133,7 @@ def command(
                 envs=envs,
                 policy_name=act.name,
                 sees=act.sees,
-                progress=lambda done, total: show(done, "episodes", total=total),
+                progress=lambda done, total: show(done, "episodes"),
                 split=split,
                 worlds=worlds,
                 backend=backend,
@@ -233,7 +233,7 @@ def _policy(policy: str, task: Task, split: str, backend: str, device: str) -> _
 def _require_gymnasium() -> None:
     """Raises CompileError (PD612) if the environments' package is not installed."""
     try:
-        import powderdsl.envs  # noqa: F401
+        import powderdsl.envs  # noqa: F401  only whether it can be imported
     except ModuleNotFoundError as error:
         from powderdsl.worlds.files import failure
 

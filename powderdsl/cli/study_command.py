@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -137,9 +138,7 @@ def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> N
     with replacing(folder / "results.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
     sys.stdout.write(text)
-    try:
-        import matplotlib  # noqa: F401  only whether it is there
-    except ImportError:
+    if find_spec("matplotlib") is None:
         click.echo("no figure: pip install 'powderdsl[plot]'", err=True)
     else:
         write_figure(folder / "figure.png", study, size, outcomes)

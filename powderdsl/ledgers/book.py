@@ -7,7 +7,7 @@ contrary, for several rules may make up for each other.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -200,7 +200,7 @@ class Ledger:
             return NotProven(f"`{field}` starts outside {low:g}..{high:g}")
         return NotProven(f"`{field}` may be written beyond {low:g}..{high:g}", tuple(lines))
 
-    def _weighed(self, weights: Mapping[str, int], verb: str, breaks) -> Verdict:  # type: ignore[no-untyped-def]
+    def _weighed(self, weights: Mapping[str, int], verb: str, breaks: Callable[[int, int], bool]) -> Verdict:
         self._known(weights)
         broken = {
             (a, b): lines

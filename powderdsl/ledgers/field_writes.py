@@ -84,7 +84,7 @@ def reach(assign: Assign, declared: Bounds) -> tuple[float | None, float | None]
     """How low and how high an assignment may bring a whole number; None where it never lowers or never raises it."""
     low, high = assign.value.kind.lo, assign.value.kind.hi
     if assign.op == ":=":
-        return tuple(min(max(value, declared[0]), declared[1]) for value in (low, high))  # type: ignore[return-value]
+        return min(max(low, declared[0]), declared[1]), min(max(high, declared[0]), declared[1])
     if assign.op == "-=":
         low, high = -high, -low
     return (declared[0] if low < 0 else None), (declared[1] if high > 0 else None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,17 +51,20 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
         lines.setdefault(", ".join(f"{name} {value}" for name, value in cell.values[1:]), []).append(cell)
     for label, cells in lines.items():
         across = [numbers[ticks.index(cell.values[0][1])] for cell in cells]
-        means = [cell.over_seeds.mean for cell in cells]
-        several = [len(cell.samples) > 1 for cell in cells]
-        below = [
-            one.over_seeds.mean - one.over_seeds.low if many else 0.0
-            for one, many in zip(cells, several, strict=True)
+        found = [cell.over_seeds for cell in cells]
+        # A single value has no interval.
+        bars = [
+            (one.mean - one.low, one.high - one.mean) if math.isfinite(one.high) else (0.0, 0.0)
+            for one in found
         ]
-        above = [
-            one.over_seeds.high - one.over_seeds.mean if many else 0.0
-            for one, many in zip(cells, several, strict=True)
-        ]
-        axes.errorbar(across, means, [below, above], fmt=f"o{joined}", capsize=3, label=label or None)
+        axes.errorbar(
+            across,
+            [one.mean for one in found],
+            list(zip(*bars, strict=True)),
+            fmt=f"o{joined}",
+            capsize=3,
+            label=label or None,
+        )
         for place, cell in zip(across, cells, strict=True):
             axes.plot([place] * len(cell.samples), cell.samples, "k.", markersize=3, alpha=0.4)
     if min(numbers) > 0 and max(numbers) >= 10 * min(numbers):

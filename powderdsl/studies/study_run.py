@@ -100,9 +100,8 @@ class StudyRun:
     def _point(self, point: Point) -> Outcome:
         kept = self.folder / "done" / f"{point.name}.json"
         place = self.folder / "runs" / point.name
-        known = read_json(
-            kept
-        )  # by where they come from, so that measures may change; runs may have been deleted
+        # Values by where they come from: measures may change later, and runs may be deleted.
+        known = read_json(kept)
         try:
             if not isinstance(known, dict):
                 place.mkdir(parents=True, exist_ok=True)
