@@ -15,11 +15,11 @@ INSTALL := $(PIP) --constraint constraints.txt
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
 # One thread a process: pytest runs several processes, and small tensors gain nothing from threads.
-test ledger golden: export OMP_NUM_THREADS ?= 1
+test test-all golden: export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test ledger check lint types format golden wheel clean distclean
+.PHONY: help setup demo test test-all check lint types format golden wheel clean distclean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
@@ -50,8 +50,8 @@ demo: $(VENV)/.core  ## run a designed world and write demo.gif
 test: $(VENV)/.ready  ## run the tests (ARGS=... for pytest, JOBS=0 for one process)
 	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 $(ARGS)
 
-ledger: $(VENV)/.ready  ## hold 10,000 worlds of every shipped ruleset against its ledger
-	@LEDGER_WORLDS=10000 $(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 --durations 0 --durations-min 1 -k random_worlds tests/semantics/test_ledger.py $(ARGS)
+test-all: $(VENV)/.ready  ## run the tests and all campaigns: long searches for mistakes (hours)
+	@$(BIN)/python -m pytest --campaigns --numprocesses $(JOBS) --maxprocesses 4 --durations 20 $(ARGS)
 
 check: lint types test  ## lint, types and test
 

@@ -1,4 +1,4 @@
-"""What all tests share: golden files, one thread for torch, and processes that Ctrl-C reaches."""
+"""What all tests share: tiers, golden files, one thread for torch, and processes that Ctrl-C reaches."""
 
 from __future__ import annotations
 
@@ -21,6 +21,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--update-golden", action="store_true", help="write golden files anew instead of comparing with them"
     )
+    parser.addoption(
+        "--campaigns", action="store_true", help="also run the long tests, which are marked `campaign`"
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave campaigns out, unless ``--campaigns``, ``-m campaign`` or the id of a test asks for them."""
+    if config.getoption("--campaigns") or "campaign" in config.getoption("-m"):
+        return
+    named = tuple(argument for argument in config.args if "::" in argument)
+    long = {one for one in items if one.get_closest_marker("campaign") and not one.nodeid.startswith(named)}
+    if long:
+        config.hook.pytest_deselected(items=[one for one in items if one in long])
+        items[:] = [one for one in items if one not in long]
 
 
 @pytest.fixture

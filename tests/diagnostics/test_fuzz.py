@@ -1,7 +1,7 @@
 """Random damage to rule files: loading raises nothing but CompileError, and what it raises can be printed.
 
-`powderdsl fuzz --front-end --seeds 0..20000` looks harder, and at time and memory; so does
-``FUZZ_EXAMPLES=20000 pytest tests/diagnostics/test_fuzz.py``, which makes what it finds small.
+`powderdsl fuzz --front-end --seeds 0..20000` looks harder, and at time and memory; so do the campaign, which reduces
+what it finds, and ``FUZZ_EXAMPLES=20000 pytest --campaigns tests/diagnostics/test_fuzz.py``.
 """
 
 from __future__ import annotations
@@ -16,18 +16,23 @@ from powderdsl.model.declarations import PackDecl
 from powderdsl.testing import damage
 from powderdsl.testing.damage import KINDS, damaged_text, load_damaged, needed, rule_texts, run_trial, whole
 from powderdsl.testing.strategies import chosen
+from tests.tiers import tiered
 
-EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "150"))
+SMOKE = 50
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "2000"))
+"""Examples of each kind in the smoke test and in the campaign."""
+
 FEWER = {"heavy": 10, "text": 3, "random rules": 3}
 """Kinds that take long, or many choices: so many times fewer examples."""
 
 SEEDS = 200
 
 
+@pytest.mark.parametrize("examples", tiered((SMOKE, EXAMPLES), [SMOKE]))
 @pytest.mark.parametrize("kind", KINDS)
-def test_damaged_files(kind: str) -> None:
+def test_damaged_files(kind: str, examples: int) -> None:
     @settings(
-        max_examples=max(1, EXAMPLES // FEWER.get(kind, 1)),
+        max_examples=max(1, examples // FEWER.get(kind, 1)),
         deadline=None,
         derandomize="FUZZ_EXAMPLES" not in os.environ,
         database=None,
@@ -45,18 +50,23 @@ def test_damaged_files(kind: str) -> None:
     run()
 
 
-@settings(max_examples=EXAMPLES, deadline=None, derandomize=True, database=None)
-@given(st.text(max_size=200))
-def test_any_text(text: str) -> None:
-    load_damaged(text)
+@pytest.mark.parametrize("examples", tiered((SMOKE, EXAMPLES), [SMOKE]))
+def test_any_text(examples: int) -> None:
+    @settings(max_examples=examples, deadline=None, derandomize=True, database=None)
+    @given(st.text(max_size=200))
+    def run(text: str) -> None:
+        load_damaged(text)
+
+    run()
 
 
 @pytest.mark.slow
-def test_seeded_damage() -> None:
+@pytest.mark.parametrize("seeds", tiered((SEEDS, 20 * SEEDS), [SEEDS]))
+def test_seeded_damage(seeds: int) -> None:
     """The first inputs of `powderdsl fuzz --front-end`: of every kind, and not all of them refused at once."""
-    trials = [run_trial(seed) for seed in range(SEEDS)]
+    trials = [run_trial(seed) for seed in range(seeds)]
     assert {trial.kind for trial in trials} == set(KINDS)
-    assert sum(trial.accepted for trial in trials) >= SEEDS // 50
+    assert sum(trial.accepted for trial in trials) >= seeds // 50
     wrong = [trial for trial in trials if trial.problem is not None and not trial.problem.startswith("took")]
     assert wrong == []
 

@@ -1,14 +1,12 @@
 """Shipped rulesets over many steps: every backend's worlds equal the reference's, bit for bit, in any batch layout.
 
-Here 100 steps; all thousand take some minutes, which the reference spends:
-
-    POWDERDSL_LONG_STEPS=1000 pytest tests/semantics/test_long_runs.py
+The smoke test runs 100 steps of the largest ruleset; the campaign a thousand of every ruleset, for some minutes, which
+the reference spends.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -22,8 +20,7 @@ from powderdsl.testing.choices import Choices
 from powderdsl.testing.compare import find_difference
 from tests.compilers import skip_without_compiler
 
-LAST = int(os.environ.get("POWDERDSL_LONG_STEPS", "100"))
-MOMENTS = [step for step in (1, 2, 5, 10, 100, 1000) if step <= LAST]
+MOMENTS = (1, 2, 5, 10, 100, 1000)
 SHAPES = [(2, 9, 130), (3, 33, 17)]
 """Widths that end inside a word: more than two words, less than one."""
 
@@ -40,27 +37,37 @@ RULESETS = [name for name in shipped_rules() if complete(name)]
 
 
 @pytest.mark.slow
+def test_all_backends_stay_equal_for_a_while() -> None:
+    run_all_backends("powderworld", SHAPES[0], MOMENTS[:-1])
+
+
+@pytest.mark.campaign
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: "x".join(map(str, shape)))
 @pytest.mark.parametrize("name", RULESETS)
 def test_all_backends_stay_equal(name: str, shape: tuple[int, int, int]) -> None:
+    run_all_backends(name, shape, MOMENTS)
+
+
+def run_all_backends(name: str, shape: tuple[int, int, int], moments: Sequence[int]) -> None:
+    """Compare all backends with the reference after each of `moments`, in a batch and alone."""
     ruleset = load(name)
     start = random_start(ruleset, Choices.seeded(sum(shape)), shape)
-    expected = dict(states(start.world(compile_ruleset(ruleset, backend="reference"))))
+    expected = dict(states(start.world(compile_ruleset(ruleset, backend="reference")), moments))
     for backend in ("dense", "planes", "native"):
         simulator = compiled(ruleset, backend)
         together = start.world(simulator)
-        for step, state in states(together):
+        for step, state in states(together, moments):
             assert find_difference(expected[step], state) is None, (backend, step)
         for i in (0, len(together) - 1):
-            for step, state in states(together.select([i])):
+            for step, state in states(together.select([i]), moments):
                 wanted = {slot: value[i : i + 1] for slot, value in expected[step].items()}
                 assert find_difference(wanted, state) is None, (backend, step, f"world {i} alone")
 
 
-def states(world: World) -> Iterator[tuple[int, Mapping[str, Any]]]:
-    """The state after each of MOMENTS; the steps between two of them are one call."""
+def states(world: World, moments: Sequence[int]) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """The state after each of `moments`; the steps between two of them are one call."""
     done = 0
-    for moment in MOMENTS:
+    for moment in moments:
         world = world.sim.step(world, moment - done)
         done = moment
         yield moment, dict(world.state)
