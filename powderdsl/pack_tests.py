@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +14,7 @@ from powderdsl.draw import to_numpy
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Ruleset
+from powderdsl.pack_test_fields import described, field_rows, unlike, with_fields
 from powderdsl.simulator import compile
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ class ExampleResult:
     """What came of one test.
 
     `problem` is empty if it passed with every seed, otherwise a sentence about the first seed it failed with:
-    `seed`, after how many steps, and the world then, in the test's characters.
+    `seed`, after how many steps, and the world then, in the test's characters. `field` is the field that is not as
+    expected, if one is, and `field_after` its rows, a word a cell.
     """
 
     example: Example
@@ -40,6 +42,8 @@ class ExampleResult:
     seed: int = 0
     step: int = 0
     after: tuple[str, ...] = ()
+    field: str = ""
+    field_after: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -56,8 +60,8 @@ def run_examples(
 ) -> list[ExampleResult]:
     """Run every test of a ruleset's packs, in the order of the files.
 
-    A test runs with its own seed, or with each of SEEDS. It passes if the last world looks as `expect` says
-    and every condition under `always` holds in every cell after every step. Tests of one size run as one batch.
+    A test runs with its own seed, or with each of SEEDS. It passes if the last world looks as `expect` says, its
+    fields hold what `expect_fields` says, and every condition under `always` holds in every cell after every step. Tests of one size run as one batch.
 
     Args:
         sim: what runs them, instead of a new simulator of this ruleset.
@@ -103,17 +107,24 @@ class _Running:
                 words = one_line(condition.span) if condition.span else "a condition"
                 problem = f"`{words}` does not hold at row {row}, column {column}"
                 return _failure(example, self.seeds, index, step, world, self.ids, problem)
+        if step < example.steps:
+            return None
         wanted = _wanted(example, self.ids)
-        if wanted is None or step < example.steps:
-            return None
-        differs = (to_numpy(world.ids) != wanted) & (wanted >= 0)
-        if not differs.any():
-            return None
-        index, row, column = (int(part[0]) for part in np.nonzero(differs))
-        found = _name(sim.ruleset, int(world.ids[index, row, column]))
-        asked = _name(sim.ruleset, int(wanted[row, column]))
-        problem = f"row {row}, column {column} is `{found}`, not `{asked}`"
-        return _failure(example, self.seeds, index, step, world, self.ids, problem)
+        differs = None if wanted is None else (to_numpy(world.ids) != wanted) & (wanted >= 0)
+        if wanted is not None and differs is not None and differs.any():
+            index, row, column = (int(part[0]) for part in np.nonzero(differs))
+            found = _name(sim.ruleset, int(world.ids[index, row, column]))
+            asked = _name(sim.ruleset, int(wanted[row, column]))
+            problem = f"row {row}, column {column} is `{found}`, not `{asked}`"
+            return _failure(example, self.seeds, index, step, world, self.ids, problem)
+        for grid in example.expect_fields:
+            place = unlike(grid, world)
+            if place is not None:
+                index, row, column = place
+                problem = f"`{grid.name}` in {described(grid, world, place)}"
+                failure = _failure(example, self.seeds, index, step, world, self.ids, problem)
+                return replace(failure, field=grid.name, field_after=field_rows(grid.name, world, index))
+        return None
 
 
 def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | None) -> list[ExampleResult]:
@@ -124,6 +135,7 @@ def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | 
     ]
     copies = [np.repeat(ids[None], len(one.seeds), axis=0) for ids, one in zip(grids, batch, strict=True)]
     world = sim.world(np.concatenate(copies), seed=[seed for one in batch for seed in one.seeds])
+    world = with_fields(world, [one.example for one in batch for _ in one.seeds])
     ends = np.cumsum([len(one.seeds) for one in batch])
     results: dict[int, ExampleResult] = {}
     now = 0

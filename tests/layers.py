@@ -9,7 +9,7 @@ _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
 _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
-_TESTING = (*_SCREEN, "ledgers", "pack_tests", "testing")
+_TESTING = (*_SCREEN, "ledgers", "pack_test_fields", "pack_tests", "testing")
 _AFTER = ("bench", "tasks", "envs", "runs", "datasets", "rl", "worldmodel", "studies", "web", "cli")
 _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 
@@ -38,7 +38,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
     "media": _SCREEN[: _SCREEN.index("media")],
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
-    "pack_tests": _SCREEN,
+    "pack_test_fields": _SCREEN,
+    "pack_tests": (*_SCREEN, "pack_test_fields"),
     "testing": (*_SCREEN, "ledgers", "pack_tests"),
     "properties": (*_TESTING, "user_cache"),
     "pytest_plugin": (*_TESTING, "properties"),

@@ -225,6 +225,8 @@ def _failure_lines(result: ExampleResult) -> Iterator[str]:
     yield f"{place_of(example.span)}: {result.problem} (seed {result.seed}, after {steps})"
     columns = [("given", example.given), ("expected", example.expect or ()), ("found", result.after)]
     drawn = [[title, *(" ".join(row) for row in rows)] for title, rows in columns if rows]
+    if result.field_after:
+        drawn.append([f"{result.field} found", *result.field_after])
     width = max(len(line) for lines in drawn for line in lines) + 3
     for lines in zip(*drawn, strict=True):
         yield "".join(line.ljust(width) for line in lines)

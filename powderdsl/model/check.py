@@ -8,9 +8,10 @@ from dataclasses import replace
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.compose import Composition, compose
+from powderdsl.model.constants import constant_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
-from powderdsl.model.examples import check_examples
+from powderdsl.model.examples import check_assigned, check_examples
 from powderdsl.model.expressions import Typer
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
@@ -71,6 +72,8 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     symbols.properties = {
         name: replace(p, stored=stored.get(name, frozenset())) for name, p in symbols.properties.items()
     }
+    ids = {name: element.id for name, element in composition.elements.items()}
+    check_assigned(examples, ids, symbols.properties, reporter)
     facts = _facts(symbols)
     check_logic(passes, facts, elaborated, reporter)
     report_unused(composition, typer, produced_ids(passes, facts))
@@ -119,7 +122,7 @@ def _params(symbols: Symbols, typer: Typer) -> None:
                     decl.name.span,
                     helps=("kinds: chance, LOW..HIGH, real(LOW..HIGH), flag",),
                 )
-            value = _constant(decl.default, kind, Scope(named.pack, {}), typer)
+            value = constant_of(decl.default, kind, Scope(named.pack, {}), typer)
         except Poisoned:
             continue
         symbols.params[qualified] = Param(qualified, kind, value, decl.about, decl.name.span)
@@ -136,7 +139,7 @@ def _params(symbols: Symbols, typer: Typer) -> None:
             continue
         try:
             symbols.params[key.text] = replace(
-                param, default=_constant(syntax, param.kind, Scope("", {}), typer)
+                param, default=constant_of(syntax, param.kind, Scope("", {}), typer)
             )
         except Poisoned:
             continue
@@ -164,16 +167,6 @@ def _kind_help(name: str, value: str) -> str:
         chance = f"`{value}%`, or "
     bounds = "real(0..1)" if "." in value else "0..9"
     return f"write {chance}`{name}: {{type: {bounds}, default: {value}}}`"
-
-
-def _constant(syntax: Syntax, kind: Kind, scope: Scope, typer: Typer) -> Value:
-    try:
-        value = typer.of_kind(typer.evaluate(syntax, scope), kind, syntax.span)
-    except Asleep as asleep:
-        raise typer.fail("PD301", f"unknown name `{asleep.name}`", syntax.span) from None
-    if value.op != "const" and not (value.op == "vector" and all(arg.op == "const" for arg in value.args)):
-        raise typer.fail("PD405", "expected a constant", syntax.span, "depends on the world")
-    return number_value(value, kind)
 
 
 def _properties(symbols: Symbols, typer: Typer) -> None:
@@ -296,7 +289,9 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
                     "PD401", "a field cannot be a chance", decl.type.span, helps=("use `real(0..1)`",)
                 )
             default = (
-                _constant(decl.default, kind, scope, typer) if decl.default else default_of(kind, symbols.ids)
+                constant_of(decl.default, kind, scope, typer)
+                if decl.default
+                else default_of(kind, symbols.ids)
             )
             of = None
             if decl.of is not None:

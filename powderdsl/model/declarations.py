@@ -89,6 +89,8 @@ class TestDecl:
     expect: Scalar | None
     always: tuple[Syntax, ...]
     seed: int | None
+    fields: tuple[tuple[Scalar, Scalar], ...] = ()
+    expect_fields: tuple[tuple[Scalar, Scalar], ...] = ()
 
 
 @dataclass(frozen=True)

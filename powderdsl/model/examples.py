@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from powderdsl.diagnostics import Span, suggest
+from collections.abc import Mapping, Sequence
+
+from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.compose import Composition
 from powderdsl.model.declarations import TestDecl
 from powderdsl.model.expressions import Typer
+from powderdsl.model.field_grids import GridReader
 from powderdsl.model.operands import Asleep, Poisoned
 from powderdsl.model.scope import Scope
-from powderdsl.model.types import Example, Expr, Kernel
+from powderdsl.model.types import Example, Expr, Kernel, Property
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_SIDE = 64
@@ -61,12 +64,15 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
             decl.expect.span,
             f"`given` has {len(given)} rows of {len(given[0])} cells",
         )
-    if expect is None and not decl.always:
+    reader = GridReader(typer, pack, legend)
+    fields = reader.read(decl.fields, given, expected=False)
+    expect_fields = reader.read(decl.expect_fields, given, expected=True)
+    if expect is None and not expect_fields and not decl.always:
         raise typer.fail(
             "PD109",
             f"the test `{decl.name}` checks nothing",
             decl.scalar.span,
-            "`expect` or `always` is missing",
+            "`expect`, `expect_fields` or `always` is missing",
         )
     scope = Scope(pack, {"world": _whole_world(len(given), len(given[0]))})
     always: list[Expr] = [typer.condition(syntax, scope) for syntax in decl.always]
@@ -80,7 +86,54 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         pack,
         decl.scalar.span,
         decl.seed,
+        fields,
+        expect_fields,
     )
+
+
+def check_assigned(
+    examples: Sequence[Example],
+    ids: Mapping[str, int],
+    properties: Mapping[str, Property],
+    reporter: Reporter,
+) -> None:
+    """Refuse drawn properties that follow from the element: only what rules assign can differ.
+
+    `ids` are those of the elements by name.
+    """
+    for example in examples:
+        legend = dict(example.legend)
+        for grid in (*example.fields, *example.expect_fields):
+            prop = properties.get(grid.name)
+            if prop is None:
+                continue
+            if not prop.stored:
+                helps = ("a test of what rules assign to it needs such a rule; otherwise leave it out",)
+                reporter.error(
+                    "PD407",
+                    f"no rule assigns `{grid.name}`",
+                    grid.span,
+                    "it follows from the element",
+                    helps=helps,
+                )
+                continue
+            if grid.everywhere or grid in example.expect_fields:
+                continue  # it counts where it can, or is compared with what is there
+            names = (
+                legend[character]
+                for row, characters in zip(grid.cells, example.given, strict=True)
+                for cell, character in zip(row, characters, strict=True)
+                if cell
+            )
+            name = next((name for name in names if ids[name] not in prop.stored), None)
+            if name is not None:
+                reporter.error(
+                    "PD407",
+                    f"no rule assigns `{grid.name}` of `{name}`",
+                    grid.span,
+                    f"a cell that holds `{name}` has a value here",
+                    helps=("write `.` for such cells",),
+                )
 
 
 def _whole_world(height: int, width: int) -> Kernel:

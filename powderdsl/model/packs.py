@@ -419,4 +419,26 @@ class _PackReader(Reader):
             self.scalar(entries, "expect"),
             lines,
             self.number(entries, "seed", 0, 2**31 - 1),
+            self.drawn(entries, "fields"),
+            self.drawn(entries, "expect_fields"),
         )
+
+    def drawn(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> tuple[tuple[Scalar, Scalar], ...]:
+        """Drawings by a field's name."""
+        node = entries.get(key, (None, None))[1]
+        if node is None:
+            return ()
+        if not isinstance(node, Mapping):
+            self.shape(
+                node, "a mapping with an entry for each field", "write `FIELD: …`, each on a line of its own"
+            )
+            return ()
+        found = []
+        for name, value in node.entries:
+            if isinstance(value, Scalar):
+                found.append((name, value))
+            else:
+                self.shape(
+                    value, f"a drawing of `{name.text}`", "write a word a cell, a row a line, below `|`"
+                )
+        return tuple(found)

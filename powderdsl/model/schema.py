@@ -106,8 +106,10 @@ KEYS: dict[str, dict[str, Key]] = {
     "test": {
         "given": Key("text", "the start world, in ASCII"),
         "legend": Key("mapping", "what the characters mean, where glyphs will not do"),
+        "fields": Key("mapping", "values of fields in the start world, a word a cell; `.` is the default"),
         "after": Key("text", "how many steps it runs: `50 steps`"),
         "expect": Key("text", "what the world looks like then; `?` matches anything"),
+        "expect_fields": Key("mapping", "values of fields then; `?` matches anything, `LOW..HIGH` a range"),
         "always": Key("any", "conditions that hold in every cell after every step"),
         "seed": Key("number", "the seed; several are tried without one"),
     },

@@ -272,6 +272,24 @@ class Pass:
     span: Span = field(compare=False, repr=False)
 
 
+Cell = tuple[tuple[float, float], ...] | None
+"""What a drawn field says of a cell: lowest and highest value of each component (the same but in ranges that are
+expected); () is what a fresh cell of its element has, None is anything."""
+
+
+@dataclass(frozen=True)
+class FieldGrid:
+    """A field, or a property that rules assign, drawn cell by cell in rows from the top.
+
+    `everywhere`: one value stood for all cells; it counts in those whose element can have it.
+    """
+
+    name: str
+    cells: tuple[tuple[Cell, ...], ...]
+    everywhere: bool
+    span: Span = field(compare=False, repr=False)
+
+
 @dataclass(frozen=True)
 class Example:
     """A test of a pack: a world drawn in ASCII, and what it must look like some steps later."""
@@ -285,6 +303,9 @@ class Example:
     pack: str
     span: Span = field(compare=False, repr=False)
     seed: int | None = None
+    fields: tuple[FieldGrid, ...] = ()
+    """Values that the start world has beside its elements."""
+    expect_fields: tuple[FieldGrid, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -184,6 +184,18 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     ("a percent sign apart", "params: {p: 5 %}\n", "PD201", "%"),
     ("bits of 24", "streams: {coin: {bits: 24}}\n", "PD110", "24"),
     # Kernels and sets
+    # Fields drawn in tests
+    ('an unknown field in a test', 'tests: [{t: {given: w s, expect: w s, fields: {agee: 1}}}]\n', 'PD301', 'agee'),
+    ('a drawing of another size', 'tests: [{t: {given: w s, expect: w s, fields: {age: 1 2 3}}}]\n', 'PD110', '1'),
+    ('a drawn word that is not a number', 'tests: [{t: {given: w s, expect: w s, fields: {age: x 1}}}]\n', 'PD110', 'x'),
+    ('a drawn number out of range', 'tests: [{t: {given: w s, expect: w s, fields: {age: 1 12}}}]\n', 'PD402', '12'),
+    ('a start world with a hole', 'tests: [{t: {given: w s, expect: w s, fields: {age: 1 ?}}}]\n', 'PD110', '?'),
+    ('a drawn range at the start', 'tests: [{t: {given: w s, expect: w s, fields: {age: 1..2 3}}}]\n', 'PD110', '1..2'),
+    ('a drawn vector of one part', 'tests: [{t: {given: w s, expect: w s, fields: {wind: 1 .}}}]\n', 'PD110', '1'),
+    ('a drawn element that is unknown', 'tests: [{t: {given: w s, expect: w s, fields: {seed: wed s}}}]\n', 'PD110', 'wed'),
+    ('a drawn flag that is a number', 'tests: [{t: {given: w s, expect: w s, fields: {wet: 3 yes}}}]\n', 'PD110', '3'),
+    ('a drawn property that nothing assigns', 'tests: [{t: {given: w s, expect: w s, fields: {weight: 1 2}}}]\n', 'PD407', 'weight'),
+    ('a drawing that is a list', 'tests: [{t: {given: w s, expect: w s, fields: {age: [1 2]}}}]\n', 'PD107', '[1 2]'),
     ("a kernel of even sides", 'kernels: {k: ["1 1", "1 1"]}\n', "PD110", "k"),
     ("a ragged kernel", 'kernels: {k: ["1 1 1", "1", "1 1 1"]}\n', "PD110", "k"),
     ("a kernel of words", 'kernels: {k: ["a b c"]}\n', "PD110", '"a b c"'),
