@@ -95,13 +95,15 @@ class PackFile(pytest.File):
 
     def collect(self) -> Iterator[pytest.Item]:
         rules = home_of(self.path)
+        from powderdsl.diagnostics.printable import printable
+
         ruleset = loaded(rules, self.path.stat().st_mtime)
         names: dict[str, int] = {}
         subjects: list[Example | Invariant] = [*ruleset.tests, *ruleset.invariants]
         for one in subjects:
             if not same_file(one.span.source.name, self.path):
                 continue
-            name = getattr(one, "name", "") or " ".join(one.span.text.split())
+            name = printable(getattr(one, "name", "") or " ".join(one.span.text.split()))
             names[name] = names.get(name, 0) + 1
             unique = name if names[name] == 1 else f"{name} ({names[name]})"
             yield PackItem.from_parent(self, name=unique, ruleset=ruleset, subject=one)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, TextIO
 
+from powderdsl.diagnostics.printable import printable, unguarded
 from powderdsl.draw import palette, rgb, to_numpy
 from powderdsl.model.types import Element
 from powderdsl.worlds.ascii import write_ascii
@@ -57,7 +58,7 @@ class LiveView:
     """
 
     def __init__(self, elements: Sequence[Element], stream: TextIO | None = None):
-        self.stream = sys.stdout if stream is None else stream
+        self.stream: TextIO = unguarded(sys.stdout if stream is None else stream)
         self.elements = elements
         self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
         self.colour = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
@@ -88,12 +89,13 @@ class LiveView:
             text = render_frame(rgb(ids, self._colors, motion))
         else:
             text = write_ascii(ids, self.elements).rstrip("\n")
+        caption = printable(caption)
         lines = [*text.split("\n"), caption]
         if not self.in_place:
             self._write("\n".join(lines) + "\n")
             return
         # Lines are cleared before they are written: behind a full line the cursor is on its last cell.
-        lines[-1] = caption.replace("\n", " ")[: shutil.get_terminal_size().columns - 1]
+        lines[-1] = caption[: shutil.get_terminal_size().columns - 1]
         back = f"\x1b[{self._height}F" if self._height else ""
         self._write(back + "".join(f"{_CLEAR_LINE}{line}\n" for line in lines) + _CLEAR_BELOW)
         self._height = len(lines)

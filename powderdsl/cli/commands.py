@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 import click
 
 from powderdsl.cli.exits import report_failure, version
+from powderdsl.diagnostics.printable import printable_streams
 
 COMMANDS: dict[str, tuple[str, str]] = {
     # name: (module in powderdsl.cli, summary)
@@ -68,10 +69,11 @@ class CommandGroup(click.Group):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")
         options["standalone_mode"] = False
-        try:
-            status = super().main(args, prog_name or "powderdsl", *rest, **options)
-        except (Exception, KeyboardInterrupt) as error:
-            status = report_failure(error)
+        with printable_streams():
+            try:
+                status = super().main(args, prog_name or "powderdsl", *rest, **options)
+            except (Exception, KeyboardInterrupt) as error:
+                status = report_failure(error)
         sys.exit(status or 0)
 
 

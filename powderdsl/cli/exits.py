@@ -55,10 +55,11 @@ def colour_wanted(stream: IO[Any]) -> bool:
 
 def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> None:
     """Full texts with carets, an empty line between two."""
+    from powderdsl.diagnostics.printable import write_styled
     from powderdsl.diagnostics.render import render_text
 
     colour = colour_wanted(stream)
-    stream.write("\n\n".join(render_text(one, colour=colour) for one in diagnostics) + "\n")
+    write_styled(stream, "\n\n".join(render_text(one, colour=colour) for one in diagnostics) + "\n")
 
 
 def counted(number: int, thing: str) -> str:
@@ -71,6 +72,9 @@ def report_failure(error: BaseException) -> int:
     from powderdsl.diagnostics import CompileError
 
     match error:
+        case click.Abort(__cause__=EOFError() as cause):  # click takes it for the end of what somebody types
+            _report_internal(cause)
+            return INTERNAL
         case click.Abort() | KeyboardInterrupt():
             return INTERRUPTED
         case click.ClickException():

@@ -9,6 +9,7 @@ import click
 from powderdsl.cli.exits import BadInput, colour_wanted
 from powderdsl.diagnostics.codes import CODES
 from powderdsl.diagnostics.explain import find_code, page, similar
+from powderdsl.diagnostics.printable import unguarded
 
 PAGE_WIDTH = 100
 
@@ -36,5 +37,5 @@ def command(code: str | None) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    console = Console()
+    console = Console(file=unguarded(sys.stdout))  # our own pages
     console.print(Markdown(text), width=min(console.width, PAGE_WIDTH))

@@ -11,6 +11,8 @@ from typing import Protocol
 
 import click
 
+from powderdsl.diagnostics.printable import printable, printable_streams, unguarded
+
 SECONDS = 30
 """Between two lines, where there is no terminal."""
 
@@ -43,13 +45,15 @@ def progress(title: str, total: float | None = None, *, lines: bool = False) -> 
     )
 
     clock = TimeElapsedColumn() if total is None else TimeRemainingColumn(elapsed_when_finished=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), clock)
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    with Progress(*columns, TextColumn("{task.fields[words]}"), console=console, transient=True) as bar:
-        task = bar.add_task(title, total=total, words="")
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), clock)
+    console = Console(file=unguarded(sys.stderr), highlight=False, soft_wrap=True)
+    shown = TextColumn("{task.fields[words]}", markup=False)
+    # Inside, stderr is rich's, which prints above the bar: what goes there is escaped as well.
+    with Progress(*columns, shown, console=console, transient=True) as bar, printable_streams():
+        task = bar.add_task(printable(title), total=total, words="")
 
         def show(done: float, words: str = "") -> None:
-            bar.update(task, completed=done, words=words)
+            bar.update(task, completed=done, words=printable(words))
 
         yield show
 

@@ -12,8 +12,9 @@ import click
 
 from powderdsl.cli.exits import BadInput, colour_wanted
 from powderdsl.cli.options import WholeType, load_rules, set_option
-from powderdsl.cli.plain_table import table
+from powderdsl.cli.plain_table import Painted, table
 from powderdsl.diagnostics import Span
+from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.reactions import reactions
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
 from powderdsl.model.types import Element, Param, Pass, Property, Ruleset, Value
@@ -66,7 +67,7 @@ def command(
     if layout == "json":
         click.echo(json.dumps(_data(ruleset), indent=2, ensure_ascii=False))
     else:
-        click.echo("\n".join(_text(ruleset, colour_wanted(sys.stdout))), color=True)
+        write_styled(sys.stdout, "\n".join(_text(ruleset, colour_wanted(sys.stdout))) + "\n")
 
 
 def rule_spans(pass_: Pass) -> tuple[Span, ...]:
@@ -78,7 +79,7 @@ def rule_spans(pass_: Pass) -> tuple[Span, ...]:
 
 
 def _text(ruleset: Ruleset, colour: bool) -> Iterator[str]:
-    yield f"{ruleset.name}{': ' if ruleset.about else ''}{ruleset.about}"
+    yield printable(f"{ruleset.name}{': ' if ruleset.about else ''}{ruleset.about}")
     yield f"packs: {' '.join(ruleset.packs)}"
     for title, rows in (
         (f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", _element_rows(ruleset, colour)),
@@ -95,7 +96,7 @@ def _swatch(element: Element, colour: bool) -> str:
     if not colour:
         return element.color
     red, green, blue = bytes.fromhex(element.color[1:])
-    return f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {element.color}"
+    return Painted(f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {element.color}")
 
 
 def _element_rows(ruleset: Ruleset, colour: bool) -> list[list[str]]:

@@ -14,6 +14,7 @@ from powderdsl.cli.commands import COMMANDS
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.options import WholeType
 from powderdsl.cli.progress import progress
+from powderdsl.diagnostics.printable import printable
 from powderdsl.studies.study import SIZES, Point, Study
 from powderdsl.studies.study_file import load_study, shipped_studies
 from powderdsl.studies.study_run import Outcome, StudyRun
@@ -133,7 +134,7 @@ def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> N
     from powderdsl.studies.results import as_data, as_markdown
     from powderdsl.worlds.files import replacing
 
-    text = as_markdown(study, size, outcomes)
+    text = printable(as_markdown(study, size, outcomes), lines=True)  # somebody will `cat` it
     write_json(folder / "results.json", as_data(study, size, outcomes))
     with replacing(folder / "results.md") as temporary:
         temporary.write_text(text, encoding="utf-8")

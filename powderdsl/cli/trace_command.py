@@ -11,6 +11,7 @@ import click
 
 from powderdsl.cli.exits import BadInput, colour_wanted, user_values
 from powderdsl.cli.options import SizeType, WholeType, backend_option, load_rules, rules_argument, set_option
+from powderdsl.diagnostics.printable import write_styled
 
 
 class CellType(click.ParamType):
@@ -82,4 +83,5 @@ def command(
     if as_json:
         click.echo(json.dumps(trace_data(found), indent=2, ensure_ascii=False))
     else:
-        click.echo(trace_text(found, colour=colour_wanted(sys.stdout), every_rule=every_rule), color=True)
+        text = trace_text(found, colour=colour_wanted(sys.stdout), every_rule=every_rule)
+        write_styled(sys.stdout, f"{text}\n")

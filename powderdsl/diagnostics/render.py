@@ -9,6 +9,7 @@ from unicodedata import combining, east_asian_width
 
 from powderdsl.diagnostics.codes import Severity
 from powderdsl.diagnostics.diagnostic import Diagnostic, Label
+from powderdsl.diagnostics.printable import printable
 from powderdsl.diagnostics.span import Span
 
 TAB_WIDTH = 4
@@ -21,8 +22,9 @@ def _cells(text: str) -> int:
     return sum(0 if combining(char) else 2 if east_asian_width(char) in "WF" else 1 for char in text)
 
 
-def _printable(text: str) -> str:
-    return "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text)
+def _one_column(text: str) -> str:
+    """A piece of a source line: what cannot be printed takes one column, so that carets stay below their text."""
+    return "".join("\N{REPLACEMENT CHARACTER}" if printable(char) != char else char for char in text)
 
 
 def _snippet(label: Label, caret: str) -> tuple[str, str]:
@@ -37,12 +39,12 @@ def _snippet(label: Label, caret: str) -> tuple[str, str]:
     right = min(len(raw), left + MAX_SHOWN)
 
     def shown(piece: str) -> str:
-        return _printable(piece.expandtabs(TAB_WIDTH))
+        return _one_column(piece.expandtabs(TAB_WIDTH))
 
     text = ("…" if left else "") + shown(raw[left:right]) + ("…" if right < len(raw) else "")
     before = _cells(shown(raw[left:start])) + (1 if left else 0)
     width = max(1, _cells(shown(raw[left : min(end, right)])) + (1 if left else 0) - before)
-    return text, (" " * before + caret * width + (" " + label.text if label.text else "")).rstrip()
+    return text, (" " * before + caret * width + (f" {printable(label.text)}" if label.text else "")).rstrip()
 
 
 def _block(label: Label, caret: str, gutter: int) -> list[str]:
@@ -65,7 +67,7 @@ def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
         if label.span.source.name != name:
             arrow = "-->" if name is None else ":::"
             name = label.span.source.name
-            lines.append(f"{' ' * gutter}{arrow} {label.span.place}")
+            lines.append(f"{' ' * gutter}{arrow} {printable(label.span.place)}")
             lines.append(f"{' ' * gutter} |")
         lines.extend(_block(label, "^" if label is labels[0] else "-", gutter))
     return lines, gutter
@@ -78,11 +80,14 @@ def render_text(diagnostic: Diagnostic, *, colour: bool = False) -> str:
         return f"\x1b[{style}m{text}\x1b[0m" if colour else text
 
     severity = diagnostic.severity
-    head = paint(f"{severity.value}[{diagnostic.code}]", COLOURS[severity]) + f": {diagnostic.message}"
+    head = (
+        paint(f"{severity.value}[{diagnostic.code}]", COLOURS[severity])
+        + f": {printable(diagnostic.message)}"
+    )
     places, gutter = source_lines([diagnostic.primary, *diagnostic.secondary])
     lines = [head, *places]
-    lines.extend(f"{' ' * gutter} = note: {note}" for note in diagnostic.notes)
-    lines.extend(f"{' ' * gutter} = help: {text}" for text in diagnostic.helps)
+    lines.extend(f"{' ' * gutter} = note: {printable(note)}" for note in diagnostic.notes)
+    lines.extend(f"{' ' * gutter} = help: {printable(text)}" for text in diagnostic.helps)
     lines.append(f"{' ' * gutter} = more: powderdsl explain {diagnostic.code}")
     return "\n".join(lines)
 
@@ -92,7 +97,7 @@ def render_short(diagnostic: Diagnostic) -> str:
     span = diagnostic.primary.span
     place = f"{span.place}: " if span else ""
     helps = f" ({'; '.join(diagnostic.helps)})" if diagnostic.helps else ""
-    return _printable(f"{place}{diagnostic.severity.value}[{diagnostic.code}]: {diagnostic.message}{helps}")
+    return printable(f"{place}{diagnostic.severity.value}[{diagnostic.code}]: {diagnostic.message}{helps}")
 
 
 def _offset_units(text: str, utf16: bool) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from itertools import groupby
 
 from powderdsl.diagnostics import Label
+from powderdsl.diagnostics.printable import printable
 from powderdsl.diagnostics.render import source_lines
 from powderdsl.model.state import Slot
 from powderdsl.model.text import place_of
@@ -61,7 +62,7 @@ def _head(trace: Trace) -> str:
         lines.append(f"  {slot.name}: {change}{by if before != after else ''}")
     if not any(one.write.rule for one in trace.causes):
         lines.append("  no rule wrote it")
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def _cause(trace: Trace, causes: list[Cause], colour: bool) -> str:
@@ -80,7 +81,7 @@ def _cause(trace: Trace, causes: list[Cause], colour: bool) -> str:
     margin = " " * gutter
     notes = [_rule_note(rule, first.write.cell, trace.cell)]
     notes += [_part_text(part, first.write.cell) for part in first.parts]
-    return "\n".join([*lines, *places, *(f"{margin} = {note}" for note in notes)])
+    return "\n".join([*lines, *places, *(f"{margin} = {printable(note)}" for note in notes)])
 
 
 def _written_again(trace: Trace) -> Iterator[str]:
@@ -90,7 +91,7 @@ def _written_again(trace: Trace) -> Iterator[str]:
         rule = causes[0].write.rule
         if rule is not None and not any(one.write.changed for one in causes):
             names = ", ".join(dict.fromkeys(one.write.slot.name for one in causes))
-            yield f"  {names}: {rule.place}, pass {rule.pass_name}"
+            yield printable(f"  {names}: {rule.place}, pass {rule.pass_name}")
 
 
 def _miss(trace: Trace, miss: Miss, colour: bool) -> str:
@@ -109,7 +110,13 @@ def _miss(trace: Trace, miss: Miss, colour: bool) -> str:
     places, gutter = source_lines(labels)
     head = _painted("almost" if len(miss.failed) <= 1 else "not", "33;1", colour)
     but = " and ".join(f"`{part.text}`" for part in miss.failed) or f"`conflicts: {miss.policy}`"
-    return "\n".join([f"{head}, but for {but}", *places, *(f"{' ' * gutter} = {one}" for one in notes)])
+    return "\n".join(
+        [
+            f"{head}, but for {printable(but)}",
+            *places,
+            *(f"{' ' * gutter} = {printable(one)}" for one in notes),
+        ]
+    )
 
 
 def _rule_note(rule: NumberedRule, asked: Cell | None, cell: Cell) -> str:
@@ -149,4 +156,4 @@ def _value(ruleset: Ruleset, slot: Slot, value: object) -> str:
 
 
 def _painted(text: str, style: str, colour: bool) -> str:
-    return f"\x1b[{style}m{text}\x1b[0m" if colour else text
+    return f"\x1b[{style}m{printable(text)}\x1b[0m" if colour else printable(text)

@@ -1,0 +1,139 @@
+"""Text from files and arguments, made safe to print: a terminal obeys some characters, and readers do not see others.
+
+`PrintableStream` stands before stdout and stderr while a command runs, so whatever any code prints is escaped. Code that
+draws on the terminal writes to `unguarded(stream)` and escapes the text in its drawing with `printable` itself.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import unicodedata
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO, cast
+
+_BREAKS = "\t\n"
+_CONTROLS = "\x00-\x08\x0b-\x1f\x7f-\x9f"
+"""C0 and C1: escape sequences begin with one, and others move the cursor. Without tab and line feed."""
+_FORMATS = (
+    "\u00ad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
+    "\ufff9-\ufffb\U000110bd\U000110cd\U00013430-\U0001345f\U0001bca0-\U0001bca3\U0001d173-\U0001d17a"
+    "\U000e0000-\U000e0fff"
+)
+"""Characters that have no shape of their own: marks of direction, joiners, separators of lines, tags."""
+_BLANKS = "\u115f\u1160\u3164\uffa0"
+"""Letters that are blank."""
+_SURROGATES = "\ud800-\udfff"
+"""Bytes of file names that are not UTF-8."""
+
+_UNPRINTABLE = re.compile(f"[{_CONTROLS}{_FORMATS}{_BLANKS}{_SURROGATES}]")
+_NOT_IN_LINES = re.compile(f"[{_BREAKS}{_CONTROLS}{_FORMATS}{_BLANKS}{_SURROGATES}]")
+_STYLE = re.compile(r"(\x1b\[[0-9;]*m)")
+
+
+def printable(text: str, *, lines: bool = False) -> str:
+    """A text with every character that a terminal obeys or does not show as ``\\uXXXX``, as JSON writes it.
+
+    That covers control characters (also C1, which some terminals obey), marks of direction, characters without a
+    shape, and bytes that are not UTF-8. JSON stays the same JSON.
+
+    Args:
+        lines: keep line breaks and tabs, which one line of a message cannot have.
+    """
+    return (_UNPRINTABLE if lines else _NOT_IN_LINES).sub(_escaped, text)
+
+
+def styled(text: str) -> str:
+    """A text whose colors stay, and everything else as `printable` has it. What comes from files is escaped before."""
+    pieces = _STYLE.split(text)
+    return "".join(one if at % 2 else printable(one, lines=True) for at, one in enumerate(pieces))
+
+
+def _escaped(match: re.Match[str]) -> str:
+    units = match[0].encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[at : at + 2].hex()}" for at in range(0, len(units), 2))
+
+
+# Letters that look like others
+
+
+def spelled(word: str) -> str:
+    """An identifier as a message should print it: letters that only look like ASCII ones as ``\\uXXXX``.
+
+    A word in another script stays as it is; a word that mixes ASCII with other scripts, or with other forms of Latin
+    letters (full width, mathematical), does not.
+    """
+    odd = set(look_alikes(word))
+    return "".join(
+        _escaped(match) if match[0] in odd else match[0]
+        for match in re.finditer(r".", printable(word), re.DOTALL)
+    )
+
+
+def look_alikes(word: str) -> tuple[str, ...]:
+    """The characters of a word that may be taken for others, in order, each once; `character_name` says what they are."""
+    mixed = any(char.isascii() and char.isalpha() for char in word)
+    odd = (
+        char
+        for char in word
+        if not char.isascii()
+        and (
+            unicodedata.normalize("NFKC", char).isascii()
+            or (mixed and char.isalpha() and not unicodedata.name(char, "").startswith("LATIN"))
+        )
+    )
+    return tuple(dict.fromkeys(odd))
+
+
+def character_name(char: str) -> str:
+    """``U+0430 CYRILLIC SMALL LETTER A``."""
+    return f"U+{ord(char):04X} {unicodedata.name(char, 'without a name')}"
+
+
+# Streams
+
+
+class PrintableStream:
+    """A text stream that escapes what is written to it. It has no `buffer`, so nothing passes it by."""
+
+    def __init__(self, stream: TextIO):
+        self.unguarded: TextIO = unguarded(stream)
+
+    def write(self, text: str) -> int:
+        self.unguarded.write(printable(text, lines=True))
+        return len(text)
+
+    def write_styled(self, text: str) -> None:
+        """Write a text that has colors: see `styled`."""
+        self.unguarded.write(styled(text))
+
+    def writelines(self, texts: Iterable[str]) -> None:
+        for text in texts:
+            self.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("buffer", "detach"):
+            raise AttributeError(name)
+        return getattr(self.unguarded, name)
+
+
+@contextmanager
+def printable_streams() -> Iterator[None]:
+    """Escape what is printed inside the block, to stdout and to stderr."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (cast(TextIO, PrintableStream(stream)) for stream in before)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def unguarded(stream: Any) -> Any:
+    """The stream behind a `PrintableStream`, for code that draws on a terminal; any other stream as it is."""
+    return stream.unguarded if isinstance(stream, PrintableStream) else stream
+
+
+def write_styled(stream: Any, text: str) -> None:
+    """Write a text that has colors of ours to any stream, as `PrintableStream.write_styled` does."""
+    unguarded(stream).write(styled(text))

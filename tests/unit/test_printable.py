@@ -1,0 +1,134 @@
+"""What a terminal would obey, or hide, is never printed as it is."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+import unicodedata
+from pathlib import Path
+
+import click
+import pytest
+
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, Source, Span
+from powderdsl.diagnostics.printable import (
+    PrintableStream,
+    character_name,
+    look_alikes,
+    printable,
+    printable_streams,
+    spelled,
+    styled,
+    unguarded,
+)
+from powderdsl.diagnostics.render import render_short, render_text
+from tests.cli.commands import powderdsl
+
+HOSTILE = "a\x1b]0;owned\x07\x1b[2J\x9b31m\u202eb\nc"
+RAW = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
+def test_every_control_and_format_character_is_escaped():
+    kinds = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    left = [
+        code
+        for code in range(sys.maxunicode + 1)
+        if unicodedata.category(chr(code)) in kinds and printable(chr(code)) == chr(code)
+    ]
+    assert left == []
+
+
+def test_what_people_write_stays():
+    text = "±×→ äöü 中文 אב 🙂 é|\u00a0|"
+    assert printable(text) == text
+    assert printable("a\tb\n", lines=True) == "a\tb\n"
+    assert printable("a\tb\n") == "a\\u0009b\\u000a"
+
+
+def test_json_stays_the_same_json():
+    value = {"name": HOSTILE + "\U000e0041"}
+    text = printable(json.dumps(value, ensure_ascii=False, indent=1), lines=True)
+    assert not RAW.search(text)
+    assert json.loads(text) == value
+
+
+def test_only_colors_pass_as_styles():
+    assert styled("\x1b[31;1mred\x1b[0m") == "\x1b[31;1mred\x1b[0m"
+    assert not RAW.search(styled("\x1b[2J\x1b]8;;x\x07\x1b[?25l\x9b31m"))
+
+
+@pytest.mark.parametrize(
+    ("word", "shown"),
+    [
+        ("wаter", "w\\u0430ter"),
+        ("ｗater", "\\uff57ater"),
+        ("𝐰ater", "\\ud835\\udc30ater"),
+        ("wärme", "wärme"),
+        ("вода", "вода"),
+        ("wa\u200bter", "wa\\u200bter"),
+    ],
+)
+def test_look_alikes_are_spelled_out(word, shown):
+    assert spelled(word) == shown
+
+
+def test_look_alikes_have_names():
+    assert look_alikes("wаtеr") == ("а", "е")
+    assert character_name("а") == "U+0430 CYRILLIC SMALL LETTER A"
+
+
+def test_a_stream_escapes_whatever_writes_to_it(capsys):
+    with printable_streams():
+        print(HOSTILE)
+        click.echo(HOSTILE)
+        click.echo(HOSTILE, err=True, color=True)
+        sys.stdout.writelines([HOSTILE])
+    found = capsys.readouterr()
+    assert found.out
+    assert found.err
+    assert not RAW.search(found.out + found.err)
+
+
+def test_no_way_leads_around_a_stream():
+    stream = PrintableStream(io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
+    assert not hasattr(stream, "buffer")
+    with pytest.raises(TypeError):
+        stream.write(b"\x1b")  # type: ignore[arg-type]
+    outer = PrintableStream(stream)  # type: ignore[arg-type]
+    assert outer.unguarded is stream.unguarded is unguarded(outer)
+
+
+def test_diagnostics_escape_every_part():
+    span = Span(Source(f"{HOSTILE}.yaml", f"x: {HOSTILE}"), 0, 3)
+    one = Diagnostic(
+        "PD101", HOSTILE, Label(span, HOSTILE), (Label(span, HOSTILE),), notes=(HOSTILE,), helps=(HOSTILE,)
+    )
+    assert not RAW.search(render_text(one))
+    assert not RAW.search(render_short(one))
+    assert not RAW.search(str(CompileError([one])))
+    assert not RAW.search(re.sub(r"\x1b\[[0-9;]*m", "", render_text(one, colour=True)))
+    # A line break in a message cannot pretend to be a line of its own.
+    assert len(render_text(one).splitlines()) == 10
+
+
+@pytest.mark.parametrize("command", ["check", "show", "test", "show --format json", "check --format json"])
+def test_commands_print_no_codes_from_a_pack(command, tmp_path):
+    hostile = '"a\\e]0;owned\\a\\e[2J\\x9b31m\\u202eb\\nc"'
+    path = tmp_path / "a\x1b[31m.yaml"
+    path.write_text(
+        f'pack: odd\nabout: {hostile}\nneeds: core\nelements:\n  foo: {{id: 40, color: "#112233", glyph: f, about: {hostile}}}\n'
+        f"params:\n  p: {{type: chance, default: 0.5, about: {hostile}}}\n"
+        f"tests:\n  - {hostile}:\n      given: f\n      after: 1 step\n      expect: .\n"
+    )
+    result = powderdsl(*command.split(), f"core+{path}")
+    assert result.exit_code == (1 if command == "test" else 0)
+    assert not RAW.search(result.output)
+
+
+def test_a_name_of_a_file_that_is_not_utf8_is_shown(tmp_path):
+    path = Path(str(tmp_path / "x") + "\udcff.yaml")
+    result = powderdsl("check", str(path))
+    assert result.exit_code == 2
+    assert "\\udcff" in result.output
