@@ -16,6 +16,7 @@ _EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
     "user_cache": (),
+    "scratch": (),
     "diagnostics": (),
     "syntax": ("diagnostics", "user_cache"),
     "model": ("diagnostics", "syntax"),
@@ -24,7 +25,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir": ("diagnostics",),
     "ir.lower*": _MODEL,  # the one door from the model into the IR
     "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
-    "backends": ("diagnostics", "ir", "user_cache"),
+    "backends": ("diagnostics", "ir", "user_cache", "scratch"),
     "compiler": _COMPILER[:-1],
     "native_start": _COMPILER,
     "auto_program": _COMPILER,
@@ -34,25 +35,25 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "simulator": (*_COMPILER, "programs", "observe"),
     "provenance": (*_MODEL, "simulator"),
     "tracing": (*_MODEL, "reference", "provenance", "simulator"),  # explains by what the oracle does
-    "worlds": _MODEL,
+    "worlds": (*_MODEL, "scratch"),
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
     "media": _SCREEN[: _SCREEN.index("media")],
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
     "pack_test_fields": _SCREEN,
     "pack_tests": (*_SCREEN, "pack_test_fields"),
-    "testing": (*_SCREEN, "ledgers", "pack_tests"),
+    "testing": (*_SCREEN, "ledgers", "pack_tests", "scratch"),
     "properties": (*_TESTING, "user_cache"),
     "pytest_plugin": (*_TESTING, "properties"),
     "bench": _SCREEN,
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
-    "runs": ("diagnostics", "worlds"),
+    "runs": ("diagnostics", "worlds", "scratch"),
     "datasets": (*_SCREEN, "tasks", "envs", "runs"),
     "rl": (*_SCREEN, "tasks", "envs", "runs"),
     "worldmodel": (*_SCREEN, "tasks", "runs"),
     "studies": (*_MODEL, "compiler", "worlds", "runs", "bench"),  # calls commands, in processes of their own
     "web": _SCREEN,
-    "cli": (*_EVERYTHING[:-1], "user_cache"),
+    "cli": (*_EVERYTHING[:-1], "user_cache", "scratch"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }

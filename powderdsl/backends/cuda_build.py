@@ -10,7 +10,6 @@ import ctypes
 import glob
 import hashlib
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,6 +18,7 @@ from pathlib import Path
 
 from powderdsl.backends import native_cache
 from powderdsl.backends.cuda_source import KernelSource
+from powderdsl.scratch import scratch_folder
 from powderdsl.user_cache import cache_folder
 
 OPTIONS = ("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true", "--ftz=false", "-w")
@@ -125,8 +125,8 @@ def machine_code(source: KernelSource, architecture: str, version: str) -> bytes
         return found.read_bytes()
     began = time.perf_counter()
     code = compile_text(compiler, source.text, options)
-    with suppress(OSError), tempfile.TemporaryDirectory(dir=folder, prefix=native_cache.BUILDING) as scratch:
-        built = Path(scratch) / "built"
+    with suppress(OSError), scratch_folder(folder) as scratch:
+        built = scratch / "built"
         built.mkdir()
         (built / native_cache.LIBRARY).write_bytes(code)
         about = {

@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from pathlib import Path
 
 from powderdsl.backends import compiler_guard, native_cache
 from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for, processor
+from powderdsl.scratch import scratch_folder
 from powderdsl.user_cache import cache_folder
 
 TIMEOUT = 600
@@ -98,8 +98,7 @@ def _compile(
 ) -> Path:
     native_cache.tidy(folder)
     began, created = time.perf_counter(), time.time()
-    scratch = Path(tempfile.mkdtemp(dir=folder, prefix=native_cache.BUILDING))
-    try:
+    with scratch_folder(folder) as scratch:
         unit, built = scratch / "program.cpp", scratch / "built"
         unit.write_text(source, encoding="utf-8")
         built.mkdir()
@@ -115,8 +114,6 @@ def _compile(
             "seconds": round(time.perf_counter() - began, 2),
         }
         return native_cache.add(folder, key, built, about)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
 _running: dict[subprocess.Popen[bytes], Path] = {}

@@ -3,7 +3,7 @@
 <key>/program, about.json    a library, and what is known of it
 <key>.json                      what a program needs besides its library (`native_code`)
 <key>.lock                      held by who is compiling
-.build-…, .gone-…               on the way in, on the way out
+.powderdsl-…                    on the way in, on the way out: see `scratch`
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,14 +21,15 @@ from typing import Any
 # Not later: a fork in the middle of an import, which a thread makes, leaves the child waiting for it for ever.
 from filelock import FileLock, Timeout
 
+from powderdsl.scratch import is_scratch, scratch_file, scratch_folder, sweep
+
 LIBRARY, ABOUT = "program", "about.json"
-BUILDING, GONE = ".build-", ".gone-"
 
 LIMIT = 512 << 20
 """Bytes of libraries that are kept; of more, those used longest ago go."""
 
-LEFT_BEHIND = 24 * 3600.0
-"""Seconds after which what a killed process has left is nobody's any more."""
+UNUSED = 24 * 3600.0
+"""Seconds after which a `<key>.json` without its library is removed: another process may be about to add that."""
 
 PATIENCE = 120.0
 """Seconds to wait for another process that compiles the same; after that both do."""
@@ -125,8 +124,8 @@ def clear(folder: Path, older_than: float = 0.0) -> list[Entry]:
         _discard(folder / entry.key)
     if older_than <= 0:
         for place in folder.iterdir():
-            # A lock may be held, and what is being built is somebody's.
-            if place.suffix != ".lock" and not place.name.startswith(BUILDING):
+            # A lock may be held, and what is being built belongs to another process.
+            if place.suffix != ".lock" and not is_scratch(place.name):
                 _discard(place)
     tidy(folder)
     return gone
@@ -139,11 +138,23 @@ def tidy(folder: Path, limit: int = LIMIT, keep: str = "") -> None:
         total += entry.about.size
         if total > limit and entry.key != keep:
             _discard(folder / entry.key)
+    sweep(folder)
     for place in folder.iterdir():
-        left = place.name.startswith((BUILDING, GONE)) or place.suffix in (".lock", ".json")
+        if place.suffix == ".lock":
+            _remove_free_lock(place)
         with suppress(OSError):
-            if left and time.time() - place.stat().st_mtime > LEFT_BEHIND and not _needed(folder, place):
+            old = place.suffix == ".json" and time.time() - place.stat().st_mtime > UNUSED
+            if old and not _needed(folder, place):
                 _discard(place)
+
+
+def _remove_free_lock(path: Path) -> None:
+    """Remove a lock file that nobody holds. Whoever waits for it then compiles too, which costs time and nothing else."""
+    lock = FileLock(path)
+    with suppress(OSError, NotImplementedError, Timeout):
+        lock.acquire(timeout=0)
+        path.unlink(missing_ok=True)
+        lock.release()
 
 
 def _needed(folder: Path, place: Path) -> bool:
@@ -183,14 +194,9 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 def write_json(path: Path, value: dict[str, Any]) -> None:
     """Write a file whole or not at all. Raises OSError."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=BUILDING)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(value, file)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    with scratch_file(path) as temporary:
+        temporary.write_text(json.dumps(value), encoding="utf-8")
+        os.replace(temporary, path)
 
 
 def _about(place: Path) -> About | None:
@@ -207,6 +213,5 @@ def _discard(place: Path) -> None:
         if not place.is_dir():
             place.unlink(missing_ok=True)
             return
-        gone = Path(tempfile.mkdtemp(dir=place.parent, prefix=GONE))
-        os.rename(place, gone / "it")
-        shutil.rmtree(gone, ignore_errors=True)
+        with scratch_folder(place.parent) as gone:
+            os.rename(place, gone / "it")

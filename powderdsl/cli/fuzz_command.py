@@ -142,18 +142,18 @@ def _check_compiler() -> None:
 
 
 def _replay(path: Path, building: Any) -> int:
-    from tempfile import TemporaryDirectory
+    from dataclasses import replace
+    from tempfile import gettempdir
 
+    from powderdsl.scratch import scratch_folder
     from powderdsl.testing.case_files import read_case
     from powderdsl.testing.differential import check_case
 
     case = read_case(path)
     if case.backend not in (*COMPARED, "reference"):
         raise BadInput(f"{path}: no backend `{case.backend}`")
-    with TemporaryDirectory(prefix="powderdsl-fuzz-") as scratch:
-        from dataclasses import replace
-
-        found = check_case(case, replace(building, folder=Path(scratch)))
+    with scratch_folder(Path(gettempdir())) as scratch:
+        found = check_case(case, replace(building, folder=scratch))
     if found is None:
         click.echo(f"{path}: {case.backend} and the reference agree")
         return OK

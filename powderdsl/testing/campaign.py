@@ -11,10 +11,11 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import gettempdir
 
 import torch
 
+from powderdsl.scratch import scratch_folder
 from powderdsl.testing.case_files import write_case
 from powderdsl.testing.cases import Case, load_text
 from powderdsl.testing.crew import Done, Lost, Tell, work_through
@@ -110,8 +111,8 @@ def run_campaign(
     folder.mkdir(parents=True, exist_ok=True)
     tasks: deque[int | Finding] = deque(islice(seeds, 2 * jobs))
     saved = time.monotonic()
-    with TemporaryDirectory(prefix="powderdsl-fuzz-") as scratch:
-        work = partial(perform, plan, Path(scratch))
+    with scratch_folder(Path(gettempdir())) as scratch:
+        work = partial(perform, plan, scratch)
         try:
             for heard in work_through(tasks, work, jobs, SEED_LIMIT):
                 findings: tuple[Finding, ...] = ()

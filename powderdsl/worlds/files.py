@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source
+from powderdsl.scratch import scratch_file
 from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
 
 
@@ -44,26 +44,22 @@ def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_CHARACTERS) 
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path`, with its suffix, that takes its place when the block ends well.
 
-    When the block fails or is interrupted, nothing is left and an older file stays as it was. Raises
-    CompileError (PD613) if the place cannot be written.
+    When the block fails or is interrupted, nothing is left and an older file stays as it was. When the process is
+    killed, the next one that writes to the folder removes what is left. Raises CompileError (PD613) if the place cannot
+    be written.
     """
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem[:40]}-", suffix=path.suffix)
-        os.close(handle)
-    except (OSError, ValueError) as error:
-        raise _not_writable(path, error) from None
-    temporary = Path(name)
-    try:
+    with ExitStack() as stack:
+        try:
+            temporary = stack.enter_context(scratch_file(path))
+        except (OSError, ValueError) as error:
+            raise _not_writable(path, error) from None
         yield temporary
-        # mkstemp makes files that only their owner can read; an ordinary new file follows the umask.
+        # Scratch files are private to their owner; an ordinary new file follows the umask.
         temporary.chmod(0o666 & ~_umask())
         try:
             os.replace(temporary, path)
         except OSError as error:
             raise _not_writable(path, error) from None
-    finally:
-        with suppress(FileNotFoundError):
-            temporary.unlink()
 
 
 def _not_writable(path: Path, error: Exception) -> CompileError:

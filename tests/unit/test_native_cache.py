@@ -14,12 +14,14 @@ import time
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from powderdsl.backends import cuda_build, native_cache
 from powderdsl.backends.cuda_source import KernelSource
 from powderdsl.backends.native_build import Building, build, building, run_guarded
 from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for
 from powderdsl.backends.native_layout import Layout
+from powderdsl.scratch import is_scratch, scratch_folder
 from tests.cli.commands import environment_with
 from tests.processes import alive, waited
 
@@ -28,10 +30,11 @@ ABOUT = {"ruleset": "yard", "backend": "native", "compiler": "g++ 1", "created":
 
 def put(folder: Path, key: str, data: bytes, used: float | None = None) -> Path:
     """A library in the cache, used that many seconds ago."""
-    built = folder / f"{native_cache.BUILDING}{key}"
-    built.mkdir()
-    (built / native_cache.LIBRARY).write_bytes(data)
-    library = native_cache.add(folder, key, built, ABOUT)
+    with scratch_folder(folder) as scratch:
+        built = scratch / "built"
+        built.mkdir()
+        (built / native_cache.LIBRARY).write_bytes(data)
+        library = native_cache.add(folder, key, built, ABOUT)
     if used is not None:
         os.utime(folder / key / native_cache.ABOUT, (time.time() - used,) * 2)
     return library
@@ -90,18 +93,17 @@ def test_beyond_the_limit_the_least_recently_used_go(tmp_path: Path) -> None:
     assert names(tmp_path) == {"d"}
 
 
-def test_only_old_remains_of_killed_processes_go(tmp_path: Path) -> None:
+def test_only_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
     put(tmp_path, "a", b"code")
     native_cache.write_json(tmp_path / "needed.json", {"library": "a"})
     native_cache.write_json(tmp_path / "orphan.json", {"library": "z"})
-    (tmp_path / ".build-old").mkdir()
-    (tmp_path / ".gone-old").mkdir()
+    (tmp_path / ".powderdsl-0123456789abcdef").mkdir()
     (tmp_path / "a.lock").touch()
     for place in tmp_path.iterdir():
-        os.utime(place, (time.time() - 2 * native_cache.LEFT_BEHIND,) * 2)
-    (tmp_path / ".build-new").mkdir()
-    native_cache.tidy(tmp_path)
-    assert names(tmp_path) == {"a", "needed.json", ".build-new"}
+        os.utime(place, (time.time() - 2 * native_cache.UNUSED,) * 2)
+    with scratch_folder(tmp_path) as mine, FileLock(tmp_path / "b.lock"):
+        native_cache.tidy(tmp_path)
+        assert names(tmp_path) == {"a", "needed.json", mine.name, "b.lock"}
 
 
 def test_clear(tmp_path: Path) -> None:
@@ -110,10 +112,10 @@ def test_clear(tmp_path: Path) -> None:
         native_cache.write_json(tmp_path / f"start-{key}.json", {"library": key})
     assert [entry.key for entry in native_cache.clear(tmp_path, older_than=100)] == ["b"]
     assert native_cache.find(tmp_path, "a") is not None
-    (tmp_path / ".build-of-somebody").mkdir()
     (tmp_path / "damaged").mkdir()
-    assert [entry.key for entry in native_cache.clear(tmp_path)] == ["a"]
-    assert names(tmp_path) == {".build-of-somebody"}
+    with scratch_folder(tmp_path) as being_built:
+        assert [entry.key for entry in native_cache.clear(tmp_path)] == ["a"]
+        assert names(tmp_path) == {being_built.name}
 
 
 def test_a_cache_that_cannot_be_written_still_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,7 +232,7 @@ def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", body)))
     with building(Building("-O0", tmp_path)), pytest.raises(NoCompiler, match=r"failed:\nprogram.cpp:1: bad"):
         build("// source\n")
-    assert not [name for name in names(tmp_path) if name.startswith(".build-")]
+    assert not [name for name in names(tmp_path) if is_scratch(name)]
 
 
 # --- processes
