@@ -39,6 +39,8 @@ from powderdsl.passes import PIPELINE
 from powderdsl.syntax import parse, yaml_tree
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.tasks.task_keys import TASK_KEYS
+from powderdsl.worlds.scene.read import FILE_KEYS, SCENE_KEYS
+from powderdsl.worlds.scene.statements import SETTING, STATEMENTS
 
 DOCS = Path(__file__).resolve().parent
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -60,6 +62,9 @@ SHAPES = {
 """Shapes of `schema.Key`, as readers see them."""
 
 
+ALL_KEYS = {**KEYS, **TASK_KEYS, "scene": SCENE_KEYS, "scenes": FILE_KEYS}
+
+
 def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     """A Markdown table; `|` inside cells is escaped."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
@@ -71,7 +76,7 @@ def keys(context: str) -> str:
     """The keys of one kind of mapping in a rule file."""
     rows = [
         (f"`{name}`" + (" *" if key.required else ""), SHAPES[key.shape], key.about)
-        for name, key in {**KEYS, **TASK_KEYS}[context].items()
+        for name, key in ALL_KEYS[context].items()
     ]
     if context in OPEN:
         rows.append((f"*{OPEN[context]}'s name*", "an expression", "its value"))
@@ -158,6 +163,11 @@ def shipped() -> str:
     return table(("name", "", "what it is"), rows)
 
 
+def scene_statements() -> str:
+    """How each statement of a scene is written."""
+    return "```text\n" + "".join(f"{line}\n" for line in (*STATEMENTS.values(), SETTING)) + "```\n"
+
+
 def tasks() -> str:
     """The tasks that come with powderdsl: what may be placed, how often, and their knobs."""
     from powderdsl.tasks.shipped_tasks import load_task
@@ -213,10 +223,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "words": words,
     "limits": limits,
     "shipped": shipped,
+    "scene statements": scene_statements,
     "tasks": tasks,
     "stages": stages,
     "commands": commands,
-    **{f"keys {context}": partial(keys, context) for context in (*KEYS, *TASK_KEYS)},
+    **{f"keys {context}": partial(keys, context) for context in ALL_KEYS},
 }
 """What can stand between markers, by name."""
 

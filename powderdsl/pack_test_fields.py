@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.draw import to_numpy
-from powderdsl.model.field_grids import ANYTHING, DEFAULT, direction_word
+from powderdsl.model.field_grids import ANYTHING, DEFAULT
+from powderdsl.model.field_words import direction_word
 from powderdsl.model.state import Slot
 from powderdsl.model.text import show_number, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset

@@ -6,7 +6,7 @@ Fenced blocks are run page by page, in order, in one temporary directory:
   top say what it is loaded with (its `needs` otherwise) and what is expected: ``# with: core+sand``,
   ``# error: PD301``, ``# warning: PD507``, ``# note: PD506``; ``# file: docs/examples/x.yaml`` demands that
   it is all of that file. It is saved under its name for later blocks to load, and its `tests:` are run.
-  One with ``task:`` is a task, which must have no mistakes.
+  One with ``task:`` is a task, which must have no mistakes; one with ``scene:`` is drawn with those rules.
 * ``statements`` of a generator and ``rewards``, one a line, with the names of `TASK`.
 * ``rules``: one rule a line, each loaded in a pass of its own. ``expressions``: one value a line.
 * ``python``: one namespace a page. A line ``VALUE  # uint8 [8, 64, 64]`` is compared.
@@ -27,11 +27,12 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from powderdsl.compiler import load_with_diagnostics
+from powderdsl.compiler import load, load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.model.types import Ruleset
 from powderdsl.pack_tests import run_examples
 from powderdsl.tasks.shipped_tasks import load_task_with_diagnostics
+from powderdsl.worlds.scene import load_start
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -93,6 +94,10 @@ def run_yaml(block: Block) -> None:
     text = block.text
     if text.startswith("task:"):
         run_task(text)
+        return
+    if scene := re.search(r"^scene: *(\S+)$", text, re.MULTILINE):
+        Path(f"{scene[1]}.yaml").write_text(text, encoding="utf-8")
+        load_start(f"{scene[1]}.yaml", load(block.expected("with")))
         return
     if not re.search(r"^(pack|ruleset):", text, re.MULTILINE):
         text = f"pack: example\n{text}"
@@ -296,6 +301,7 @@ def test_every_table_of_keys_is_shown(generate: Any) -> None:
         ("rules", "# with: core\nwall -> empty\nwall -> salt\n"),
         ("expressions", "# with: core\ncount(wall) > 1\ncount(wall) > wall\n"),
         ("yaml", "task: bad\nrules: core\n"),
+        ("yaml", "# with: core\nscene: bad\nsize: [3, 3]\nfill: empty\ndraw: [fill wal]\n"),
         ("statements", "fill wall\nfill wal\n"),
         ("rewards", "count(wall)\ncount(wal)\n"),
         ("console", "$ powderdsl explain PD999\n"),

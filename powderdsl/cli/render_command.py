@@ -27,11 +27,11 @@ def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, sca
     ruleset = load_rules(rules, {})
     check_writable(out)
     from powderdsl.cli.pictures import pictures
-    from powderdsl.cli.start_worlds import start_ids, start_world
+    from powderdsl.cli.start_worlds import start_drawn, start_world
     from powderdsl.media import write_png
     from powderdsl.simulator import compile
 
-    ids = start_ids(ruleset, world, size, None, None)
+    drawn = start_drawn(ruleset, world, size, None, None)
     # Nothing runs, so the backend that takes no compiling will do.
-    start = start_world(compile(ruleset, backend="reference"), ids, world, None)
+    start = start_world(compile(ruleset, backend="reference"), drawn, world, None)
     write_png(out, pictures(start, most=len(start), factor=scale))

@@ -101,13 +101,13 @@ def command(
     ruleset = load_rules(rules, settings)
     if out is not None:
         check_writable(out)
-    from powderdsl.cli.start_worlds import start_ids, start_world
+    from powderdsl.cli.start_worlds import start_drawn, start_world
     from powderdsl.simulator import compile
 
     # The world first: compiling imports torch, and whoever mistyped a name should not wait for that.
-    ids = start_ids(ruleset, world, size, batch, seed)
+    drawn = start_drawn(ruleset, world, size, batch, seed)
     sim = compile(ruleset, backend=backend, device=device, threads=threads or 1)
-    start = start_world(sim, ids, world, seed)
+    start = start_world(sim, drawn, world, seed)
     used = _set_threads(threads, start)
     plan = Plan(steps, every, fps, scale, out, watch)
     began = time.perf_counter()

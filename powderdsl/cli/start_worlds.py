@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.model.types import Ruleset
 from powderdsl.worlds.files import failure
 from powderdsl.worlds.raster import Size
+from powderdsl.worlds.scene import FieldValues, Start, load_start
 from powderdsl.worlds.strewn import check_cells, strew
 
 if TYPE_CHECKING:
@@ -23,10 +26,18 @@ DEFAULT_SIZE: Size = (64, 64)
 KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
 
 
-def start_ids(
+@dataclass(frozen=True)
+class Drawn:
+    """What fresh worlds are made of: ids uint8 [B, H, W], and the fields that a scene sets in each of them."""
+
+    ids: NDArray[np.uint8]
+    fields: Mapping[str, FieldValues] = field(default_factory=dict)
+
+
+def start_drawn(
     ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None
-) -> NDArray[np.uint8] | None:
-    """The ids uint8 [B, H, W] that a run starts from, or None for a saved world, which has more than ids.
+) -> Drawn | None:
+    """What a run starts from, or None for a saved world, which has everything.
 
     A saved world goes on as it was saved, random future included, so `size`, `batch` and `seed` do not go
     with it. A drawn world stands `batch` times. Without a name every world is strewn by itself.
@@ -34,46 +45,48 @@ def start_ids(
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
     """
     if name is None:
-        return strew(ruleset, size or DEFAULT_SIZE, batch or 1, seed or 0)
+        return Drawn(strew(ruleset, size or DEFAULT_SIZE, batch or 1, seed or 0))
     if name.lower().endswith(".npz"):
         _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
         return None
-    ids = drawn_ids(name, ruleset, size)
-    check_cells(batch or 1, ids.shape)
-    return np.repeat(ids[None], batch or 1, axis=0)
+    one = drawn_world(name, ruleset, size)
+    check_cells(batch or 1, one.ids.shape)
+    return Drawn(np.repeat(one.ids[None], batch or 1, axis=0), one.fields)
 
 
-def start_world(sim: Simulator, ids: NDArray[np.uint8] | None, name: str | None, seed: int | None) -> World:
-    """The worlds of what `start_ids` gave for the same name; each has random numbers of its own."""
+def start_world(sim: Simulator, drawn: Drawn | None, name: str | None, seed: int | None) -> World:
+    """The worlds of what `start_drawn` gave for the same name; each has random numbers of its own."""
     with user_values():
-        if ids is not None:
-            return sim.world(ids, seed=seed or 0)
+        if drawn is not None:
+            world = sim.world(drawn.ids, seed=seed or 0)
+            for key, given in drawn.fields.items():
+                values: dict[str, Any] = {key: given.values}
+                world = sim.paint(world, where=given.where, **values)
+            return world
         from powderdsl.worlds.store import load_world
 
         assert name is not None
         return load_world(name, sim)
 
 
-def drawn_ids(name: str, ruleset: Ruleset, size: Size | None) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a picture, an ASCII drawing or a scene; only scenes can have another `size`."""
+def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
+    """A picture, an ASCII drawing or a scene; only scenes set fields and can have another `size`."""
     suffix = Path(name).suffix.lower()
     if suffix == ".png":
         _refuse_options("a picture has its own", size=size)
         from powderdsl.worlds.image import read_image
 
-        return read_image(name, ruleset.elements)
+        return Start(read_image(name, ruleset.elements), {})
     if suffix == ".txt":
         _refuse_options("a drawing has its own", size=size)
         from powderdsl.worlds.ascii import load_ascii
 
-        return load_ascii(name, ruleset.elements)
+        return Start(load_ascii(name, ruleset.elements), {})
     if Path(name).is_file() and suffix not in (".yaml", ".yml"):
         raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
     if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name) and suffix not in (".yaml", ".yml"):
         raise failure("PD601", f"no world {name}", helps=(KINDS,))
-    from powderdsl.worlds.scene import load_scene
-
-    return load_scene(name, ruleset, size=size)
+    return load_start(name, ruleset, size=size)
 
 
 def _refuse_options(reason: str, **options: object) -> None:

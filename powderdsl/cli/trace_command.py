@@ -67,14 +67,14 @@ def command(
     `powderdsl run` with the same --world, --size and --seed.
     """
     ruleset = load_rules(rules, settings)
-    from powderdsl.cli.start_worlds import start_ids, start_world
+    from powderdsl.cli.start_worlds import start_drawn, start_world
     from powderdsl.simulator import compile
     from powderdsl.tracing.trace import trace
     from powderdsl.tracing.trace_data import trace_data
     from powderdsl.tracing.trace_text import trace_text
 
-    ids = start_ids(ruleset, world, size, None, seed)
-    start = start_world(compile(ruleset, backend=backend), ids, world, seed)
+    drawn = start_drawn(ruleset, world, size, None, seed)
+    start = start_world(compile(ruleset, backend=backend), drawn, world, seed)
     with user_values():
         try:
             found = trace(start, *cell, step, number=number, of=names or None, every_rule=every_rule)

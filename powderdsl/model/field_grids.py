@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from fractions import Fraction
 
 from powderdsl.diagnostics import Label, Span, suggest
-from powderdsl.model.builtins import DIRECTIONS, OCTANTS
 from powderdsl.model.expressions import Typer
+from powderdsl.model.field_words import FORMS, WordProblem, read_word
 from powderdsl.model.operands import Asleep, Poisoned
-from powderdsl.model.symbols import settled
 from powderdsl.model.types import Cell, FieldGrid, Kind
 from powderdsl.syntax.yaml_tree import Scalar
 
@@ -20,27 +18,6 @@ DEFAULT = "."
 ANYTHING = "?"
 """The word of an expected cell that is not looked at."""
 
-_FORMS = {
-    "int": ("a whole number", "such as `3` or `-2`"),
-    "flag": ("a flag", "`yes` or `no`"),
-    "element": ("an element", "an element's name, or its character in `given`"),
-    "direction": ("a direction", "a neighbor such as `left` or `above.right`"),
-    "real": ("a number", "such as `3` or `-0.25`"),
-    "vec2": ("a vector", "rows and columns without a blank, such as `1.5,-2`"),
-}
-"""What a word of each kind is, and how it is written."""
-
-_WHOLE = re.compile(r"-?[0-9]{1,7}")
-_NUMBER = re.compile(r"-?[0-9]{1,7}(\.[0-9]{1,20})?([eE][-+]?[0-9]{1,2})?")
-
-
-def direction_word(octant: int) -> str:
-    """A direction as drawings have it: `above.right`."""
-    rows, columns = OCTANTS[octant]
-    words = {name: offset for name, offset in DIRECTIONS.items() if name != "here"}
-    parts = [name for name, offset in words.items() if offset in ((rows, 0), (0, columns))]
-    return ".".join(parts)
-
 
 class GridReader:
     """Reads the drawn fields of one test; all mistakes are reported, and words that come again are read once."""
@@ -49,6 +26,10 @@ class GridReader:
         self.typer = typer
         self.pack = pack
         self.legend = legend
+        elements = typer.symbols.composition.elements
+        self.ids = {element.qualified: element.id for element in elements.values()}
+        self.ids |= {name: element.id for name, element in elements.items()}
+        self.ids |= {character: elements[name].id for character, name in legend.items()}
 
     def read(
         self, drawn: Sequence[tuple[Scalar, Scalar]], given: Sequence[str], *, expected: bool
@@ -75,7 +56,7 @@ class GridReader:
                 f"`{key.text}` has another size than `given`",
                 places[0] if places else key.span,
                 f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}",
-                (f"write a word for each cell, or one for all of them: {_FORMS[kind.name][1]}",),
+                (f"write a word for each cell, or one for all of them: {FORMS[kind.name][1]}",),
             )
         words: dict[str, Cell] = {}
         cells, at = [], 0
@@ -106,7 +87,7 @@ class GridReader:
             return symbols.fields[name].kind
         if name in symbols.properties:
             kind = symbols.properties[name].kind
-            if kind.name in _FORMS:
+            if kind.name in FORMS:
                 return kind
             raise self.typer.fail(
                 "PD407", f"`{name}` is not a field", key.span, f"no cell has {kind} of its own"
@@ -138,60 +119,12 @@ class GridReader:
                 return None
             cure = (f"write `{DEFAULT}` for what a fresh cell has",)
             raise self.typer.fail(
-                "PD110", "a start world leaves nothing open", place, _FORMS[kind.name][1], cure
+                "PD110", "a start world leaves nothing open", place, FORMS[kind.name][1], cure
             )
-        parts = word.removeprefix("(").removesuffix(")").split(",") if kind.name == "vec2" else [word]
-        bounds = [self._bounds(part, kind, place, expected) for part in parts]
-        if len(bounds) != (2 if kind.name == "vec2" else 1) or None in bounds:
-            helps: tuple[str, ...] = ()
-            if kind.name == "element":
-                names = [name for name in self.typer.symbols.composition.elements if len(name) > 1]
-                helps = suggest(word, names, "elements")
-            noun, form = _FORMS[kind.name]
-            raise self.typer.fail("PD110", f"`{word}` is not {noun}", place, f"expected {form}", helps)
-        return tuple(pair for pair in bounds if pair is not None)
-
-    def _bounds(self, word: str, kind: Kind, place: Span, expected: bool) -> tuple[float, float] | None:
-        """The bounds of what a word allows: twice the same, but for a range. None if it is not of this kind."""
-        match kind.name:
-            case "flag":
-                value = {"yes": 1, "true": 1, "no": 0, "false": 0}.get(word)
-                return None if value is None else (value, value)
-            case "element":
-                elements = self.typer.symbols.composition.elements
-                name = self.legend.get(word, word)
-                found = [e.id for key, e in elements.items() if name in (key, e.qualified)]
-                return (found[0], found[0]) if found else None
-            case "direction":
-                steps = word.split(".")
-                if not all(step in DIRECTIONS for step in steps):
-                    return None
-                offset = (sum(DIRECTIONS[s][0] for s in steps), sum(DIRECTIONS[s][1] for s in steps))
-                return (OCTANTS.index(offset),) * 2 if offset in OCTANTS else None
-        low, dots, high = word.partition("..")
-        if dots and not expected:
-            return None
-        ends = [self._number(end, kind, place) for end in ((low, high) if dots else (low, low))]
-        if ends[0] is None or ends[1] is None:
-            return None
-        if ends[0] > ends[1]:
-            raise self.typer.fail("PD402", "a range that runs backwards", place, f"{low} is above {high}")
-        return ends[0], ends[1]
-
-    def _number(self, word: str, kind: Kind, place: Span) -> float | None:
-        whole = kind.name == "int"
-        if not (_WHOLE if whole else _NUMBER).fullmatch(word):
-            return None
-        value = Fraction(word)
-        if not kind.lo <= value <= kind.hi:
-            label = f"the range is {kind.lo:g}..{kind.hi:g}"
-            helps = ("write a number in this range, or widen it where it is declared",)
-            raise self.typer.fail("PD402", f"{word} lies outside {kind}", place, label, helps)
-        if whole:
-            return int(value)
-        found = settled(float(value), Kind("real", kind.lo, kind.hi))
-        assert isinstance(found, float)
-        return found
+        try:
+            return read_word(word, kind, self.ids, ranges=expected)
+        except WordProblem as wrong:
+            raise self.typer.fail(wrong.code, wrong.message, place, wrong.label, wrong.helps) from None
 
     def _check_holders(
         self,

@@ -14,7 +14,8 @@ from powderdsl.syntax import yaml_tree
 from powderdsl.tasks.task import MAX_SIDE, Stamp
 from powderdsl.worlds.ascii import load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
-from powderdsl.worlds.scene import load_scene
+from powderdsl.worlds.raster import Setting
+from powderdsl.worlds.scene import draw_scene, find_scene
 
 LEAVE = 255
 """In a stamp: the cell stays as it is."""
@@ -94,7 +95,15 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> np.ndarr
             return read_image(beside, ruleset.elements)
         if suffix == ".txt":
             return load_ascii(beside, ruleset.elements)
-        return load_scene(beside if suffix in (".yaml", ".yml") else word.text, ruleset)
+        scene = find_scene(beside if suffix in (".yaml", ".yml") else word.text)
+        setting = next((one for one in scene.paints if isinstance(one, Setting)), None)
+        if setting is not None:
+            label = "a picture is made of elements only"
+            reader.reporter.error(
+                "PD605", f"the scene `{scene.name}` sets `{setting.name}`", word.span, label
+            )
+            return None
+        return draw_scene(scene, ruleset)
     except CompileError as error:
         for one in error.diagnostics:
             reader.reporter.error(one.code, one.message, word.span, notes=one.notes, helps=one.helps)

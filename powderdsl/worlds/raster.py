@@ -124,6 +124,18 @@ class Paint:
     element_span: Span | None = field(default=None, compare=False, repr=False)
 
 
+@dataclass(frozen=True)
+class Setting:
+    """A statement that gives the field `name` a value in the cells of `shape`: a word as `field_words` reads it."""
+
+    name: str
+    value: str
+    shape: Shape
+    span: Span = field(compare=False, repr=False)
+    name_span: Span = field(compare=False, repr=False)
+    value_span: Span = field(compare=False, repr=False)
+
+
 def mask(shape: Shape, size: Size) -> NDArray[np.bool_]:
     """The cells of a shape in a grid of `size`, bool [H, W]. What lies outside the grid is cut off."""
     cells = np.zeros(size, dtype=np.bool_)

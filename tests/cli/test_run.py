@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import powderdsl as package
-from powderdsl.cli.start_worlds import start_ids
+from powderdsl.cli.start_worlds import start_drawn
 from powderdsl.compiler import shipped_rules
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.reactions import unchanging_ids
@@ -185,7 +185,8 @@ def test_worlds_come_from_drawings_pictures_and_scenes():
 def test_every_shipped_scene_is_a_start_world():
     rules = package.load("powderworld")
     for scene in shipped_scenes():
-        ids = start_ids(rules, scene.name, None, 2, None)
+        drawn = start_drawn(rules, scene.name, None, 2, None)
+        ids = drawn.ids if drawn else None
         assert ids.shape == (2, *scene.size)
 
 

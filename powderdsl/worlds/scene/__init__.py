@@ -10,6 +10,7 @@
       - box ELEMENT rows 32:64                         # a:b leaves b out; all columns unless it says so
       - box ELEMENT rows 48:end columns :16            # `48:` means the same, but YAML takes it for a key
       - frame ELEMENT
+      - FIELD := VALUE in box rows 32:64               # everywhere without `in SHAPE`
 
 `draw` may also be a `|` block, one statement a line. A file with several scenes has a list under `scenes`.
 """
@@ -17,15 +18,20 @@
 from powderdsl.worlds.scene.fixed import parse_statement
 from powderdsl.worlds.scene.load import draw_scene, find_scene, load_scene, load_scenes, shipped_scenes
 from powderdsl.worlds.scene.read import Scene, read_scenes
+from powderdsl.worlds.scene.start import FieldValues, Start, draw_start, load_start
 from powderdsl.worlds.scene.statements import STATEMENTS
 
 __all__ = [
     "STATEMENTS",
+    "FieldValues",
     "Scene",
+    "Start",
     "draw_scene",
+    "draw_start",
     "find_scene",
     "load_scene",
     "load_scenes",
+    "load_start",
     "parse_statement",
     "read_scenes",
     "shipped_scenes",

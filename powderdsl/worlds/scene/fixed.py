@@ -14,16 +14,19 @@ from powderdsl.worlds.raster import (
     Line,
     Paint,
     Ramp,
+    Setting,
     Shape,
     Slice,
     Square,
     Wave,
 )
-from powderdsl.worlds.scene.statements import STATEMENTS, Statement, read_statement
+from powderdsl.worlds.scene.statements import SETTING, STATEMENTS, Statement, read_setting, read_statement
 
 
-def parse_statement(span: Span, reporter: Reporter) -> Paint | None:
+def parse_statement(span: Span, reporter: Reporter) -> Paint | Setting | None:
     """The statement of a scene at `span`, or None after reporting bad syntax (PD605) or numbers (PD606)."""
+    if ":=" in span.text:
+        return _setting(span, reporter)
     found = read_statement(span, reporter)
     if found is None:
         return None
@@ -35,6 +38,27 @@ def parse_statement(span: Span, reporter: Reporter) -> Paint | None:
     element = found.choice.names[0]
     numbers = [None if one is None else int(one.value or 0) for one in found.numbers]
     return Paint(element.text, shape_of(found.kind, numbers), found.span, element.span)
+
+
+def _setting(span: Span, reporter: Reporter) -> Setting | None:
+    found = read_setting(span, reporter)
+    if found is None:
+        return None
+    drawn = (
+        [one for one in found.shape.numbers if one is not None and not one.is_number] if found.shape else []
+    )
+    for amount in drawn:
+        place = amount.span or found.span
+        reporter.error(
+            "PD605", "a scene is the same every time", place, "a number, written out", helps=(SETTING,)
+        )
+    if drawn:
+        return None
+    shape: Shape = Box()
+    if found.shape is not None:
+        numbers = [None if one is None else int(one.value or 0) for one in found.shape.numbers]
+        shape = shape_of(found.shape.kind, numbers)
+    return Setting(found.name.text, found.value.text, shape, found.span, found.name.span, found.value.span)
 
 
 def _usage(statement: Statement) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.types import Element
 from powderdsl.worlds.files import failure, read_source
-from powderdsl.worlds.raster import MAX_CELLS, Size, paint
+from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, paint
 from powderdsl.worlds.scene.read import SIZE_RULE, Scene, read_scenes
 
 
@@ -27,6 +27,8 @@ def load_scene(
     path_or_name: str | Path, ruleset: HasElements, *, size: Size | None = None
 ) -> NDArray[np.uint8]:
     """The ids uint8 [H, W] of a scene: a file, ``FILE#NAME`` for one of several, or a shipped scene's name.
+
+    Fields that the scene sets are left out: `load_start` has them.
 
     With another `size` shapes stay where they are, a frame and open ends follow the edge. Raises CompileError
     with everything that is wrong.
@@ -87,6 +89,12 @@ def _read_file(path: Path) -> tuple[Scene, ...]:
     return scenes
 
 
+def element_ids(ruleset: HasElements) -> dict[str, int]:
+    """Ids by plain and qualified name."""
+    ids = {element.qualified: element.id for element in ruleset.elements}
+    return ids | {element.name: element.id for element in ruleset.elements}
+
+
 def draw_scene(scene: Scene, ruleset: HasElements, *, size: Size | None = None) -> NDArray[np.uint8]:
     """The ids uint8 [H, W] of a scene. Raises CompileError: PD604 unknown elements, PD607 a bad `size`."""
     reporter = Reporter()
@@ -102,9 +110,9 @@ def _draw(
     height, width = size or scene.size
     if not (height >= 1 and width >= 1 and height * width <= MAX_CELLS):
         raise failure("PD607", f"a world of {height}×{width} cells", helps=(SIZE_RULE,))
-    ids = {element.qualified: element.id for element in ruleset.elements}
-    ids |= {element.name: element.id for element in ruleset.elements}
-    used = [(scene.fill, scene.fill_span), *((one.element, one.element_span) for one in scene.paints)]
+    ids = element_ids(ruleset)
+    paints = [one for one in scene.paints if isinstance(one, Paint)]
+    used = [(scene.fill, scene.fill_span), *((one.element, one.element_span) for one in paints)]
     unknown = [(name, span) for name, span in used if name not in ids]
     for name, span in unknown:
         reporter.error(
@@ -114,4 +122,4 @@ def _draw(
             "not an element of this ruleset",
             helps=suggest(name, {element.name for element in ruleset.elements}, "its elements"),
         )
-    return None if unknown else paint((height, width), ids[scene.fill], scene.paints, ids)
+    return None if unknown else paint((height, width), ids[scene.fill], paints, ids)

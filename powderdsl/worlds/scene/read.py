@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from powderdsl.diagnostics import Label, Reporter, Source, Span, suggest
 from powderdsl.model.schema import Key, Reader, first_line
 from powderdsl.syntax import yaml_tree
-from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, mask
+from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Size, mask
 from powderdsl.worlds.scene.fixed import parse_statement
 
 SCENE_KEYS = {
@@ -39,7 +39,7 @@ class Scene:
     about: str
     size: Size
     fill: str
-    paints: tuple[Paint, ...]
+    paints: tuple[Paint | Setting, ...]
     span: Span = field(compare=False, repr=False)
     fill_span: Span = field(compare=False, repr=False)
 
@@ -164,7 +164,7 @@ def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
     return rows, columns
 
 
-def _check_coverage(paints: Iterable[Paint], size: Size, reporter: Reporter) -> None:
+def _check_coverage(paints: Iterable[Paint | Setting], size: Size, reporter: Reporter) -> None:
     for one in paints:
         if not mask(one.shape, size).any():
             reporter.error(
@@ -176,7 +176,7 @@ def _check_coverage(paints: Iterable[Paint], size: Size, reporter: Reporter) -> 
             )
 
 
-def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint, ...]:
+def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Setting, ...]:
     """A list of statements, or a `|` block with one a line."""
     spans: list[Span] = []
     if isinstance(node, yaml_tree.Sequence):

@@ -45,6 +45,9 @@ GENERATOR_STATEMENTS = {
 }
 """Those of a generator: besides, cells at random, pictures, and lists of statements with a name."""
 
+SETTING = "FIELD := VALUE in SHAPE"
+"""How a scene gives cells a field's value. Without `in` it is given everywhere."""
+
 _POINT = (("a row", -MAX_COORDINATE), ("a column", -MAX_COORDINATE))
 _ROWS = (("the start of a range", 0), ("the end of a range", 0))
 NUMBERS: dict[str, tuple[tuple[str, int], ...]] = {
@@ -112,6 +115,7 @@ _TERMINAL_WORDS = {
     "SLASH": "`/`",
     "PERCENT": "`%`",
     "__ANON_0": "`..`",
+    "ASSIGN": "`:=`",
     "$END": "the end of the statement",
 }
 """What terminals are called in messages; keywords are called by themselves."""
@@ -123,7 +127,7 @@ def _parser() -> Lark:
         Path(__file__).with_name("scene.lark").read_text(encoding="utf-8"),
         parser="lalr",
         lexer="basic",
-        start=["statement", "shape", "amount", "repeat", "choice"],
+        start=["statement", "setting", "shape", "amount", "repeat", "choice"],
         propagate_positions=True,
         maybe_placeholders=False,
     )
@@ -144,6 +148,31 @@ def read_statement(span: Span, reporter: Reporter, *, shape: bool = False) -> St
     reading = _Reading(span.source, reporter)
     found = reading.statement(tree, shape)
     return None if reading.failed else found
+
+
+@dataclass(frozen=True)
+class WrittenSetting:
+    """A field and its value as written; without a `shape` it is meant everywhere."""
+
+    name: Word
+    value: Word
+    shape: Statement | None
+    span: Span = field(compare=False, repr=False)
+
+
+def read_setting(span: Span, reporter: Reporter) -> WrittenSetting | None:
+    """The `FIELD := VALUE in SHAPE` that stands at `span`, or None after reporting PD605 or PD606."""
+    tree = _parse(span, "setting", reporter)
+    if tree is None:
+        return None
+    reading = _Reading(span.source, reporter)
+    parts: list[Any] = tree.children
+    name, _, worth, *shapes = parts
+    shape = reading.statement(shapes[0], True) if shapes else None
+    place = _token_span(span.source, worth.meta)
+    value = Word("".join(place.text.split()), place)
+    written = WrittenSetting(reading.word(name), value, shape, _token_span(span.source, tree.meta))
+    return None if reading.failed else written
 
 
 def read_amount(span: Span, reporter: Reporter, *, repeat: bool = False) -> Amount | None:
@@ -332,6 +361,8 @@ def _usage(statement: Span) -> tuple[str, ...]:
     """How the statement is written, if its first word says which it is; otherwise the word that was meant."""
     if was_cut(statement.source.text, statement.start, statement.end):
         return (CUT,)
+    if ":=" in statement.text:
+        return (SETTING,)
     word = next(iter(statement.text.split(maxsplit=1)), "")
     if word in GENERATOR_STATEMENTS:
         return (GENERATOR_STATEMENTS[word],)
