@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from powderdsl.diagnostics import Reporter, Severity, Source, suggest
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.packs import read_file
+from powderdsl.model.palette import Palette
 from powderdsl.model.types import Param, Ruleset, Value
 from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
 
@@ -61,29 +63,33 @@ def shipped_tests() -> list[str]:
     ]
 
 
-def load(*names: str | Path, params: Mapping[str, Any] | None = None) -> Ruleset:
+def load(
+    *names: str | Path, params: Mapping[str, Any] | None = None, palette: Palette | None = None
+) -> Ruleset:
     """Read rule files into a checked model.
 
     Args:
         names: shipped names (``"powderworld"``), paths of rule files, or several joined by ``+``. A name after ``-``
             is left out: ``"name-pack"``.
         params: other values for parameters, by qualified name: ``{"pack.param": 0.05}``.
+        palette: ids that were recorded, such as a model's: the qualified name of the element of each id, or None.
+            Elements that it does not have get its free ids, then those after its end.
 
     Raises:
         CompileError: with everything that is wrong in the files.
     """
-    ruleset, _ = load_with_diagnostics(*names, params=params)
+    ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette)
     return ruleset
 
 
 def load_with_diagnostics(
-    *names: str | Path, params: Mapping[str, Any] | None = None
+    *names: str | Path, params: Mapping[str, Any] | None = None, palette: Palette | None = None
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
     """Like `load`; the second value has the warnings and notes."""
     reporter = Reporter()
     packs, ruleset = read(names, reporter)
     reporter.raise_if_errors()
-    model = check(packs, ruleset, reporter)
+    model = check(packs, ruleset, reporter, palette)
     if params:
         model = set_params(model, params, reporter)
     reporter.raise_if_errors()
@@ -100,7 +106,7 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
         left_out |= set(minus)
         for word in plus:
             _read_one(word, packs, rulesets, reporter, from_ruleset=None)
-    for word in left_out - set(packs):
+    for word in sorted(left_out - set(packs)):
         reporter.error(
             "PD304",
             f"`{word}` is left out, but it was not there",
@@ -111,7 +117,12 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
         reporter.error(
             "PD304", "no rules were named", None, helps=["name a shipped ruleset or a file: `powderworld`"]
         )
-    return [pack for name, pack in packs.items() if name not in left_out], rulesets[-1] if rulesets else None
+    kept = [pack for name, pack in packs.items() if name not in left_out]
+    if not rulesets:
+        return kept, None
+    own = {scalar.text for scalar in rulesets[-1].packs}
+    gone = tuple(pack for name, pack in packs.items() if name in left_out and name in own)
+    return kept, replace(rulesets[-1], left_out=gone)
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:

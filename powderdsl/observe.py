@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -29,7 +28,7 @@ from powderdsl.ir.gates import width as width_of
 from powderdsl.ir.lower import plane_type
 from powderdsl.ir.ops import Type
 from powderdsl.model.state import Slot, slots, storage
-from powderdsl.model.types import Property, Ruleset
+from powderdsl.model.types import MatrixChannel, Property, Ruleset
 
 
 class Observer:
@@ -116,16 +115,7 @@ class Observer:
     @cached_property
     def matrix_names(self) -> tuple[str, ...]:
         """What the channels of `matrix` are: elements, properties and fields by name; ``name.row`` of vectors."""
-        elements = {element.id: element.name for element in self.ruleset.elements}
-        names: list[str] = []
-        for name in self.ruleset.matrix:
-            if name == "elements":
-                names.extend(elements.get(number, "") for number in range(self.ruleset.slots))
-            elif name in self.slots and self.slots[name].planes == 2:
-                names.extend(f"{name}.{part}" for part in ("row", "column"))
-            else:
-                names.append(name)
-        return tuple(names)
+        return tuple(channel.name for channel in self.ruleset.matrix)
 
     @cached_property
     def matrix_tables(self) -> tuple[tuple[int, ...], Tensor]:
@@ -203,23 +193,20 @@ class Observer:
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:
         """The channels of `matrix:`, and the tables float32 [n, 256] of properties among them."""
         properties: list[Tensor] = []
-        channels = tuple(c for name in self.ruleset.matrix for c in self._channels_of(name, properties))
+        channels = tuple(self._channel_of(channel, properties) for channel in self.ruleset.matrix)
         return channels, torch.stack(properties) if properties else torch.zeros(1, 256, device=self.device)
 
-    def _channels_of(self, name: str, tables: list[Tensor]) -> Iterator[Channel]:
-        base, _, part = name.partition(".")
-        prop = self.ruleset.property(base)
-        if name == "elements":
-            yield from (Channel("one_hot", "element", number) for number in range(self.ruleset.slots))
-        elif base in self.slots and self.slots[base].planes == 2:
-            yield from (Channel("slot", f"{base}.{p}") for p in ([part] if part else ("row", "column")))
-        elif base in self.slots:
-            yield Channel("slot", base)
-        elif prop is not None:
-            yield Channel("table", "element", len(tables))
-            tables.append(self.table(base).to(_dtype(prop)).float())
-        else:
-            yield Channel("zero")
+    def _channel_of(self, channel: MatrixChannel, tables: list[Tensor]) -> Channel:
+        name = channel.source
+        if channel.id is not None:
+            return Channel("one_hot", "element", channel.id)
+        if name in self.slots:
+            return Channel("slot", f"{name}.{channel.part}" if channel.part else name)
+        prop = self.ruleset.property(name)
+        if prop is None:
+            return Channel("zero")
+        tables.append(self.table(name).to(_dtype(prop)).float())
+        return Channel("table", "element", len(tables) - 1)
 
     def _buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """The buffer that was given, or a new one."""

@@ -6,7 +6,7 @@ Worlds that lie packed in native memory are read where they lie; all others are 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -75,8 +75,10 @@ def write_channels(state: State, channels: Sequence[Channel], tables: Tensor, ou
     at = 0
     while at < len(channels):
         channel, end = channels[at], at + 1
-        if channel.kind == "one_hot":  # neighbouring numbers together
-            while end < len(channels) and channels[end].kind == "one_hot":
+        if channel.kind == "one_hot":  # consecutive numbers together
+            while end < len(channels) and channels[end] == replace(
+                channels[end - 1], value=channels[end - 1].value + 1
+            ):
                 end += 1
             first, last = channel.value, channels[end - 1].value
             numbers = torch.arange(first, last + 1, device=out.device, dtype=torch.uint8)
@@ -92,7 +94,9 @@ def write_channels(state: State, channels: Sequence[Channel], tables: Tensor, ou
 
 def _part(state: State, name: str) -> Tensor:
     base, _, part = name.rpartition(".")
-    return state[base][:, ("row", "column").index(part)] if base in state else state[name]
+    if part in ("row", "column") and base in state:
+        return state[base][:, ("row", "column").index(part)]
+    return state[name]
 
 
 def _native_channel(channel: Channel, state: PackedState) -> tuple[int, int, int, int]:

@@ -55,6 +55,8 @@ _ROWS = (
     ("PD309", "unknown-parameter", _ERROR),
     ("PD310", "unknown-ruleset-entry", _ERROR),
     ("PD311", "reserved-word", _ERROR),
+    ("PD312", "name-qualified", _NOTE),
+    ("PD313", "id-taken", _NOTE),
     # PD4xx: kinds and ranges
     ("PD401", "wrong-kind", _ERROR),
     ("PD402", "value-out-of-range", _ERROR),

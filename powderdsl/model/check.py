@@ -14,9 +14,11 @@ from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
 from powderdsl.model.expressions import Typer
 from powderdsl.model.invariants import check_invariants
+from powderdsl.model.layout import matrix_channels, state_order
 from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
 from powderdsl.model.needless import report_needless, report_undrawn
 from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
+from powderdsl.model.palette import Palette
 from powderdsl.model.satisfy import Facts
 from powderdsl.model.scope import Scope
 from powderdsl.model.symbols import (
@@ -35,13 +37,16 @@ from powderdsl.syntax.ast import Syntax
 
 
 def resolve_names(
-    packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter
+    packs: Sequence[PackDecl],
+    ruleset: RulesetDecl | None,
+    reporter: Reporter,
+    palette: Palette | None = None,
 ) -> tuple[Typer, list[tuple[str, int, Span]]]:
     """What checks expressions against all names of some packs, and where elements' own values stand.
 
     Raises CompileError where names clash.
     """
-    composition = compose(packs, ruleset, reporter)
+    composition = compose(packs, ruleset, reporter, palette)
     reporter.raise_if_errors()  # with names that clash or packs that lack, rules would only be misread
     symbols = base_symbols(composition)
     typer = Typer(symbols, reporter)
@@ -55,9 +60,17 @@ def resolve_names(
     return typer, given
 
 
-def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Ruleset:
-    """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter."""
-    typer, given = resolve_names(packs, ruleset, reporter)
+def check(
+    packs: Sequence[PackDecl],
+    ruleset: RulesetDecl | None,
+    reporter: Reporter,
+    palette: Palette | None = None,
+) -> Ruleset:
+    """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter.
+
+    `palette` has ids that were recorded earlier: see `model/palette.py`.
+    """
+    typer, given = resolve_names(packs, ruleset, reporter, palette)
     symbols, composition = typer.symbols, typer.symbols.composition
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
@@ -77,7 +90,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
     facts = _facts(symbols)
     check_logic(passes, facts, elaborated, reporter)
     report_unused(composition, typer, produced_ids(passes, facts))
-    matrix = _matrix(composition, symbols, reporter)
+    matrix = matrix_channels(composition, symbols, passes, reporter)
     reporter.raise_if_errors()
     report_needless(passes, facts, reporter)
     found = Ruleset(
@@ -92,6 +105,7 @@ def check(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Repo
         params=tuple(symbols.params.values()),
         passes=without_dead_overrides(passes, frozenset(name for name, ids in stored.items() if not ids)),
         matrix=matrix,
+        order=state_order(composition, symbols, passes),
         tests=examples,
         invariants=invariants,
     )
@@ -193,10 +207,13 @@ def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Spa
     given: dict[tuple[str, str], tuple[Syntax, str]] = {}
     sources = [(named.pack, name, named.decl.values) for name, named in composition.element_decls.items()]
     for pack in composition.packs:
-        sources += [(pack.name.text, also.element.text.removesuffix("?"), also.values) for also in pack.also]
+        own = pack.name.text
+        for also in pack.also:
+            word = also.element.text.removesuffix("?")
+            sources.append((own, composition.element(word, own) or word, also.values))
     for pack_name, element, values in sources:
         for key, syntax in values:
-            name = key.text.removesuffix("?")
+            name = composition.names.of(pack_name, key.text.removesuffix("?"))
             if name in composition.properties:
                 given[(name, element)] = (syntax, pack_name)
             elif not key.text.endswith("?"):
@@ -216,17 +233,18 @@ def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Spa
                 )
     for name, named in composition.properties.items():
         for key, syntax in named.decl.values:
-            element = key.text.removesuffix("?")
-            if element in composition.elements:
-                given[(name, element)] = (syntax, named.pack)
+            word = key.text.removesuffix("?")
+            found = composition.element(word, named.pack)
+            if found is not None:
+                given[(name, found)] = (syntax, named.pack)
             elif not key.text.endswith("?"):
                 typer.reporter.error(
                     "PD301",
-                    f"unknown element `{element}`",
+                    f"unknown element `{word}`",
                     key.span,
                     helps=[
-                        *suggest(element, composition.elements, "elements"),
-                        f"if its pack may be absent, write `{element}?`",
+                        *suggest(word, composition.elements, "elements"),
+                        f"if its pack may be absent, write `{word}?`",
                     ],
                 )
         if name in symbols.properties:
@@ -291,7 +309,7 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
             default = (
                 constant_of(decl.default, kind, scope, typer)
                 if decl.default
-                else default_of(kind, symbols.ids)
+                else default_of(kind, symbols.first_id)
             )
             of = None
             if decl.of is not None:
@@ -305,7 +323,7 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
                     )
         except Poisoned:
             continue
-        symbols.fields[name] = field_from(decl, named.pack, kind, settled(default, kind), of)
+        symbols.fields[name] = field_from(named, kind, settled(default, kind), of)
 
 
 def _sets(typer: Typer) -> None:
@@ -337,26 +355,3 @@ def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tu
                 helps=["rename one of them"],
             )
     return tuple(streams)
-
-
-def _matrix(composition: Composition, symbols: Symbols, reporter: Reporter) -> tuple[str, ...]:
-    """The channels of `World.matrix()`: as the ruleset says, or elements, then everything a cell holds."""
-    holds = [
-        *(p.name for p in symbols.properties.values() if p.stored),
-        *(n for n, f in symbols.fields.items() if not f.resets),
-    ]
-    if composition.ruleset is None or not composition.ruleset.matrix:
-        return ("elements", *holds)
-    known = ["elements", *symbols.properties, *symbols.fields]
-    for scalar in composition.ruleset.matrix:
-        name, _, part = scalar.text.removesuffix("?").partition(".")
-        if (name not in known or part not in ("", "row", "column")) and not scalar.text.endswith("?"):
-            helps = [*suggest(name, known, "channels"), f"if its pack may be absent, write `{scalar.text}?`"]
-            reporter.error(
-                "PD310",
-                f"unknown channel `{scalar.text}`",
-                scalar.span,
-                "not a field or property",
-                helps=helps,
-            )
-    return tuple(s.text.removesuffix("?") for s in composition.ruleset.matrix)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.builtins import RESERVED
 from powderdsl.model.declarations import (
     ElementDecl,
     KernelDecl,
@@ -18,9 +17,10 @@ from powderdsl.model.declarations import (
     StreamDecl,
     TypedDecl,
 )
+from powderdsl.model.names import PASS, NameBook, Names, needs_of
+from powderdsl.model.palette import Claim, Palette, composed_ids, recorded_ids, report_ids
 from powderdsl.model.types import Element
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_PASSES = 200
@@ -30,10 +30,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Named(Generic[T]):
-    """A declaration with the pack it comes from."""
+    """A declaration with the pack it comes from, and its global name."""
 
     pack: str
     decl: T
+    name: str
 
 
 @dataclass(frozen=True)
@@ -56,37 +57,54 @@ class Composition:
     kernels: dict[str, Named[KernelDecl]]
     sets: dict[str, Named[tuple[Scalar, Syntax]]]
     passes: tuple[Named[PassDecl], ...]
-    owners: dict[str, str]
-    """The pack that defines each global name."""
+    names: Names
+    order: dict[int, int]
+    """The place of each id where loops run over elements: as if no palette had been recorded."""
+    groups: tuple[tuple[str, ...], ...]
+    """The packs whose elements and channels are placed together; the first ones lie where they lie by themselves."""
+    reserved: tuple[int, ...]
+    """Ids of elements of a ruleset's own packs that are left out."""
 
-    def knows(self, pack: str, name: str) -> bool:
-        """Whether a pack can be expected to know a global name: its own, or one of a pack that it needs."""
-        owner = self.owners.get(name)
-        return owner is None or owner in self.needs_of(pack)
-
-    def needs_of(self, pack: str) -> frozenset[str]:
-        """A pack and all packs that it needs, directly or not."""
-        needs = {decl.name.text: [need.text for need in decl.needs] for decl in self.packs}
-        found: set[str] = set()
-        waiting = [pack]
-        while waiting:
-            name = waiting.pop()
-            if name not in found:
-                found.add(name)
-                waiting.extend(needs.get(name, ()))
-        return frozenset(found)
+    def element(self, word: str, pack: str) -> str | None:
+        """The global name of the element that a pack means by a plain or qualified name."""
+        name = self.names.of(pack, word)
+        if name in self.elements:
+            return name
+        return next((one for one, element in self.elements.items() if element.qualified == word), None)
 
 
-def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter) -> Composition:
-    """Merge packs in the order given. Reports clashes of names and ids, missing packs, and cycles of passes."""
+def compose(
+    packs: Sequence[PackDecl],
+    ruleset: RulesetDecl | None,
+    reporter: Reporter,
+    palette: Palette | None = None,
+) -> Composition:
+    """Merge packs in the order given. Reports clashes of names and ids, missing packs, and cycles of passes.
+
+    `palette` has ids that were recorded earlier.
+    """
     _check_needs(packs, reporter)
-    names = _Names(reporter)
-    elements, element_decls = _elements(packs, names, reporter)
-    slots = max([ruleset.slots or 0 if ruleset else 0, *(e.id + 1 for e in elements.values()), 1])
+    book = NameBook(packs, ruleset.rename if ruleset else (), reporter)
+    chosen = _chosen_elements(packs, book, reporter)
+    groups = _groups(packs, ruleset)
+    claims = _claims(groups, ruleset is not None, chosen)
+    natural = composed_ids(claims)
+    ids = natural if palette is None else recorded_ids(claims, palette)
+    loaded = [claim for claim in claims if claim.name in chosen]
+    report_ids(loaded, ids, reporter, recorded=palette is not None)
+    elements = _elements(chosen, ids, reporter)
+    slots = max(
+        [
+            ruleset.slots or 0 if ruleset else 0,
+            *(number + 1 for number in ids.values()),
+            len(palette or ()),
+            1,
+        ]
+    )
     # The ruleset's own packs must fit its slots; packs loaded on top of them add slots.
     own = {scalar.text for scalar in ruleset.packs} if ruleset and ruleset.slots else set()
     top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
-    if top and ruleset and ruleset.slots and top.id >= ruleset.slots:
+    if top and ruleset and ruleset.slots and palette is None and top.id >= ruleset.slots:
         reporter.error(
             "PD402",
             f"element `{top.name}` has id {top.id}, but the ruleset has {ruleset.slots} slots",
@@ -96,14 +114,14 @@ def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Re
     tag_spans: dict[str, Span] = {}
     for pack in packs:
         for scalar, _ in pack.tags:
-            names.define(scalar, "tag", pack.name.text)
-            tag_spans.setdefault(scalar.text, scalar.span)
+            if name := book.define(scalar, "tag", pack.name.text):
+                tag_spans[name] = scalar.span
 
     def table(entries: Iterable[tuple[PackDecl, Scalar, T]], kind: str) -> dict[str, Named[T]]:
         found: dict[str, Named[T]] = {}
         for pack, scalar, decl in entries:
-            if names.define(scalar, kind, pack.name.text):
-                found[scalar.text] = Named(pack.name.text, decl)
+            if name := book.define(scalar, kind, pack.name.text):
+                found[name] = Named(pack.name.text, decl, name)
         return found
 
     properties = table(((p, d.name, d) for p in packs for d in p.properties), "property")
@@ -111,81 +129,56 @@ def compose(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Re
     streams = table(((p, d.name, d) for p in packs for d in p.streams), "stream")
     kernels = table(((p, d.name, d) for p in packs for d in p.kernels), "kernel")
     sets = table(((p, d[0], d) for p in packs for d in p.sets), "set")
+    passes = table(((p, d.name, d) for p in packs for d in p.passes), PASS)
     params: dict[str, Named[TypedDecl]] = {}
     for pack in packs:
         for decl in pack.params:
-            params[f"{pack.name.text}.{decl.name.text}"] = Named(pack.name.text, decl)
-            names.check_word(decl.name, "parameter")
-    tags = _tags(packs, elements, tag_spans, reporter)
-    passes = _order_passes(packs, reporter)
+            qualified = f"{pack.name.text}.{decl.name.text}"
+            params[qualified] = Named(pack.name.text, decl, qualified)
+            book.check_word(decl.name, "parameter")
+    names = book.finish()
+    _check_renamed(ruleset, book, reporter)
     name = ruleset.name.text if ruleset else "+".join(pack.name.text for pack in packs)
     about = ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else "")
-    return Composition(
-        name,
-        about,
-        tuple(packs),
-        ruleset,
-        elements,
-        element_decls,
-        slots,
-        tags,
-        tag_spans,
-        properties,
-        fields,
-        streams,
-        params,
-        kernels,
-        sets,
-        passes,
-        {name: pack for name, (_, _, pack) in names.defined.items()},
+    composition = Composition(
+        name=name,
+        about=about,
+        packs=tuple(packs),
+        ruleset=ruleset,
+        elements=elements,
+        element_decls={word: chosen[word].named for word in elements},
+        slots=slots,
+        tags={},
+        tag_spans=tag_spans,
+        properties=properties,
+        fields=fields,
+        streams=streams,
+        params=params,
+        kernels=kernels,
+        sets=sets,
+        passes=_order_passes(passes, names, reporter),
+        names=names,
+        order={number: natural.get(word, number) for word, number in ids.items()},
+        groups=tuple(tuple(pack.name.text for pack in group) for group in groups),
+        reserved=tuple(ids[c.name] for c in claims if c.name in ids and c.name not in chosen),
     )
+    return replace(composition, tags=_tags(composition, reporter))
 
 
-def a(noun: str) -> str:
-    """The noun with its article."""
-    return f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
-
-
-class _Names:
-    """One namespace for everything that rules can name."""
-
-    def __init__(self, reporter: Reporter):
-        self.reporter = reporter
-        self.defined: dict[str, tuple[str, Scalar, str]] = {}
-        self.reserved = RESERVED | reserved_words() | {"elements"}
-
-    def check_word(self, scalar: Scalar, kind: str) -> bool:
-        if scalar.text in self.reserved:
-            self.reporter.error(
-                "PD311",
-                f"`{scalar.text}` is a word of the language",
-                scalar.span,
-                f"cannot name {a(kind)}",
-                helps=[f"write `{scalar.text}_`, or choose another name"],
+def _check_renamed(ruleset: RulesetDecl | None, book: NameBook, reporter: Reporter) -> None:
+    """Report names under `rename:` that no pack defines. Those of packs that are left out may wait."""
+    if ruleset is None:
+        return
+    waiting = {pack.name.text for pack in ruleset.left_out}
+    for old, _ in ruleset.rename:
+        if old.text not in book.renamed and old.text.partition(".")[0] not in waiting:
+            reporter.error(
+                "PD310",
+                f"nothing is called `{old.text}`",
+                old.span,
+                "no loaded pack defines this",
+                helps=["write the pack's name, a point, and the name that it defines: `pack.word`"],
             )
-            return False
-        return True
-
-    def define(self, scalar: Scalar, kind: str, pack: str) -> bool:
-        if not self.check_word(scalar, kind):
-            return False
-        # A pass and an element may share a name; streams too stand where no element can.
-        known = self.defined.get(scalar.text)
-        if known is not None:
-            self.reporter.error(
-                "PD302",
-                f"`{scalar.text}` is defined twice",
-                scalar.span,
-                f"{a(kind)} of {pack}",
-                secondary=[Label(known[1].span, f"{a(known[0])} of {known[2]}")],
-                helps=[
-                    "rename one of them"
-                    + ("; to replace an element say `override: yes`" if kind == "element" else "")
-                ],
-            )
-            return False
-        self.defined[scalar.text] = (kind, scalar, pack)
-        return True
 
 
 def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
@@ -217,58 +210,40 @@ def _need_help(need: str, pack: str, loaded: Iterable[str]) -> str:
     return close[0] if close and close[0].startswith("did") else f"load it too, as in `{need}+{pack}`"
 
 
-def _elements(
-    packs: Sequence[PackDecl], names: _Names, reporter: Reporter
-) -> tuple[dict[str, Element], dict[str, Named[ElementDecl]]]:
-    chosen: dict[str, Named[ElementDecl]] = {}
+@dataclass(frozen=True)
+class _Chosen:
+    """The declaration of an element that holds, and those that it overrides, the latest first."""
+
+    named: Named[ElementDecl]
+    replaced: tuple[Named[ElementDecl], ...] = ()
+
+    @property
+    def first(self) -> ElementDecl:
+        """Where the element is defined, not overridden."""
+        return (self.replaced or (self.named,))[-1].decl
+
+
+def _chosen_elements(packs: Sequence[PackDecl], book: NameBook, reporter: Reporter) -> dict[str, _Chosen]:
+    """By global name, in load order."""
+    chosen: dict[str, _Chosen] = {}
     for pack in packs:
         for decl in pack.elements:
-            name = decl.name.text
-            if name in chosen and decl.override:
-                chosen[name] = Named(pack.name.text, decl)
+            known = book.find(decl.name.text, pack.name.text, "element") if decl.override else None
+            if known is not None:
+                before = chosen[known]
+                named = Named(pack.name.text, decl, known)
+                chosen[known] = _Chosen(named, (before.named, *before.replaced))
                 continue
-            if decl.override and name not in chosen:
+            if decl.override:
                 reporter.error(
                     "PD301",
-                    f"`{name}` overrides nothing",
+                    f"`{decl.name.text}` overrides nothing",
                     decl.name.span,
                     "no pack before this one defines it",
                     helps=["remove `override`, or load the other pack first"],
                 )
-            if names.define(decl.name, "element", pack.name.text):
-                chosen[name] = Named(pack.name.text, decl)
-    by_id: dict[int, ElementDecl] = {}
-    glyphs = {named.decl.glyph for named in chosen.values() if named.decl.glyph}
-    elements: dict[str, Element] = {}
-    used = {named.decl.id for named in chosen.values()}
-    for name, named in chosen.items():
-        decl = named.decl
-        if decl.id is None:
-            continue
-        if decl.id in by_id:
-            free = next((i for i in range(256) if i not in used), None)
-            reporter.error(
-                "PD303",
-                f"elements `{by_id[decl.id].name.text}` and `{name}` have the same id {decl.id}",
-                decl.id_scalar.span if decl.id_scalar else decl.name.span,
-                "already taken",
-                secondary=[Label(by_id[decl.id].name.span, "by this one")],
-                helps=[] if free is None else [f"id {free} is free"],
-            )
-        by_id[decl.id] = decl
-        glyph = decl.glyph or next(
-            (
-                c
-                for c in [*name, *name.upper(), *"0123456789@$&*+=<>"]
-                if c.isalnum() | (c in "@$&*+=<>") and c not in glyphs
-            ),
-            "?",
-        )
-        glyphs.add(glyph)
-        elements[name] = Element(
-            name, named.pack, decl.id, decl.color, glyph, decl.about, frozenset(), decl.name.span
-        )
-    _check_glyphs(chosen, reporter)
+            if name := book.define(decl.name, "element", pack.name.text):
+                chosen[name] = _Chosen(Named(pack.name.text, decl, name))
     if not chosen:
         reporter.error(
             "PD109",
@@ -277,83 +252,153 @@ def _elements(
             "a world needs elements",
             helps=["define `elements:`, or load `core` too"],
         )
-    ordered = dict(sorted(elements.items(), key=lambda item: item[1].id))
-    return ordered, {name: chosen[name] for name in ordered}
+    return chosen
 
 
-def _check_glyphs(chosen: dict[str, Named[ElementDecl]], reporter: Reporter) -> None:
-    """One character cannot stand for two elements."""
-    owners: dict[str, ElementDecl] = {}
-    for named in chosen.values():
-        decl = named.decl
-        first = owners.setdefault(decl.glyph, decl)
-        if decl.glyph and first is not decl:
+def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
+    """The packs whose elements and channels are placed together, one group after the other.
+
+    A ruleset's own packs come first, those that are left out among them, for their places stay reserved. Then comes
+    each further pack by itself, after those that it needs: the order in which packs are named decides little.
+    """
+    own = {scalar.text for scalar in ruleset.packs} if ruleset else set()
+    left_out = ruleset.left_out if ruleset else ()
+    first = [pack for pack in (*packs, *left_out) if pack.name.text in own]
+    others = _needed_first([pack for pack in packs if pack.name.text not in own])
+    return [*([first] if first else []), *([pack] for pack in others)]
+
+
+def _claims(groups: Sequence[Sequence[PackDecl]], own: bool, chosen: dict[str, _Chosen]) -> list[Claim]:
+    """All elements in the order in which ids are decided. In each group those that ask for an id come first.
+
+    `own` says that the first group is a ruleset's.
+    """
+    claims: list[Claim] = []
+    for number, group in enumerate(groups):
+        found = [claim for pack in group for claim in _claims_of(pack, chosen, not own or number == 0)]
+        claims += sorted(found, key=lambda claim: claim.decl.id is None)
+    return claims
+
+
+def _claims_of(pack: PackDecl, chosen: dict[str, _Chosen], own: bool) -> Iterator[Claim]:
+    """The claims of the elements that a pack defines first. What overrides them speaks for them."""
+    name = pack.name.text
+    by_decl = {id(one.first): one for one in chosen.values()}
+    for decl in pack.elements:
+        one = by_decl.get(id(decl))
+        if one is None:
+            if not decl.override:  # of a pack that is left out: its id stays reserved
+                qualified = f"{name}.{decl.name.text}"
+                yield Claim(f"-{qualified}", qualified, name, decl, own)
+            continue
+        final = one.named
+        wished = next((old for old in (final, *one.replaced) if old.decl.id is not None), final).decl
+        yield Claim(
+            final.name,
+            f"{final.pack}.{final.decl.name.text}",
+            final.pack,
+            replace(final.decl, id=wished.id, id_scalar=wished.id_scalar),
+            own,
+            tuple(f"{old.pack}.{old.decl.name.text}" for old in one.replaced),
+        )
+
+
+def _needed_first(packs: Sequence[PackDecl]) -> list[PackDecl]:
+    """The packs in load order, but each after those that it needs. Packs that need each other stay as they are."""
+    needs = needs_of(packs)
+    ordered: list[PackDecl] = []
+    waiting = list(packs)
+    while waiting:
+        names = {pack.name.text for pack in waiting}
+        ready = next((p for p in waiting if not (needs[p.name.text] - {p.name.text}) & names), waiting[0])
+        waiting.remove(ready)
+        ordered.append(ready)
+    return ordered
+
+
+def _elements(chosen: dict[str, _Chosen], ids: dict[str, int], reporter: Reporter) -> dict[str, Element]:
+    """The elements by ascending id. A glyph that another element has already is replaced by a free one."""
+    owners: dict[str, Named[ElementDecl]] = {}
+    for one in chosen.values():
+        glyph = one.named.decl.glyph
+        first = owners.setdefault(glyph, one.named) if glyph else one.named
+        if first is not one.named and first.pack == one.named.pack:
             reporter.error(
-                "PD302", f"elements `{first.name.text}` and `{decl.name.text}` have the same glyph `{decl.glyph}`",
-                decl.name.span, "this one", secondary=[Label(first.name.span, "and this one")], helps=["give one of them another glyph"],
+                "PD302", f"elements `{first.decl.name.text}` and `{one.named.decl.name.text}` have the same glyph `{glyph}`",
+                one.named.decl.name.span, "this one", secondary=[Label(first.decl.name.span, "and this one")], helps=["give one of them another glyph"],
             )  # fmt: skip
+    glyphs = set(owners)
+    elements: dict[str, Element] = {}
+    for name, one in chosen.items():
+        decl = one.named.decl
+        if name not in ids:
+            continue
+        glyph = decl.glyph if owners.get(decl.glyph) is one.named else ""
+        word = decl.name.text
+        glyph = glyph or next(
+            (
+                c
+                for c in [*word, *word.upper(), *"0123456789@$&*+=<>"]
+                if c.isalnum() | (c in "@$&*+=<>") and c not in glyphs
+            ),
+            "?",
+        )
+        glyphs.add(glyph)
+        elements[name] = Element(
+            name, one.named.pack, ids[name], decl.color, glyph, decl.about, frozenset(), decl.name.span
+        )
+    return dict(sorted(elements.items(), key=lambda item: item[1].id))
 
 
-def _tags(
-    packs: Sequence[PackDecl], elements: dict[str, Element], tag_spans: dict[str, Span], reporter: Reporter
-) -> dict[str, frozenset[int]]:
-    members: dict[str, set[int]] = {tag: set() for tag in tag_spans}
+def _tags(composition: Composition, reporter: Reporter) -> dict[str, frozenset[int]]:
+    elements, names = composition.elements, composition.names
+    members: dict[str, set[int]] = {tag: set() for tag in composition.tag_spans}
 
-    def give(element: str, tags: Iterable[Scalar]) -> None:
+    def give(pack: str, element: str, tags: Iterable[Scalar]) -> None:
         for scalar in tags:
-            tag = scalar.text.removesuffix("?")
+            word = scalar.text.removesuffix("?")
+            tag = names.of(pack, word)
             if tag in members:
                 if element in elements:
                     members[tag].add(elements[element].id)
             elif not scalar.text.endswith("?"):
                 reporter.error(
                     "PD301",
-                    f"unknown tag `{tag}`",
+                    f"unknown tag `{word}`",
                     scalar.span,
                     "no loaded pack declares it",
                     helps=[
-                        *suggest(tag, members, "tags"),
-                        f"if its pack may be absent, write `{tag}?`; to make a tag, declare it under `tags:`",
+                        *suggest(word, members, "tags"),
+                        f"if its pack may be absent, write `{word}?`; to make a tag, declare it under `tags:`",
                     ],
                 )
 
-    for pack in packs:
+    for pack in composition.packs:
+        own = pack.name.text
         for decl in pack.elements:
-            give(decl.name.text, decl.tags)
+            give(own, names.of(own, decl.name.text), decl.tags)
         for also in pack.also:
-            name = also.element.text.removesuffix("?")
-            if name not in elements and not also.element.text.endswith("?"):
+            word = also.element.text.removesuffix("?")
+            name = composition.element(word, own)
+            if name is None and not also.element.text.endswith("?"):
                 reporter.error(
                     "PD301",
-                    f"unknown element `{name}`",
+                    f"unknown element `{word}`",
                     also.element.span,
                     "no loaded pack defines it",
                     helps=[
-                        *suggest(name, elements, "elements"),
-                        f"if its pack may be absent, write `{name}?`",
+                        *suggest(word, elements, "elements"),
+                        f"if its pack may be absent, write `{word}?`",
                     ],
                 )
-            give(name, also.tags)
+            give(own, name or word, also.tags)
     return {tag: frozenset(ids) for tag, ids in members.items()}
 
 
-def _order_passes(packs: Sequence[PackDecl], reporter: Reporter) -> tuple[Named[PassDecl], ...]:
+def _order_passes(
+    passes: dict[str, Named[PassDecl]], names: Names, reporter: Reporter
+) -> tuple[Named[PassDecl], ...]:
     """Sort passes by `after` and `before`; what those leave open is decided by load order."""
-    passes: dict[str, Named[PassDecl]] = {}
-    for pack in packs:
-        for decl in pack.passes:
-            name = decl.name.text
-            if name in passes:
-                reporter.error(
-                    "PD302",
-                    f"pass `{name}` is defined twice",
-                    decl.name.span,
-                    f"in {pack.name.text}",
-                    secondary=[Label(passes[name].decl.name.span, f"in {passes[name].pack}")],
-                    helps=["rename one of them"],
-                )
-            else:
-                passes[name] = Named(pack.name.text, decl)
     if len(passes) > MAX_PASSES:
         last = list(passes.values())[MAX_PASSES].decl.name.span
         reporter.error(
@@ -364,19 +409,20 @@ def _order_passes(packs: Sequence[PackDecl], reporter: Reporter) -> tuple[Named[
     for name, named in passes.items():
         for scalars, is_after in ((named.decl.after, True), (named.decl.before, False)):
             for scalar in scalars:
-                other = scalar.text.removesuffix("?")
+                word = scalar.text.removesuffix("?")
+                other = names.of_pass(named.pack, word)
                 if other in passes:
                     first, second = (other, name) if is_after else (name, other)
                     earlier[second][first] = scalar.span
                 elif not scalar.text.endswith("?"):
                     reporter.error(
                         "PD301",
-                        f"unknown pass `{other}`",
+                        f"unknown pass `{word}`",
                         scalar.span,
                         "no loaded pack has it",
                         helps=[
-                            *suggest(other, passes, "passes"),
-                            f"if its pack may be absent, write `{other}?`",
+                            *suggest(word, passes, "passes"),
+                            f"if its pack may be absent, write `{word}?`",
                         ],
                     )
     ordered: list[str] = []

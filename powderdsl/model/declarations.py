@@ -128,3 +128,7 @@ class RulesetDecl:
     matrix: tuple[Scalar, ...]
     params: tuple[tuple[Scalar, Syntax], ...] = field(default=())
     invariants: tuple[Syntax, ...] = ()
+    rename: tuple[tuple[Scalar, Scalar], ...] = ()
+    """Qualified names, and the names by which these definitions are known here."""
+    left_out: tuple[PackDecl, ...] = ()
+    """Packs of its own that are not loaded: the ids of their elements stay reserved."""

@@ -109,7 +109,7 @@ class Elaborator:
 
     def _pass(self, named: Named[PassDecl]) -> Pass:
         decl = named.decl
-        self._name, self._pack = decl.name.text, named.pack
+        self._name, self._pack, self._word = named.name, named.pack, decl.name.text
         self._numbers = {id(rule): number for number, rule in enumerate(_rules_of(decl.block))}
         self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
@@ -130,7 +130,7 @@ class Elaborator:
             scratch[qualified] = Field(
                 qualified,
                 kind,
-                default_of(kind, self.typer.symbols.ids),
+                default_of(kind, self.typer.symbols.first_id),
                 "place",
                 True,
                 None,
@@ -304,7 +304,7 @@ class Elaborator:
         if clause := syntax.child("chance"):
             # Named by where the rule stands, not by how many were unrolled before it: other packs shift nothing.
             label = f"[{self._label}]" if self._label else ""
-            name = f"{self._pack}.{self._name}#{self._numbers[id(syntax)]}{label}"
+            name = f"{self._pack}.{self._word}#{self._numbers[id(syntax)]}{label}"
             self.result.streams[name] = Stream(name, stream_ident(name), 32)
             parts.append(self.typer.chance_draw(name, clause.children[0], scope))
         return conjunction(parts, syntax.span)
@@ -393,7 +393,7 @@ class Elaborator:
             fields = [
                 *self.typer.symbols.fields,
                 *self.typer.symbols.properties,
-                *(n.split(".")[1] for n in self._scratch),
+                *(n.rpartition(".")[2] for n in self._scratch),
             ]
             helps = suggest(syntax.text, fields, "fields")
             if isinstance(operand, (SetOf, Place)):

@@ -35,15 +35,16 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
     own = {name: named.decl.glyph for name, named in composition.element_decls.items() if named.pack == pack}
     legend |= {glyph: name for name, glyph in own.items() if glyph}
     for key, value in decl.legend:
-        name = value.text.removesuffix("?")
-        if name not in composition.elements:
-            if value.text != name:
-                raise Asleep(name)  # a test of what packs do together waits until both are loaded
+        word = value.text.removesuffix("?")
+        name = composition.element(word, pack)
+        if name is None:
+            if value.text != word:
+                raise Asleep(word)  # a test of what packs do together waits until both are loaded
             helps = (
-                *suggest(name, composition.elements, "elements"),
-                f"if its pack may be absent, write `{name}?`",
+                *suggest(word, composition.elements, "elements"),
+                f"if its pack may be absent, write `{word}?`",
             )
-            raise typer.fail("PD301", f"unknown element `{name}`", value.span, helps=helps)
+            raise typer.fail("PD301", f"unknown element `{word}`", value.span, helps=helps)
         if len(key.text) != 1:
             raise typer.fail("PD110", "a legend explains single characters", key.span, "not one character")
         legend[key.text] = name

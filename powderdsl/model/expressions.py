@@ -112,6 +112,12 @@ class Typer(Coercer):
             if isinstance(scope.locals[name], Broken):
                 raise Poisoned
             return self.turn(scope.locals[name], scope)
+        param = symbols.params.get(f"{scope.pack}.{name}")
+        if param is not None:  # a name that hides no other that its pack knows
+            self.used.add(param.name)
+            return Expr("param", param.kind, value=param.name, span=span)
+        name = symbols.composition.names.of(scope.pack, name)
+        self.used.add(name)
         if name in self.set_definitions and name not in symbols.constants:
             return self.resolve_set(name, span)
         if name in symbols.constants:
@@ -127,10 +133,6 @@ class Typer(Coercer):
             return Expr("field", symbols.fields[name].kind, value=name, span=span)
         if name in symbols.streams:
             return Expr("draw", DRAW, value=name, span=span)
-        param = symbols.params.get(f"{scope.pack}.{name}")
-        if param is not None:
-            self.used.add(param.name)
-            return Expr("param", param.kind, value=param.name, span=span)
         return None
 
     def hides(self, name: str, span: Span, scope: Scope) -> bool:
@@ -138,7 +140,8 @@ class Typer(Coercer):
         if name in scope.locals:
             return True
         found = self.find(name, span, Scope(scope.pack, {}))
-        return found is not None and self.symbols.composition.knows(scope.pack, name)
+        names = self.symbols.composition.names
+        return found is not None and names.knows(scope.pack, names.of(scope.pack, name))
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
@@ -219,6 +222,9 @@ class Typer(Coercer):
                 self.used.add(qualified)
                 param = self.symbols.params[qualified]
                 return Expr("param", param.kind, value=qualified, span=syntax.span)
+        qualified_operand = self._of_pack(syntax, scope)
+        if qualified_operand is not None:
+            return qualified_operand
         base = self.evaluate(base_syntax, scope)
         word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
         if isinstance(base, Absent):
@@ -252,6 +258,21 @@ class Typer(Coercer):
                     helps=(f"write `{text}`",),
                 )
         raise self.wrong(value, "a field, property or neighbour after the dot", word)
+
+    def _of_pack(self, syntax: Syntax, scope: Scope) -> Operand | None:
+        """``pack.name``, or ``below.pack.name``: what one pack defines, whatever others call theirs."""
+        (pack,) = syntax.children
+        if pack.kind not in ("name", "optional_name", "attribute"):
+            return None
+        name = self.symbols.composition.names.qualified(pack.text, syntax.text)
+        inner = Scope("", scope.locals, scope.orientation)
+        if name is None or self.find(pack.text, pack.span, inner) is not None:
+            return None
+        found = self.find(name, syntax.span, Scope("", {}, scope.orientation))
+        if pack.kind == "attribute" and isinstance(found, Expr):
+            place = self.place(self.evaluate(pack.children[0], scope), pack.children[0].span)
+            return look(found, place.offset, syntax.span)
+        return found if pack.kind != "attribute" else None
 
     # Literals and lists
 
@@ -389,8 +410,10 @@ class Typer(Coercer):
                     )
                 return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():
-                names = {element.id: name for name, element in self.symbols.composition.elements.items()}
-                return [SetOf((i,), names[i]) for i in operand.ids]
+                composition = self.symbols.composition
+                names = {element.id: name for name, element in composition.elements.items()}
+                ids = sorted(operand.ids, key=composition.order.__getitem__)
+                return [SetOf((i,), names[i]) for i in ids]
             case Items():
                 return list(operand.items)
             case Absent():

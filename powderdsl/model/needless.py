@@ -171,7 +171,11 @@ def report_undrawn(
     chances = {prop.name: prop for prop in ruleset.properties if prop.kind.name == "chance"}
     for name, number, span in given:
         prop = chances.get(name)
-        if prop is None or name in ruleset.matrix or prop.values[number] == 0:
+        if (
+            prop is None
+            or any(name == channel.source for channel in ruleset.matrix)
+            or prop.values[number] == 0
+        ):
             continue
         if not _drawn(prop, number, ruleset, quick):
             element = facts.names.get(number, "?")

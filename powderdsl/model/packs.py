@@ -65,6 +65,12 @@ class _PackReader(Reader):
         name = self.scalar(entries, "ruleset")
         if name is None or not self.name(name, "a ruleset"):
             return None
+        renamed = []
+        for key, value in self._pairs(entries.get("rename", (None, None))[1], "names: `pack.word: name`"):
+            if not isinstance(value, Scalar):
+                self.shape(value, "a name")
+            elif self.name(value, "a name"):
+                renamed.append((key, value))
         params = []
         node = entries.get("params", (None, None))[1]
         if isinstance(node, Mapping):
@@ -78,6 +84,7 @@ class _PackReader(Reader):
             self.words(entries.get("matrix", (None, None))[1]),
             tuple(params),
             self.statements(entries.get("invariants", (None, None))[1]),
+            tuple(renamed),
         )
 
     def pack(self, tree: Mapping) -> PackDecl | None:
@@ -114,7 +121,7 @@ class _PackReader(Reader):
             elements=tuple(
                 self.element(key, node) for key, node in self.named(value("elements"), "an element")
             ),
-            also=tuple(self.also(key, node) for key, node in self._pairs(value("also"))),
+            also=tuple(self.also(key, node) for key, node in self._pairs(value("also"), "elements to tags")),
             passes=tuple(self.pass_(key, node) for key, node in self.named(value("passes"), "a pass")),
             tests=tuple(t for node in self._items(value("tests")) if (t := self.test(node))),
             invariants=self.statements(value("invariants")),
@@ -125,11 +132,11 @@ class _PackReader(Reader):
         items = () if node is None else node.items if isinstance(node, Sequence) else (node,)
         return tuple(line for item in items if (line := self.line(item, "invariant")))
 
-    def _pairs(self, node: Node | None) -> tuple[tuple[Scalar, Node], ...]:
+    def _pairs(self, node: Node | None, what: str) -> tuple[tuple[Scalar, Node], ...]:
         if node is None:
             return ()
         if not isinstance(node, Mapping):
-            self.shape(node, "a mapping from elements to tags")
+            self.shape(node, f"a mapping from {what}")
             return ()
         return node.entries
 

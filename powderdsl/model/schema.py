@@ -57,6 +57,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "packs": Key("words", "the packs it is made of", True),
         "slots": Key("number", "how many element ids there are, vacant ones included"),
         "matrix": Key("words", "the channels of `World.matrix()`"),
+        "rename": Key("mapping", "other names for what packs define: `pack.word: name`"),
         "params": Key("mapping", "other values for the packs' parameters"),
         "invariants": Key("statements", "what is true of every world, a statement a line"),
     },
@@ -87,7 +88,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "edges": Key("word", "`nothing` (the default) or `wrap`: what lies outside the grid"),
     },
     "element": {
-        "id": Key("number", "its number, for good: 0 to 255", True),
+        "id": Key("number", "the number it asks for, 0 to 255; a free one otherwise"),
         "color": Key("word", 'its colour, quoted: "#RRGGBB"', True),
         "glyph": Key("word", "one character for ASCII art; the first free letter of its name otherwise"),
         "about": Key("text", "what it is, in a sentence"),

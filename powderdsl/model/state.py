@@ -47,7 +47,7 @@ def storage(kind: Kind) -> str:
 
 
 def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
-    """All slots of a ruleset's worlds: the element, stored properties, then fields, in load order."""
+    """All slots of a ruleset's worlds: the element, then stored properties and fields in the order of the ruleset."""
     found = [Slot("element", ELEMENT, 0, True, False, None, "uint8", 1)]
     for prop in ruleset.properties:
         if prop.stored:
@@ -66,4 +66,5 @@ def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
                 planes,
             )
         )
-    return tuple(found)
+    place = {name: number for number, name in enumerate(ruleset.order)}
+    return tuple(sorted(found, key=lambda slot: place.get(slot.name, -1)))

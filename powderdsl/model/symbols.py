@@ -58,6 +58,11 @@ class Symbols:
     def ids(self) -> tuple[int, ...]:
         return tuple(element.id for element in self.composition.elements.values())
 
+    @property
+    def first_id(self) -> int:
+        """The element that fields of elements hold unless their file says otherwise."""
+        return min(self.ids, key=self.composition.order.__getitem__)
+
     def names(self, *, after_dot: bool = False) -> list[str]:
         """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbour."""
         if after_dot:
@@ -81,7 +86,8 @@ class Symbols:
             found.sets,
             found.element_decls,
         )
-        return any(name in table for table in tables) or f"{pack}.{name}" in found.params
+        meant = found.names.of(pack, name)
+        return any(meant in table for table in tables) or f"{pack}.{name}" in found.params
 
 
 def base_symbols(composition: Composition) -> Symbols:
@@ -151,12 +157,12 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
     raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", helps)
 
 
-def default_of(kind: Kind, ids: tuple[int, ...] = (0,)) -> Value:
+def default_of(kind: Kind, first_id: int = 0) -> Value:
     """The value of something whose file gives no default: zero or the nearest bound to it; the first element."""
     if kind.name in ("int", "real", "vec2"):
         zero = min(max(0, kind.lo), kind.hi)
         return int(zero) if kind.name == "int" else float(zero) if kind.name == "real" else (zero, zero)
-    return ids[0] if kind.name == "element" else 0
+    return first_id if kind.name == "element" else 0
 
 
 def settled(default: Value, kind: Kind) -> Value:
@@ -169,12 +175,13 @@ def settled(default: Value, kind: Kind) -> Value:
     return (row, column[0]) if column else row
 
 
-def field_from(decl: TypedDecl, pack: str, kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
-    return Field(decl.name.text, kind, default, decl.at, decl.resets, of, pack, decl.name.span)
+def field_from(named: Named[TypedDecl], kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
+    decl = named.decl
+    return Field(named.name, kind, default, decl.at, decl.resets, of, named.pack, decl.name.span)
 
 
 def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
-    """A parameter may not hide a global word: a rule would read the other one without a sign."""
+    """A parameter may not hide a global word that its pack knows: a rule would read the other one without a sign."""
     composition = symbols.composition
     spans: dict[str, Span] = {name: element.span for name, element in composition.elements.items()}
     spans |= composition.tag_spans
@@ -184,9 +191,9 @@ def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
     spans |= {name: named.decl.name.span for name, named in composition.streams.items()}
     spans |= {name: named.decl[0].span for name, named in composition.sets.items()}
     spans |= {name: named.decl.name.span for name, named in composition.kernels.items()}
-    for qualified, named in composition.params.items():
-        name = qualified.split(".")[1]
-        if name in spans:
+    for named in composition.params.values():
+        name = composition.names.of(named.pack, named.decl.name.text)
+        if name in spans and composition.names.knows(named.pack, name):
             reporter.error(
                 "PD308",
                 f"the parameter `{name}` hides another `{name}`",

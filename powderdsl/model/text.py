@@ -137,7 +137,7 @@ class _Printer:
         yield f"ruleset {rules.name}"
         yield f"packs {' '.join(rules.packs)}"
         yield f"slots {rules.slots}"
-        yield f"matrix {' '.join(rules.matrix)}"
+        yield f"matrix {' '.join(channel.name or '-' for channel in rules.matrix)}"
         for element in rules.elements:
             tags = f" tags {' '.join(sorted(element.tags))}" if element.tags else ""
             head = f"element {element.id} {element.qualified} {element.glyph} {element.color}{tags}"

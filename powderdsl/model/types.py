@@ -113,7 +113,10 @@ OPS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Element:
-    """An element: its id is stable across any selection of packs. `glyph` is one ASCII character."""
+    """An element. `id` is its number in worlds of this ruleset; `glyph` is one ASCII character.
+
+    `name` is plain, or qualified where a pack that was loaded earlier has an element of the same name.
+    """
 
     name: str
     pack: str
@@ -126,7 +129,8 @@ class Element:
 
     @property
     def qualified(self) -> str:
-        return f"{self.pack}.{self.name}"
+        """The name that it has whatever else is loaded."""
+        return f"{self.pack}.{self.name.rpartition('.')[2]}"
 
 
 @dataclass(frozen=True)
@@ -375,8 +379,21 @@ class Invariant:
 
 
 @dataclass(frozen=True)
+class MatrixChannel:
+    """A channel of `World.matrix()`: whether a cell has the element `id`, or a field or property, or a component of it.
+
+    Without an id and a source it is always 0, for its pack is not loaded; so it is for an id without an element.
+    """
+
+    name: str
+    source: str = ""
+    id: int | None = None
+    part: str = ""
+
+
+@dataclass(frozen=True)
 class Ruleset:
-    """A checked ruleset. `slots` is the number of ids: one-hot layouts have this many channels, some may be vacant."""
+    """A checked ruleset. `slots` is the number of ids, some of which may be vacant."""
 
     name: str
     about: str
@@ -388,13 +405,21 @@ class Ruleset:
     streams: tuple[Stream, ...]
     params: tuple[Param, ...]
     passes: tuple[Pass, ...]
-    matrix: tuple[str, ...]
+    matrix: tuple[MatrixChannel, ...]
+    order: tuple[str, ...] = ()
+    """What a cell holds besides its element, as `model/layout.py` orders it."""
     tests: tuple[Example, ...] = ()
     invariants: tuple[Invariant, ...] = ()
 
     def element(self, name: str) -> Element | None:
         """The element of a plain or qualified name."""
         return next((e for e in self.elements if name in (e.name, e.qualified)), None)
+
+    @property
+    def palette(self) -> tuple[str | None, ...]:
+        """The qualified name of the element of each id, `slots` of them, or None."""
+        names = {element.id: element.qualified for element in self.elements}
+        return tuple(names.get(number) for number in range(self.slots))
 
     def property(self, name: str) -> Property | None:
         return next((p for p in self.properties if p.name == name), None)

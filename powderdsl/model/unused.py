@@ -52,12 +52,13 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     Tasks and programs may read a field that a ruleset lists as a channel. Streams and tags are left out: packs declare
     them for others.
     """
-    words = {word for pack in composition.packs for word in _pack_words(pack)}
+    names = composition.names
+    words = {names.of(pack.name.text, word) for pack in composition.packs for word in _pack_words(pack)}
     if composition.ruleset is not None:
         words |= {word for line in composition.ruleset.invariants for word in _words(line)}
         words |= {scalar.text.removesuffix("?").partition(".")[0] for scalar in composition.ruleset.matrix}
     for name, field in composition.fields.items():
-        if name not in words:
+        if name not in words and field.decl.name.text not in words:
             _unused("field", name, field.decl.name.span, reporter)
     for pack in composition.packs:
         for pass_ in pack.passes:

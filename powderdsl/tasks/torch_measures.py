@@ -175,7 +175,8 @@ class _Part:
         planes: dict[str, Tensor] = {}
         for name in self.slots:
             base, _, part = name.rpartition(".")
-            plane = given.state[base][:, ("row", "column").index(part)] if base else given.state[name]
+            vector = part in ("row", "column") and base in given.state
+            plane = given.state[base][:, ("row", "column").index(part)] if vector else given.state[name]
             planes[name] = _cut(plane, self.window).to(_WORKING[self.types[name].name])
         for name in self.regions:
             planes[name] = _cut(given.regions[name.removeprefix(REGION_LET)], self.window)

@@ -141,7 +141,6 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     ("an id with a fraction", 'elements: {a: {id: 1.5, color: "#000000"}}\n', "PD110", "1.5"),
     ("an id of many digits", f'elements: {{a: {{id: {"9" * 5000}, color: "#000000"}}}}\n', "PD402", "9" * 5000),
     ("an id twice", 'elements: {a: {id: 2, color: "#000000"}, b: {id: 2, color: "#000000"}}\n', "PD303", "2"),
-    ("no id", 'elements: {a: {color: "#000000"}}\n', "PD109", "{"),
     ("a short colour", 'elements: {a: {id: 9, color: "#FFF"}}\n', "PD110", '"#FFF"'),
     ("a colour by name", "elements: {a: {id: 9, color: red}}\n", "PD110", "red"),
     ("a long glyph", 'elements: {a: {id: 9, color: "#000000", glyph: ab}}\n', "PD110", "ab"),

@@ -115,7 +115,7 @@ def test_meaning(torch) -> None:  # type: ignore[no-untyped-def]
     assert np.array_equal(world.rgb().numpy(), rgb(world.ids.numpy(), palette(sim.ruleset.elements)))
     matrix, at = world.matrix(), sim.ruleset.slots
     assert torch.equal(matrix[:, :at].argmax(1).to(torch.uint8), world.ids)
-    for name in sim.ruleset.matrix[1:]:
+    for name in dict.fromkeys(channel.source for channel in sim.ruleset.matrix[at:]):
         value = world[name].float()
         parts = value.unbind(1) if value.ndim == 4 else (value,)
         for part in parts:

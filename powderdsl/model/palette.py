@@ -1,0 +1,123 @@
+"""Which number each element has: assigned when packs are composed, or recorded in a palette.
+
+A palette has the qualified name of the element of each id, or None where an id is free. Worlds, datasets and
+checkpoints keep one, so that they mean the same elements whatever else is loaded later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from powderdsl.diagnostics import Label, Reporter
+from powderdsl.model.declarations import ElementDecl
+
+MAX_ELEMENTS = 256
+"""Ids fit into a byte."""
+
+Palette = Sequence[str | None]
+"""By id: an element's qualified name, or None."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """An element that wants an id. `name` is the global one; `own` says that a ruleset lists its pack."""
+
+    name: str
+    qualified: str
+    pack: str
+    decl: ElementDecl
+    own: bool
+    replaces: tuple[str, ...] = ()
+    """Qualified names of the elements that it overrides, the latest first: it takes over their id."""
+
+
+def composed_ids(claims: Iterable[Claim]) -> dict[str, int]:
+    """Ids by global name. What comes first is decided first, so further packs change nothing.
+
+    An element has the id that its file gives, unless that is taken. All others have the lowest free id above those of
+    the ruleset's packs, or, without a ruleset, above all ids so far.
+    """
+    ids: dict[str, int] = {}
+    taken: dict[int, str] = {}
+    highest = -1
+    for claim in claims:
+        number = claim.decl.id
+        if number is None or number in taken:
+            above = [n for n in range(highest + 1, MAX_ELEMENTS) if n not in taken]
+            free = above or [n for n in range(MAX_ELEMENTS) if n not in taken]
+            if not free:
+                break
+            number = free[0]
+        ids[claim.name] = number
+        taken[number] = claim.name
+        if claim.own:
+            highest = max(highest, number)
+    return ids
+
+
+def recorded_ids(claims: Iterable[Claim], palette: Palette) -> dict[str, int]:
+    """Ids by global name, where a palette has them; others get its free ids, then those behind its end."""
+    known = {name: number for number, name in enumerate(palette) if name is not None}
+    ids: dict[str, int] = {}
+    later: list[Claim] = []
+    for claim in claims:
+        found = next((known[name] for name in (claim.qualified, *claim.replaces) if name in known), None)
+        if found is None:
+            later.append(claim)
+        else:
+            ids[claim.name] = found
+    free = [n for n in range(MAX_ELEMENTS) if n >= len(palette) or palette[n] is None]
+    return ids | {claim.name: number for claim, number in zip(later, free, strict=False)}
+
+
+def report_ids(
+    claims: Sequence[Claim], ids: Mapping[str, int], reporter: Reporter, *, recorded: bool
+) -> None:
+    """Report elements without an id, two of one pack with the same one, and those that could not have theirs."""
+    lacking = [claim for claim in claims if claim.name not in ids]
+    if lacking:
+        reporter.error(
+            "PD508",
+            f"{len(claims)} elements",
+            lacking[0].decl.name.span,
+            f"the limit is {MAX_ELEMENTS}",
+            helps=["load fewer packs"],
+        )
+    by_number: dict[tuple[str, int], Claim] = {}
+    for claim in claims:
+        wanted, scalar = claim.decl.id, claim.decl.id_scalar
+        if wanted is None or scalar is None:
+            continue
+        first = by_number.setdefault((claim.pack, wanted), claim)
+        if first is not claim:
+            used = {other.decl.id for other in claims}
+            used |= {ids[other.name] for other in claims if other is not claim and other.name in ids}
+            free = next((n for n in range(MAX_ELEMENTS) if n not in used), None)
+            reporter.error(
+                "PD303",
+                f"elements `{first.decl.name.text}` and `{claim.decl.name.text}` have the same id {wanted}",
+                scalar.span,
+                "already taken",
+                secondary=[Label(first.decl.name.span, "by this one")],
+                helps=[]
+                if free is None
+                else [f"id {free} is free; an element without `id:` gets a free one"],
+            )
+        elif not recorded and ids.get(claim.name, wanted) != wanted:
+            owner = next(other for other in claims if ids.get(other.name) == wanted)
+            reporter.report(
+                "PD313",
+                f"`{claim.qualified}` has id {ids[claim.name]} here, not {wanted}",
+                scalar.span,
+                f"`{owner.qualified}` has id {wanted}",
+                notes=["saved worlds, datasets and checkpoints know elements by name, not by id"],
+            )
+
+
+def compact_palette(palette: Palette, slots: int = 0) -> list[str | None]:
+    """A palette without free ids at its end, but with at least `slots` ids."""
+    found = list(palette)
+    while found and found[-1] is None:
+        found.pop()
+    return found + [None] * (slots - len(found))
