@@ -11,7 +11,7 @@ _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_test_fields", "pack_tests", "testing")
 _AFTER = ("bench", "tasks", "envs", "runs", "datasets", "rl", "worldmodel", "studies", "web", "cli")
-_EVERYTHING = (*_TESTING, "properties", "pytest_plugin", *_AFTER)
+_EVERYTHING = (*_TESTING, "properties", "mutation", "pytest_plugin", *_AFTER)
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
@@ -43,6 +43,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "pack_tests": (*_SCREEN, "pack_test_fields"),
     "testing": (*_SCREEN, "ledgers", "pack_tests", "scratch"),
     "properties": (*_TESTING, "user_cache"),
+    "mutation": (*_TESTING, "properties"),
     "pytest_plugin": (*_TESTING, "properties"),
     "bench": _SCREEN,
     "tasks": (*_COMPILER, "simulator", "worlds"),
@@ -73,6 +74,7 @@ _TORCH = (
     *_PROGRAMS,
     *_STEPS,
     "testing",
+    "mutation",
     "tasks.episodes",
     "envs",
     "datasets",

@@ -47,6 +47,16 @@ MAX_SECONDS = 24 * 3600
     help="Keep counterexamples in .powderdsl/.  [default: unless $CI is set]",
 )
 @click.option("--json", "as_json", is_flag=True, help="One JSON object instead of text.")
+@click.option(
+    "--mutate", is_flag=True, help="Put mistakes into the packs, and list those that nothing notices."
+)
+@click.option("--pack", "packs", multiple=True, metavar="PACK",
+              help="With --mutate: only mistakes in this pack. May be repeated.")  # fmt: skip
+@click.option("--mutants", type=WholeType(1, 1_000_000), metavar="N",
+              help="With --mutate: at most so many mistakes, of each kind in proportion.")  # fmt: skip
+@click.option("--write", is_flag=True, help="With --mutate: add a test for each of them to its pack.")
+@click.option("--jobs", type=WholeType(1, 256), metavar="N",
+              help="With --mutate: processes.  [default: one a processor]")  # fmt: skip
 def command(
     rules: tuple[str, ...],
     backend: str,
@@ -59,6 +69,11 @@ def command(
     picture: Path | None,
     keep: bool | None,
     as_json: bool,
+    mutate: bool,
+    packs: tuple[str, ...],
+    mutants: int | None,
+    write: bool,
+    jobs: int | None,
 ) -> int:
     """Run the tests of packs, and hold their invariants against the rules.
 
@@ -68,6 +83,11 @@ def command(
 
     Exit code: 0 if all holds, 1 if something fails, 2 for bad rules.
     """
+    if mutate:
+        from powderdsl.cli.mutation_report import MutationPlan, report_mutants
+
+        chosen = MutationPlan(packs, mutants, seed, jobs, write, as_json)
+        return report_mutants(rules or tuple(shipped_tests()), chosen)
     if picture is not None:
         if picture.suffix.lower() != ".png":
             raise BadInput(f"--picture must end in .png, not `{picture}`")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from powderdsl.model.operands import TRUE
 from powderdsl.model.state import slots
 from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
 from powderdsl.properties.samples import Array, Sample, State, full_state
+
+if TYPE_CHECKING:
+    from powderdsl.simulator import Simulator, World
 
 MARK = "happened "
 """How the flags are called that lines of rules set. No rule file can have a name with a blank."""
@@ -35,17 +38,9 @@ class Runner:
 
     def states(self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         """The state at the start and after each step, in storage dtypes. `random`: draws for all streams."""
-        start = full_state(self.ruleset, sample)
-        world = self.sim.world(sample.ids, seed=sample.seeds)
-        given = {name: world.state[name].new_tensor(values) for name, values in start.items()}
-        clock = world.step.new_tensor(sample.clock)
-        world = replace(world, state={**world.state, **given}, step=clock)
-        found = [start]
-        for _ in range(steps):
-            world = self.sim.step(world, random=random, params=dict(sample.params) or None)
-            found.append({name: to_numpy(world.state[name]) for name in start})
+        found, end = run_sample(self.sim, sample, steps, random, self.ruleset)
         self.worlds_run += len(sample)
-        self.note(world.state)
+        self.note(end.state)
         return found
 
     def note(self, state: Mapping[str, Any]) -> None:
@@ -53,6 +48,29 @@ class Runner:
         for number, span in enumerate(self.lines):
             if span not in self.happened and bool(state[f"{MARK}{number}"].any()):
                 self.happened.add(span)
+
+
+def run_sample(
+    sim: Simulator,
+    sample: Sample,
+    steps: int,
+    random: Mapping[str, Array] | None = None,
+    ruleset: Ruleset | None = None,
+) -> tuple[list[State], World]:
+    """The state at the start and after each step, in storage dtypes, and the world after the last one.
+
+    `ruleset`: whose slots are kept, if the simulator has more.
+    """
+    start = full_state(ruleset or sim.ruleset, sample)
+    world = sim.world(sample.ids, seed=sample.seeds)
+    given = {name: world.state[name].new_tensor(values) for name, values in start.items()}
+    clock = world.step.new_tensor(sample.clock)
+    world = replace(world, state={**world.state, **given}, step=clock)
+    found = [start]
+    for _ in range(steps):
+        world = sim.step(world, random=random, params=dict(sample.params) or None)
+        found.append({name: to_numpy(world.state[name]) for name in start})
+    return found, world
 
 
 def reference_states(

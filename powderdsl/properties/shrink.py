@@ -13,12 +13,16 @@ from time import monotonic
 import numpy as np
 
 from powderdsl.properties.breaks import Agreement, Alike, Runs, Tested, breaks, is_paired, steps_for
-from powderdsl.properties.samples import Sample
+from powderdsl.properties.samples import Array, Sample
 
 SEEDS = 24
 """How many seeds each smaller world is tried with, its own first."""
 
 MAX_BATCH = 1024
+
+
+Judge = Callable[[Sample, int], Array]
+"""After which step each world of a sample, run for so many steps, is what is looked for: int [B], 0 if it is not."""
 
 
 def shrink(
@@ -31,19 +35,32 @@ def shrink(
     until = monotonic() + seconds
     tries = 1 if isinstance(claim, Agreement | Alike) or not runs.ruleset.streams else SEEDS
     sample, steps = _later(claim, runs, sample, steps)
+    sample, steps = shrink_while(
+        lambda some, most: breaks(claim, runs, some, most).first, sample, steps, tries, until
+    )
+    if not runs.ruleset.streams:
+        sample = replace(sample, seeds=np.zeros_like(sample.seeds))
+    return sample, steps
+
+
+def shrink_while(judge: Judge, sample: Sample, steps: int, tries: int, until: float) -> tuple[Sample, int]:
+    """The smallest world found for which the judge still says yes, and after how many steps.
+
+    Args:
+        tries: with how many seeds each smaller world is tried, its own first.
+        until: when to end, by the monotonic clock, even if something smaller might be found.
+    """
     while monotonic() < until:
         smaller = sample
         for group in _GROUPS:
             while monotonic() < until:
-                found = _first(claim, runs, group(smaller), steps, tries)
+                found = _first(judge, group(smaller), steps, tries)
                 if found is None:
                     break
                 smaller, steps = found
         if smaller is sample:
             break
         sample = smaller
-    if not runs.ruleset.streams:
-        sample = replace(sample, seeds=np.zeros_like(sample.seeds))
     return sample, steps
 
 
@@ -56,15 +73,13 @@ def _later(claim: Tested, runs: Runs, sample: Sample, steps: int) -> tuple[Sampl
     return (late, 1) if breaks(claim, runs, late, 1).first.any() else (sample, steps)
 
 
-def _first(
-    claim: Tested, runs: Runs, candidates: list[Sample], steps: int, tries: int
-) -> tuple[Sample, int] | None:
-    """The first of these worlds of one shape that breaks the claim, with the seed that does it soonest."""
+def _first(judge: Judge, candidates: list[Sample], steps: int, tries: int) -> tuple[Sample, int] | None:
+    """The first of these worlds of one shape that the judge accepts, with the seed that does it soonest."""
     most = max(MAX_BATCH // tries, 1)
     for start in range(0, len(candidates), most):
         some = candidates[start : start + most]
         batch = _together([_seeded(one, number) for one in some for number in range(tries)])
-        first = breaks(claim, runs, batch, steps).first
+        first = judge(batch, steps)
         broken = np.nonzero(first)[0]
         if len(broken):
             best = min(broken.tolist(), key=lambda i: (i // tries, first[i], i))

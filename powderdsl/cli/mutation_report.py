@@ -1,0 +1,184 @@
+"""`powderdsl test --mutate`: realistic mistakes in packs, which of them nothing notices, and tests that would."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from powderdsl.cli.exits import FAILED, OK, BadInput, counted
+from powderdsl.cli.progress import progress
+
+if TYPE_CHECKING:
+    from powderdsl.mutation.mutants import Mutant
+    from powderdsl.mutation.mutation_run import Outcome
+    from powderdsl.mutation.written import GeneratedTest
+
+
+@dataclass(frozen=True)
+class MutationPlan:
+    """What is asked: only these packs, at most so many mutants, in so many processes; add tests to the files."""
+
+    packs: tuple[str, ...]
+    mutants: int | None
+    seed: int
+    jobs: int | None
+    write: bool
+    as_json: bool
+
+
+def report_mutants(names: Sequence[str], plan: MutationPlan) -> int:
+    """Mutate each of some compositions; the exit code: 1 if a mutant survives."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
+    data = {}
+    survived = False
+    try:
+        for name in names:
+            data[name] = _report(name, plan)
+            survived |= bool(data[name]["survived"])
+    finally:
+        if plan.as_json:
+            click.echo(json.dumps(data, indent=2, ensure_ascii=False))
+    return FAILED if survived else OK
+
+
+def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
+    from powderdsl.mutation.mutation_run import run_campaign, sampled
+    from powderdsl.mutation.original import Original
+
+    began = monotonic()
+    original = Original.of(name)
+    loaded = [pack.name.text for pack in original.packs]
+    unknown = [pack for pack in plan.packs if pack not in loaded]
+    if unknown:
+        raise BadInput(f"--pack {unknown[0]}: {name} consists of {', '.join(loaded)}")
+    mutants = original.mutants(frozenset(plan.packs))
+    numbers = sampled(mutants, plan.mutants, plan.seed)
+    outcomes: dict[int, Outcome] = {}
+    events = run_campaign(name, plan.packs, numbers, plan.jobs or os.cpu_count() or 1, plan.seed)
+    interrupted = False
+    with progress(name, len(numbers), lines=True) as show:
+        try:
+            for outcome in events:
+                outcomes[outcome.number] = outcome
+                alive = sum(one.verdict.status == "survived" for one in outcomes.values())
+                show(len(outcomes), f"{alive} survived")
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            events.close()  # its processes end
+    found = [(mutants[number], outcomes[number]) for number in sorted(outcomes)]
+    if not plan.as_json:
+        _tell(name, found, monotonic() - began, len(numbers), interrupted)
+    if plan.write:
+        _write(found)
+    return _data(found)
+
+
+def _tell(
+    name: str, found: list[tuple[Mutant, Outcome]], seconds: float, planned: int, interrupted: bool
+) -> None:
+    for mutant, outcome in found:
+        if outcome.verdict.status != "survived":
+            continue
+        click.echo(f"survived  {mutant.place}: {mutant.operator}")
+        click.echo(f"      {mutant.diff}")
+        if outcome.size is None:
+            click.echo(f"      no world was found on which it differs{_because(outcome)}")
+        elif outcome.test is None:
+            rows, columns, steps = outcome.size
+            click.echo(
+                f"      differs in `{outcome.slot}` alone, on {rows}×{columns} cells after {counted(steps, 'step')}"
+            )
+        else:
+            click.echo("".join(f"        {line}\n" for line in outcome.test.text.splitlines()), nl=False)
+    if interrupted:
+        click.echo(f"interrupted after {len(found)} of {counted(planned, 'mutant')}")
+    for pack in dict.fromkeys(mutant.pack for mutant, _ in found):
+        own = [(mutant, outcome) for mutant, outcome in found if mutant.pack == pack]
+        click.echo(f"{pack}: {summary(own)}")
+    click.echo(f"{name}: {summary(found)} in {seconds:.0f} s")
+
+
+def _because(outcome: Outcome) -> str:
+    return f" ({outcome.verdict.detail})" if outcome.verdict.detail else ""
+
+
+def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
+    """How many there were, and what noticed them."""
+    counts = tally([outcome for _, outcome in found])
+    real = counts["mutants"] - counts["equivalent"]
+    share = f"{100 * counts['killed'] / real:.1f} %" if real else "none"
+    by = ", ".join(f"{counts[key]} by {words}" for key, words in WORDS.items())
+    return (
+        f"{counted(counts['mutants'], 'mutant')}, {counts['equivalent']} equivalent,"
+        f" {counts['killed']} noticed ({by}), {counts['survived']} survived: {share}"
+    )
+
+
+WORDS = {
+    "check": "`check`",
+    "invariant": "invariants",
+    "test": "tests",
+    "generated": "generated tests",
+}
+
+
+def tally(outcomes: Sequence[Outcome]) -> Counter[str]:
+    """Numbers of mutants: all, equivalent, killed, survived, and killed by each kind of notice."""
+    counts: Counter[str] = Counter()
+    for outcome in outcomes:
+        verdict = outcome.verdict
+        if verdict.status == "invalid":
+            continue
+        counts["mutants"] += 1
+        counts[verdict.status] += 1
+        if verdict.status == "killed":
+            counts[verdict.by] += 1
+    return counts
+
+
+def _write(found: list[tuple[Mutant, Outcome]]) -> None:
+    from powderdsl.mutation.written import add_tests
+
+    tests: dict[Path, dict[str, GeneratedTest]] = {}
+    for mutant, outcome in found:
+        if outcome.test is not None:
+            body = outcome.test.text.split("\n", 1)[1]  # several mutants may be told apart by one world
+            tests.setdefault(Path(mutant.source.name), {}).setdefault(body, outcome.test)
+    for path, some in tests.items():
+        try:
+            add_tests(path, list(some.values()))
+        except ValueError as error:
+            raise BadInput(str(error)) from None
+        click.echo(f"{path}: {counted(len(some), 'generated test')} added", err=True)
+
+
+def _data(found: list[tuple[Mutant, Outcome]]) -> dict[str, Any]:
+    counts = tally([outcome for _, outcome in found])
+    keys = ("mutants", "equivalent", "killed", "survived", *WORDS)
+    return {
+        **{key: counts[key] for key in keys},
+        "list": [
+            {
+                "place": mutant.place,
+                "pack": mutant.pack,
+                "operator": mutant.operator,
+                "change": mutant.diff,
+                "status": outcome.verdict.status,
+                "by": outcome.verdict.by,
+                "detail": outcome.verdict.detail,
+                "test": outcome.test.text if outcome.test else None,
+                "differs_in": outcome.slot or None,
+            }
+            for mutant, outcome in found
+            if outcome.verdict.status != "invalid"
+        ],
+    }

@@ -1,0 +1,1 @@
+"""Mutation testing of packs: realistic mistakes, what notices them, and worlds that show those that nothing notices."""

@@ -1,0 +1,173 @@
+"""What notices a mutant: the checker, an invariant that a world breaks, a test; or a proof that nothing can."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.model.text import one_line
+from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
+from powderdsl.mutation.mutants import Mutant
+from powderdsl.mutation.original import Batch, Invalid, Original, is_generated, lowered, meaning
+from powderdsl.pack_tests import run_examples
+from powderdsl.properties.breaks import breaks, is_paired, look, steps_for
+from powderdsl.properties.proofs import horizon
+from powderdsl.properties.running import run_sample
+from powderdsl.properties.samples import Array, Sample, State
+from powderdsl.simulator import Simulator, compile
+
+NOTICED = ("check", "invariant", "test", "generated")
+"""What may notice a mutant, in rising order of cost. `test` are those written by hand."""
+
+FEW_STEPS = 20
+"""Tests of so many steps run before longer ones."""
+
+PAIRED = 6
+"""Batches on which invariants are tried that need more than one run of a world."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a mutant.
+
+    `status` is ``killed``, ``survived``, ``equivalent`` (proven) or ``invalid`` (no rule file); `by` is one of NOTICED
+    or how it was proven; `detail` is a code, an invariant's words or a test's name.
+    """
+
+    status: str
+    by: str = ""
+    detail: str = ""
+
+
+def judge(original: Original, mutant: Mutant) -> Verdict:
+    """Hold a mutant against everything that its composition says about itself, cheapest first."""
+    try:
+        ruleset, warnings = original.mutated(mutant)
+    except Invalid:
+        return Verdict("invalid")
+    except CompileError as error:
+        return Verdict("killed", "check", error.diagnostics[0].code)
+    new = warnings - original.warnings
+    if new:
+        return Verdict("killed", "check", min(new))
+    if meaning(ruleset) == original.meaning:
+        return Verdict("equivalent", "the same model")
+    if lowered(ruleset) == original.lowered:
+        return Verdict("equivalent", "the same program")
+    sim = compile(ruleset, backend="planes")
+    broken = broken_invariant(original, sim)
+    if broken is not None:
+        return Verdict("killed", "invariant", one_line(broken.span))
+    failed = failed_test(original, sim, mutant.pack)
+    if failed is not None:
+        return Verdict(
+            "killed", "generated" if is_generated(failed) else "test", f"{failed.pack}: {failed.name}"
+        )
+    return Verdict("survived")
+
+
+# Tests
+
+
+def failed_test(original: Original, sim: Simulator, pack: str) -> Example | None:
+    """A test that the original passes and the mutant fails: one written by hand, if there is one."""
+    for some in _portions(sim.ruleset, pack):
+        known = tuple(one for one in some if one.name not in original.failing)
+        if known:
+            results = run_examples(replace(sim.ruleset, tests=known), sim=sim)
+            failed = next((one.example for one in results if not one.passed), None)
+            if failed is not None:
+                return failed
+    return None
+
+
+def _portions(ruleset: Ruleset, pack: str) -> Iterator[list[Example]]:
+    """Tests in portions: written by hand first, then those of the mutated pack, then short ones."""
+    portions: dict[tuple[bool, bool, bool], list[Example]] = {}
+    for one in ruleset.tests:
+        key = is_generated(one), one.pack != pack, one.steps > FEW_STEPS
+        portions.setdefault(key, []).append(one)
+    for key in sorted(portions):
+        yield portions[key]
+
+
+# Invariants
+
+
+@dataclass(frozen=True)
+class _Mutated:
+    """Runs worlds with the mutant."""
+
+    sim: Simulator
+
+    @property
+    def ruleset(self) -> Ruleset:
+        return self.sim.ruleset
+
+    def states(self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
+        return run_sample(self.sim, sample, steps, random)[0]
+
+
+def broken_invariant(original: Original, sim: Simulator) -> Invariant | None:
+    """An invariant of the mutant that some world breaks. Only worlds that end otherwise than before are looked at."""
+    ruleset = sim.ruleset
+    if len(ruleset.invariants) != len(original.ruleset.invariants):
+        return None
+    single = [one for one in ruleset.invariants if not is_paired(one.claim)]
+    if single and same_state(original.ruleset, ruleset):
+        for batch in original.batches():
+            found = _broken_in(batch, original, sim, single)
+            if found is not None:
+                return found
+    runs = _Mutated(sim)
+    for one in ruleset.invariants:
+        if is_paired(one.claim) and not _is_local(one, ruleset):
+            for sample in original.samples[:PAIRED]:
+                start = sample.without(one.without, ruleset)
+                wrong = breaks(one.claim, runs, start, 1).first.any()
+                if wrong and isinstance(one.claim, Symmetric) and ruleset.streams:
+                    break  # the same draws may be used in another way
+                if wrong:
+                    return one
+    return None
+
+
+def _is_local(invariant: Invariant, ruleset: Ruleset) -> bool:
+    return isinstance(invariant.claim, Local) and horizon(ruleset) <= invariant.claim.radius
+
+
+def _broken_in(
+    batch: Batch, original: Original, sim: Simulator, invariants: list[Invariant]
+) -> Invariant | None:
+    states, _ = run_sample(sim, batch.sample, batch.steps)
+    differs = differing(batch.states, states)
+    for number, without in enumerate(original.withouts):
+        worlds = np.nonzero(differs & (batch.group == number))[0]
+        if not len(worlds):
+            continue
+        sample = batch.sample.select(worlds)
+        some = [{name: values[worlds] for name, values in state.items()} for state in states]
+        for one in invariants:
+            asked = one.without == without and steps_for(one.claim, batch.steps) <= batch.steps
+            if asked and look(one.claim, sim.ruleset, sample, some).first.any():
+                return one
+    return None
+
+
+def same_state(first: Ruleset, second: Ruleset) -> bool:
+    """Whether worlds of one composition hold what worlds of the other hold."""
+    from powderdsl.model.state import slots
+
+    return slots(first) == slots(second) and [p.name for p in first.params] == [p.name for p in second.params]
+
+
+def differing(first: list[State], second: list[State]) -> np.ndarray:
+    """bool [B]: worlds that differ after some step."""
+    wrong = np.zeros(len(first[0]["element"]), bool)
+    for one, other in zip(first[1:], second[1:], strict=True):
+        for name, values in one.items():
+            wrong |= (values != other[name]).reshape(len(wrong), -1).any(1)
+    return wrong

@@ -1,0 +1,88 @@
+"""`powderdsl test --mutate`: mistakes in packs, what notices them, and tests for those that nothing notices."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+import powderdsl as package
+from powderdsl.compiler import shipped
+from powderdsl.mutation.mutation_run import sampled
+from powderdsl.mutation.original import Original
+from tests.cli.commands import powderdsl
+
+PACK = """\
+pack: spread  # where it goes
+elements:
+  dry: {id: 0, color: "#101010", glyph: "."}
+  wet: {id: 1, color: "#202020", glyph: w}
+passes:
+  spread:
+    do: dry -> wet if left is wet  # to the right
+tests:
+  # the only one
+  - two dry cells stay dry:
+      given: . .
+      after: 2 steps
+      expect: . .
+
+# the end
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "spread.yaml").write_text(PACK)
+    return tmp_path
+
+
+def mutate(*arguments):
+    return powderdsl("test", "--mutate", "--jobs", "1", *arguments)
+
+
+def test_survivors_are_listed_with_a_test_to_paste(folder):
+    result = mutate("spread.yaml")
+    assert result.exit_code == 1
+    assert "survived  spread.yaml:7:23: neighbor" in result.stdout
+    assert "- generated " in result.stdout
+
+
+def test_written_tests_pass_and_notice_what_survived_before(folder):
+    before = json.loads(mutate("spread.yaml", "--json").stdout)["spread.yaml"]
+    assert before["survived"] > 0
+    mutate("spread.yaml", "--write")
+    text = (folder / "spread.yaml").read_text()
+    assert text.startswith(PACK.partition("\n# the end")[0])
+    assert text.endswith("# the end\n")
+    rules = package.load("spread.yaml")
+    assert len(rules.tests) > 1
+    assert powderdsl("test", "spread.yaml", "--no-keep", "--examples", "10", "--drawn", "0").exit_code == 0
+    after = json.loads(mutate("spread.yaml", "--json").stdout)["spread.yaml"]
+    assert after["mutants"] == before["mutants"]
+    assert after["survived"] == 0
+    assert after["generated"] >= before["survived"]
+
+
+def test_mutants_of_a_shipped_pack_are_noticed(folder):
+    shutil.copy(shipped("rules") / "wireworld.yaml", folder)
+    found = json.loads(mutate("wireworld.yaml", "--json", "--mutants", "12").stdout)["wireworld.yaml"]
+    assert found["mutants"] == 12
+    assert found["killed"] + found["survived"] + found["equivalent"] == 12
+    assert found["killed"] >= 8
+
+
+def test_a_sample_is_in_proportion_and_the_same_again():
+    mutants = Original.of("life").mutants()
+    some = sampled(mutants, 20, 3)
+    assert some == sampled(mutants, 20, 3) != sampled(mutants, 20, 4)
+    assert len(set(some)) == 20
+    assert len({mutants[number].operator for number in some}) >= 6
+
+
+def test_an_unknown_pack_is_refused(folder):
+    result = mutate("spread.yaml", "--pack", "nowhere")
+    assert result.exit_code == 2
+    assert "spread" in result.stderr
