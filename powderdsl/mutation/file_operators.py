@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.declarations import PackDecl
+from powderdsl.mutation.exchangeable import Names, names_of
 from powderdsl.mutation.line_operators import chance_changes, kind_changes, line_changes
 from powderdsl.mutation.mutants import Change, Edit, Mutant
-from powderdsl.mutation.names import Names, names_of
 from powderdsl.mutation.removal import Path, inserted, lines_of, removed, without_action
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar

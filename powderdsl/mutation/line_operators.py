@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator
 
 from powderdsl.model.builtins import DIRECTION_SETS
+from powderdsl.mutation.exchangeable import Names
 from powderdsl.mutation.mutants import Change, Edit
-from powderdsl.mutation.names import Names
 from powderdsl.syntax.ast import Syntax
 
 PLACES = {
