@@ -331,7 +331,7 @@ def _default(slot: Slot, like: Array) -> Array:
 
 
 def _where(mask: Array, yes: Array, no: Array) -> Array:
-    return np.where(mask[:, None] if yes.ndim == 4 else mask, yes, no)
+    return np.where(mask[:, None] if no.ndim == 4 else mask, yes, no)
 
 
 def _become(target: Array, mask: Array, state: State, at: Context, table: Mapping[str, Slot]) -> None:
@@ -349,6 +349,9 @@ def _become(target: Array, mask: Array, state: State, at: Context, table: Mappin
             fresh = fresh.astype(state[name].dtype)
         else:
             fresh = _default(slot, state[name])
+            for identity, value in slot.own:
+                own = np.asarray(value, fresh.dtype)
+                fresh = _where(target == identity, own[:, None, None] if slot.planes == 2 else own, fresh)
         state[name] = _where(mask, fresh, state[name])
 
 

@@ -168,10 +168,9 @@ class Simulator:
         dtype = getattr(torch, slot.dtype)
         if prop is not None:
             return self.observer.table(prop.name)[ids.long()].to(dtype)
-        if slot.planes == 2:
-            default = torch.tensor(slot.default, dtype=dtype, device=self.device)
-            return default[None, :, None, None].expand(len(ids), 2, *ids.shape[1:]).clone()
-        return torch.full(ids.shape, slot.default, dtype=dtype, device=self.device)
+        values = torch.tensor([slot.fresh(i) for i in range(256)], dtype=dtype, device=self.device)
+        fresh = values[ids.int()]
+        return fresh.movedim(-1, 1).contiguous() if slot.planes == 2 else fresh
 
     def _tensor(self, value: Any, name: str) -> Tensor:
         flags = getattr(value, "flags", None)

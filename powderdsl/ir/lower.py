@@ -189,8 +189,11 @@ class _PassLowering:
                 continue
             defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
             type = plane_type(slot.kind, self.ruleset.slots)
-            for name, default in zip(plane_names(slot), defaults, strict=True):
-                found[name] = build.const(default, type)
+            for part, (name, default) in enumerate(zip(plane_names(slot), defaults, strict=True)):
+                values = [build.const(default, type)] * self.ruleset.slots
+                for identity, own in slot.own:
+                    values[identity] = build.const(own[part] if isinstance(own, tuple) else own, type)
+                found[name] = at.by_element(element, values)
         return found
 
     def _apply_policy(self, policy: str, movers: list[Mover], masks: dict[int, Node]) -> None:

@@ -84,7 +84,7 @@ def named_by_fields(ruleset: Ruleset) -> Ids:
     """The ids that a field or a value under `let` may name although no cell ever held them."""
     found: set[int] = set()
     fields = [*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)]
-    found |= {int(item.default) for item in fields if item.kind == ELEMENT}
+    found |= {int(value) for item in fields if item.kind == ELEMENT for value in item.defaults}
     for pass_ in ruleset.passes:
         for moment in pass_.moments:
             values = [let.value for let in moment.lets]

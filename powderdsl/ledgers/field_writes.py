@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from powderdsl.ledgers.changes import Found, RuleLine
-from powderdsl.model.text import show_value
+from powderdsl.model.text import element_name, show_value
 from powderdsl.model.types import Assign, Kind, Ruleset
 
 Bounds = tuple[float, float]
@@ -41,7 +41,9 @@ def find_fields(ruleset: Ruleset, found: Iterable[Found]) -> tuple[FieldEntry, .
     entries = []
     for item in (*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)):
         default = show_value(ruleset, item.kind, item.default)
-        fresh = (item.default, item.default) if item.kind.name == "int" else None
+        for identity, value in item.own:
+            default += f", {element_name(ruleset, identity)} as {show_value(ruleset, item.kind, value)}"
+        fresh = (min(item.defaults), max(item.defaults)) if item.kind.name == "int" else None
         entries.append(
             _entry(item.name, item.kind, default, item.at == "element", fresh, writes.get(item.name, []))
         )

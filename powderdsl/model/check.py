@@ -13,6 +13,7 @@ from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
 from powderdsl.model.expressions import Typer
+from powderdsl.model.field_values import add_field_values, unknown_element_key
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.layout import matrix_channels, state_order
 from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
@@ -55,6 +56,7 @@ def resolve_names(
     _params(symbols, typer)
     _properties(symbols, typer)
     _fields(symbols, typer)
+    add_field_values(symbols, typer)
     given = _property_values(symbols, typer)
     _sets(typer)
     return typer, given
@@ -216,7 +218,7 @@ def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Spa
             name = composition.names.of(pack_name, key.text.removesuffix("?"))
             if name in composition.properties:
                 given[(name, element)] = (syntax, pack_name)
-            elif not key.text.endswith("?"):
+            elif name not in composition.fields and not key.text.endswith("?"):
                 typer.reporter.error(
                     "PD108",
                     f"unknown property `{name}`",
@@ -225,7 +227,15 @@ def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Spa
                     helps=[
                         *suggest(
                             name,
-                            [*composition.properties, "id", "color", "glyph", "about", "tags"],
+                            [
+                                *composition.properties,
+                                *composition.fields,
+                                "id",
+                                "color",
+                                "glyph",
+                                "about",
+                                "tags",
+                            ],
                             "properties",
                         ),
                         f"if its pack may be absent, write `{name}?`",
@@ -238,15 +248,7 @@ def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Spa
             if found is not None:
                 given[(name, found)] = (syntax, named.pack)
             elif not key.text.endswith("?"):
-                typer.reporter.error(
-                    "PD301",
-                    f"unknown element `{word}`",
-                    key.span,
-                    helps=[
-                        *suggest(word, composition.elements, "elements"),
-                        f"if its pack may be absent, write `{word}?`",
-                    ],
-                )
+                unknown_element_key(key, "property", f"the property `{name}`", symbols, typer)
         if name in symbols.properties:
             prop = symbols.properties[name]
             symbols.properties[name] = replace(

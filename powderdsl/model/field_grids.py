@@ -26,9 +26,11 @@ class GridReader:
         self.typer = typer
         self.pack = pack
         self.legend = legend
-        elements = typer.symbols.composition.elements
+        elements, names = typer.symbols.composition.elements, typer.symbols.composition.names
         self.ids = {element.qualified: element.id for element in elements.values()}
         self.ids |= {name: element.id for name, element in elements.items()}
+        own = {word: name for (where, word), name in names.meanings.items() if where == pack}
+        self.ids |= {word: elements[name].id for word, name in own.items() if name in elements}
         self.ids |= {character: elements[name].id for character, name in legend.items()}
 
     def read(
@@ -78,11 +80,15 @@ class GridReader:
             self._check_holders(key, cells, given, places, everywhere)
         if everywhere:
             cells = [tuple(cells[0][0] for _ in line) for line in given]
-        return FieldGrid(key.text.removesuffix("?"), tuple(cells), everywhere, key.span)
+        return FieldGrid(self._name(key), tuple(cells), everywhere, key.span)
+
+    def _name(self, key: Scalar) -> str:
+        """The field's name in all packs."""
+        return self.typer.symbols.composition.names.of(self.pack, key.text.removesuffix("?"))
 
     def _kind(self, key: Scalar) -> Kind:
         symbols = self.typer.symbols
-        name = key.text.removesuffix("?")
+        name = self._name(key)
         if name in symbols.fields:
             return symbols.fields[name].kind
         if name in symbols.properties:
@@ -94,7 +100,7 @@ class GridReader:
             )
         if symbols.is_declared(name, self.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
-        if name != key.text:
+        if key.text.endswith("?"):
             raise Asleep(name)  # the test waits for the pack that declares it
         helps = (
             *suggest(name, [*symbols.fields, *symbols.properties], "fields"),
@@ -136,7 +142,7 @@ class GridReader:
     ) -> None:
         """Refuse a value in a cell whose element does not have the field."""
         symbols = self.typer.symbols
-        field = symbols.fields.get(key.text.removesuffix("?"))
+        field = symbols.fields.get(self._name(key))
         if everywhere or field is None or field.of is None:
             return
         at = 0

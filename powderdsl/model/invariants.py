@@ -208,11 +208,14 @@ def _stays(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     lo, hi = read_bounds(bounds, typer)
     name = str(operand.value)
     field = typer.symbols.fields.get(name)
-    default = field.default if field is not None else None
-    parts = default if isinstance(default, tuple) else () if default is None else (default,)
     outside = hi < operand.kind.lo or lo > operand.kind.hi
-    if outside or any(not lo <= part <= hi for part in parts):
-        found = f"`{name}` holds {operand.kind}" if outside else f"a fresh cell has {default}"
+    beyond = [
+        value
+        for value in (field.defaults if field is not None else ())
+        if any(not lo <= part <= hi for part in (value if isinstance(value, tuple) else (value,)))
+    ]
+    if outside or beyond:
+        found = f"`{name}` holds {operand.kind}" if outside else f"a fresh cell has {beyond[0]}"
         raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, ("widen the bounds",))
     return Bounded(name, lo, hi)
 

@@ -186,6 +186,7 @@ class _PackReader(Reader):
             at,
             self.entry_line(entries, "of"),
             resets,
+            values=self.open_values(entries, "field"),
             about=self.text(entries, "about"),
         )
 

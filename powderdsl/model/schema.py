@@ -46,7 +46,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "kernels": Key("mapping", "neighbourhoods for `count` and `sum`"),
         "sets": Key("mapping", "names for sets of elements"),
         "elements": Key("mapping", "the pack's elements"),
-        "also": Key("mapping", "tags and property values for elements of other packs"),
+        "also": Key("mapping", "tags and values for elements of other packs"),
         "passes": Key("mapping", "what happens in a step"),
         "invariants": Key("statements", "what is true of every world, a statement a line"),
         "tests": Key("list", "small worlds, and what becomes of them"),
@@ -69,7 +69,7 @@ KEYS: dict[str, dict[str, Key]] = {
     "field": {
         "type": Key("line", "its kind", True),
         "at": Key("word", "`element`: it travels with it; `place`: it stays", True),
-        "default": Key("line", "its value in a fresh cell"),
+        "default": Key("line", "its value in a fresh cell; that of one element beside it, by its name"),
         "of": Key("line", "the elements that have it; others read the default"),
         "resets": Key("word", "`step`: back to the default when a step starts"),
         "about": Key("text", "what it is, in a sentence"),
@@ -116,7 +116,12 @@ KEYS: dict[str, dict[str, Key]] = {
     },
 }
 
-OPEN = {"element": "a property", "also": "a property", "property": "an element"}
+OPEN = {
+    "element": "a property or field",
+    "also": "a property or field",
+    "property": "an element",
+    "field": "an element",
+}
 """Mappings that take further keys, and what those name."""
 
 VALUES = ("word", "number", "flag", "line")

@@ -28,6 +28,12 @@ class Slot:
     of: frozenset[int] | None
     dtype: str
     planes: int
+    own: tuple[tuple[int, Any], ...] = ()
+    """Defaults of single elements, by id."""
+
+    def fresh(self, identity: int) -> Any:
+        """The value of a fresh cell of an element, of a field."""
+        return dict(self.own).get(identity, self.default)
 
     @property
     def is_real(self) -> bool:
@@ -64,6 +70,7 @@ def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
                 item.of,
                 storage(item.kind),
                 planes,
+                item.own,
             )
         )
     place = {name: number for number, name in enumerate(ruleset.order)}

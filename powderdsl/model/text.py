@@ -163,7 +163,11 @@ class _Printer:
         default = show_value(self.ruleset, item.kind, item.default)
         of = f" of {show_set(self.ruleset, item.of)}" if item.of is not None else ""
         resets = " resets step" if item.resets else ""
-        return f"{item.name} {item.kind} at {item.at}{of} default {default}{resets}"
+        own = "".join(
+            f", {element_name(self.ruleset, identity)} {show_value(self.ruleset, item.kind, value)}"
+            for identity, value in item.own
+        )
+        return f"{item.name} {item.kind} at {item.at}{of} default {default}{own}{resets}"
 
     def kernel_lines(self) -> list[str]:
         lines = []

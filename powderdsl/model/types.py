@@ -148,7 +148,10 @@ class Property:
 
 @dataclass(frozen=True)
 class Field:
-    """State of a cell. `at` is ``element`` (travels with it) or ``place``; `of` limits it to some elements."""
+    """State of a cell. `at` is ``element`` (travels with it) or ``place``; `of` limits it to some elements.
+
+    `own` are the defaults of single elements, by id, in the order of ids.
+    """
 
     name: str
     kind: Kind
@@ -158,6 +161,12 @@ class Field:
     of: frozenset[int] | None
     pack: str
     span: Span = field(compare=False, repr=False)
+    own: tuple[tuple[int, Any], ...] = ()
+
+    @property
+    def defaults(self) -> tuple[Any, ...]:
+        """All values that a fresh cell may have."""
+        return (self.default, *(value for _, value in self.own))
 
 
 @dataclass(frozen=True)

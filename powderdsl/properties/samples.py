@@ -125,11 +125,8 @@ def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
         table = np.zeros(256, slot.dtype)
         table[: len(prop.values)] = [defaults[v] if isinstance(v, str) else v for v in prop.values]
         return table[ids]
-    if slot.planes == 2:
-        row, column = slot.default
-        parts = [np.full(ids.shape, part, np.float32) for part in (row, column)]
-        return np.stack(parts, 1)
-    return np.full(ids.shape, slot.default, slot.dtype)
+    values = np.array([slot.fresh(identity) for identity in range(256)], slot.dtype)[ids]
+    return np.moveaxis(values, -1, 1) if slot.planes == 2 else values
 
 
 def holders(ruleset: Ruleset, slot: Slot) -> frozenset[int] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,11 +50,9 @@ class Hands:
                 self._fresh[slot.name] = table
         self._slots = sim.slots
         self._differing = {
-            name: table
-            for name, table in self._fresh.items()
-            if table.ndim == 1 and bool((table != table[0]).any())
+            name: table for name, table in self._fresh.items() if bool((table != table[0]).any())
         }
-        """Properties that cells may override: those of new cells hang on their element."""
+        """What new cells have by their element: properties that cells may override, fields with defaults by element."""
 
     def _lines(self, axis: int) -> tuple[Tensor, Tensor]:
         """The rows (or columns) of the brush at each bin, int64 [bins, brush] within the grid, and whether they lie there.
@@ -77,18 +76,20 @@ class Hands:
         for slot in self._slots:
             if slot.name != "element":
                 by_id = self._differing.get(slot.name)
-                state[slot.name] = self._usual(slot, len(ids)) if by_id is None else by_id[ids.int()]
+                if by_id is None:
+                    state[slot.name] = self._usual(slot, len(ids))
+                else:
+                    new = by_id[ids.int()]
+                    state[slot.name] = new.movedim(-1, 1).contiguous() if slot.planes == 2 else new
         return state
 
     def _usual(self, slot: Slot, batch: int) -> Tensor:
         """A slot that is the same in all cells."""
         dtype = getattr(torch, slot.dtype)
+        default: Any = self._fresh[slot.name][0].tolist() if slot.name in self._fresh else slot.default
         if slot.planes == 2:
-            value = torch.tensor(slot.default, dtype=dtype, device=self.device)[:, None, None]
+            value = torch.tensor(default, dtype=dtype, device=self.device)[:, None, None]
             return value.repeat(batch, 1, *self.size)
-        default = (
-            int(self._fresh[slot.name][0]) if slot.name in self._fresh and not slot.is_real else slot.default
-        )
         return torch.full((batch, *self.size), default, dtype=dtype, device=self.device)
 
     def act(self, world: World, actions: Tensor, *, reuse: bool) -> Done:

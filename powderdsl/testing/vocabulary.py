@@ -139,22 +139,30 @@ def _fields(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
         kind = choices.weighted([(4, some_range(choices)), (3, FLAG), (2, ELEMENT), (2, DIRECTION), *floats])
         words.fields[name] = kind
         entry: dict[str, Tree] = {"type": str(kind), "at": choices.pick(["element", "place"])}
-        if kind == ELEMENT:
-            entry["default"] = choices.pick(words.elements)
-        elif kind.name != "vec2" and choices.maybe(40):
-            entry["default"] = _constant(choices, kind)
-        elif kind.name == "vec2" and choices.maybe(30):
-            entry["default"] = (
-                f"vector({choices.pick(['0', '1', '-0.5'])}, {choices.pick(['0', '-2', '0.25'])})"
-            )
+        if kind == ELEMENT or choices.maybe(30 if kind.name == "vec2" else 40):
+            entry["default"] = _default(choices, words, kind)
+        holders = words.elements
         if entry["at"] == "element" and choices.maybe(40):
-            entry["of"] = choices.weighted(
-                [(3, choices.pick(words.elements)), (1, f"any but {choices.pick(words.elements)}")]
-            )
+            one = choices.pick(words.elements)
+            inside = choices.maybe(75)
+            entry["of"] = one if inside else f"any but {one}"
+            holders = [name for name in words.elements if (name == one) == inside]
         if choices.maybe(20):
             entry["resets"] = "step"
+        elif entry["at"] == "element" and choices.maybe(40):
+            some = choices.some(holders, 0, 3)
+            entry |= {name: _default(choices, words, kind) for name in some}
         section[name] = entry
     return section
+
+
+def _default(choices: Choices, words: Words, kind: Kind) -> str:
+    """What a fresh cell may have of a field."""
+    if kind == ELEMENT:
+        return choices.pick(words.elements)
+    if kind.name == "vec2":
+        return f"vector({choices.pick(['0', '1', '-0.5'])}, {choices.pick(['0', '-2', '0.25'])})"
+    return _constant(choices, kind)
 
 
 def _streams(choices: Choices, words: Words, manner: Manner) -> Tree:

@@ -176,6 +176,6 @@ def _fresh(scene: Scene, slot: Slot, identity: int) -> Any:
         return np.asarray(identity, dtype)[()]
     prop = scene.ruleset.property(slot.name)
     if prop is None:
-        return np.asarray(slot.default, dtype)[()]
+        return np.asarray(slot.fresh(identity), dtype)[()]
     value = prop.values[identity]
     return np.asarray(scene.at.params[value][0] if isinstance(value, str) else value, dtype)[()]
