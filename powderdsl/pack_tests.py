@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from powderdsl import reference
 from powderdsl.draw import to_numpy
-from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Ruleset
+from powderdsl.pack_test_chances import chance_problem, world_context
 from powderdsl.pack_test_fields import described, field_rows, unlike, with_fields
 from powderdsl.simulator import compile
 
@@ -61,7 +61,8 @@ def run_examples(
     """Run every test of a ruleset's packs, in the order of the files.
 
     A test runs with its own seed, or with each of SEEDS. It passes if the last world looks as `expect` says, its
-    fields hold what `expect_fields` says, and every condition under `always` holds in every cell after every step. Tests of one size run as one batch.
+    fields hold what `expect_fields` says, every condition under `always` holds in every cell after every step, and
+    what `often` says happens about as often. Tests of one size run as one batch.
 
     Args:
         sim: what runs them, instead of a new simulator of this ruleset.
@@ -101,7 +102,7 @@ class _Running:
         """What is wrong after a step; `world` holds this test's worlds alone."""
         example, sim = self.example, world.sim
         for condition in example.always if step else ():
-            holds = reference.evaluate(condition, _context(world))
+            holds = reference.evaluate(condition, world_context(world))
             if not holds.all():
                 index, row, column = (int(part[0]) for part in np.nonzero(~holds))
                 words = one_line(condition.span) if condition.span else "a condition"
@@ -151,6 +152,13 @@ def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | 
                 results[number] = problem
     if seen is not None:
         seen(world)
+    for number, one in enumerate(batch):
+        if one.example.often and number not in results:
+            seed = one.seeds[0]
+            start = with_fields(sim.world(grids[number][None], seed=seed), [one.example])
+            problem_of = chance_problem(start, one.example.steps, one.example.often, seed)
+            if problem_of:
+                results[number] = ExampleResult(one.example, one.seeds, problem_of, seed, one.example.steps)
     return [results.get(number, ExampleResult(one.example, one.seeds)) for number, one in enumerate(batch)]
 
 
@@ -192,20 +200,3 @@ def _id(ruleset: Ruleset, name: str) -> int:
 
 def _name(ruleset: Ruleset, number: int) -> str:
     return next(element.name for element in ruleset.elements if element.id == number)
-
-
-def _context(world: World) -> reference.Context:
-    """What a condition reads of a world: its state as the oracle holds it, parameters, the clock."""
-    ruleset = world.sim.ruleset
-    wide: dict[str, type] = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
-    state: reference.State = {
-        slot.name: to_numpy(world.state[slot.name]).astype(wide.get(slot.kind.name, np.int64))
-        for slot in slots(ruleset)
-    }
-    dtypes: dict[str, type] = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
-    params: dict[str, reference.Array] = {
-        param.name: np.full(len(world), float(param.default), dtypes[param.kind.name])
-        for param in ruleset.params
-    }
-    clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
-    return reference.Context(ruleset, state, params, {}, clock)

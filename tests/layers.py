@@ -9,7 +9,7 @@ _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
 _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
-_TESTING = (*_SCREEN, "ledgers", "pack_test_fields", "pack_tests", "testing")
+_TESTING = (*_SCREEN, "ledgers", "pack_test_fields", "pack_test_chances", "pack_tests", "testing")
 _AFTER = ("bench", "tasks", "envs", "runs", "datasets", "rl", "worldmodel", "studies", "web", "cli")
 _EVERYTHING = (*_TESTING, "properties", "mutation", "pytest_plugin", *_AFTER)
 
@@ -40,7 +40,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "media": _SCREEN[: _SCREEN.index("media")],
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
     "pack_test_fields": _SCREEN,
-    "pack_tests": (*_SCREEN, "pack_test_fields"),
+    "pack_test_chances": _SCREEN,
+    "pack_tests": (*_SCREEN, "pack_test_fields", "pack_test_chances"),
     "testing": (*_SCREEN, "ledgers", "pack_tests", "scratch"),
     "properties": (*_TESTING, "user_cache"),
     "mutation": (*_TESTING, "properties"),

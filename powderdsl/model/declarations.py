@@ -91,6 +91,8 @@ class TestDecl:
     seed: int | None
     fields: tuple[tuple[Scalar, Scalar], ...] = ()
     expect_fields: tuple[tuple[Scalar, Scalar], ...] = ()
+    often: tuple[tuple[Syntax, Syntax], ...] = ()
+    """What becomes of cells, as `before -> after`, and how likely."""
 
 
 @dataclass(frozen=True)

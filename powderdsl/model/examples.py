@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.compose import Composition
+from powderdsl.model.constants import constant_of
 from powderdsl.model.declarations import TestDecl
 from powderdsl.model.expressions import Typer
 from powderdsl.model.field_grids import GridReader
 from powderdsl.model.operands import Asleep, Poisoned
 from powderdsl.model.scope import Scope
-from powderdsl.model.types import Example, Expr, Kernel, Property
+from powderdsl.model.types import CHANCE, Example, Expr, Kernel, Often, Property
+from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_SIDE = 64
@@ -68,12 +71,12 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
     reader = GridReader(typer, pack, legend)
     fields = reader.read(decl.fields, given, expected=False)
     expect_fields = reader.read(decl.expect_fields, given, expected=True)
-    if expect is None and not expect_fields and not decl.always:
+    if expect is None and not expect_fields and not decl.always and not decl.often:
         raise typer.fail(
             "PD109",
             f"the test `{decl.name}` checks nothing",
             decl.scalar.span,
-            "`expect`, `expect_fields` or `always` is missing",
+            "`expect`, `expect_fields`, `always` or `often` is missing",
         )
     scope = Scope(pack, {"world": _whole_world(len(given), len(given[0]))})
     always: list[Expr] = [typer.condition(syntax, scope) for syntax in decl.always]
@@ -89,7 +92,13 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         decl.seed,
         fields,
         expect_fields,
+        tuple(_often(change, chance, scope, typer) for change, chance in decl.often),
     )
+
+
+def _often(change: Syntax, chance: Syntax, scope: Scope, typer: Typer) -> Often:
+    before, after = (typer.condition(part, scope) for part in change.children)
+    return Often(before, after, Fraction(constant_of(chance, CHANCE, scope, typer)), change.span)  # type: ignore[arg-type]
 
 
 def check_assigned(

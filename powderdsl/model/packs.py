@@ -429,7 +429,31 @@ class _PackReader(Reader):
             self.number(entries, "seed", 0, 2**31 - 1),
             self.drawn(entries, "fields"),
             self.drawn(entries, "expect_fields"),
+            self.often(entries.get("often", (None, None))[1]),
         )
+
+    def often(self, node: Node | None) -> tuple[tuple[Syntax, Syntax], ...]:
+        """`before -> after: CHANCE`, in one mapping or a list of them."""
+        if node is None:
+            return ()
+        parts = node.items if isinstance(node, Sequence) else (node,)
+        found = []
+        for part in parts:
+            if not isinstance(part, Mapping):
+                self.shape(part, "a mapping from changes to chances", "write `ice -> water: 2%`")
+                continue
+            for key, value in part.entries:
+                change, chance = self.line(key, "rule"), self.line(value)
+                if change is None or chance is None:
+                    continue
+                if change.kind == "transform" and len(change.children) == 2:
+                    found.append((change, chance))
+                    continue
+                self.reporter.error(
+                    "PD110", "`often` says what becomes of cells", key.span, "not of the form `A -> B`",
+                    helps=["write what holds in a cell before and after: `ice -> water: 2%`"],
+                )  # fmt: skip
+        return tuple(found)
 
     def drawn(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> tuple[tuple[Scalar, Scalar], ...]:
         """Drawings by a field's name."""

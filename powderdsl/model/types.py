@@ -304,6 +304,16 @@ class FieldGrid:
 
 
 @dataclass(frozen=True)
+class Often:
+    """Of the cells for which `before` holds at the start, `after` holds in such a part in the end."""
+
+    before: Expr
+    after: Expr
+    chance: Fraction
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
 class Example:
     """A test of a pack: a world drawn in ASCII, and what it must look like some steps later."""
 
@@ -319,6 +329,7 @@ class Example:
     fields: tuple[FieldGrid, ...] = ()
     """Values that the start world has beside its elements."""
     expect_fields: tuple[FieldGrid, ...] = ()
+    often: tuple[Often, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,112 @@
+"""`often`: chances that tests of packs claim, and how sharply counts judge them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+import powderdsl
+from powderdsl.diagnostics import CompileError
+from powderdsl.pack_test_chances import ERROR_RATE, OFF, divergence, is_unlikely, trials_for
+from powderdsl.pack_tests import run_examples
+
+PACK = """\
+pack: coins
+params: {melt: 2%}
+elements:
+  floor: {id: 0, color: "#101010", glyph: "."}
+  coin: {id: 1, color: "#202020", glyph: c}
+  gold: {id: 2, color: "#303030", glyph: g}
+passes:
+  melt:
+    do: coin -> gold with chance melt
+tests:
+  - coins melt:
+      given: |
+        . c .
+        c . c
+      after: STEPS
+      often: {coin -> gold: CHANCE}
+"""
+
+
+def problem(tmp_path, chance: str, melt: float = 0.02, steps: str = "1 step", text: str = PACK) -> str:
+    path = tmp_path / "coins.yaml"
+    path.write_text(text.replace("CHANCE", chance).replace("STEPS", steps))
+    (result,) = run_examples(powderdsl.load(str(path), params={"coins.melt": melt}))
+    return result.problem
+
+
+@pytest.mark.parametrize("chance", ["2%", "0.02", "1 - 0.98"])
+def test_a_true_claim_holds(tmp_path, chance):
+    assert problem(tmp_path, chance) == ""
+
+
+def test_steps_add_up(tmp_path):
+    assert problem(tmp_path, "1 - 0.98 * 0.98 * 0.98", steps="3 steps") == ""
+
+
+@pytest.mark.parametrize("melt", [0.2, 0.002, 0.03, 0.025, 0.015, 0.0, 1.0])
+def test_another_chance_is_noticed(tmp_path, melt):
+    assert "not 2 %" in problem(tmp_path, "2%", melt)
+
+
+@pytest.mark.parametrize(("claim", "melt"), [("0%", 0.001), ("100%", 0.999)])
+def test_what_is_said_to_be_sure_must_be(tmp_path, claim, melt):
+    assert problem(tmp_path, claim, float(claim.rstrip("%")) / 100) == ""
+    assert problem(tmp_path, claim, melt)
+
+
+def test_a_claim_about_nothing_fails(tmp_path):
+    text = PACK.replace("coin -> gold: CHANCE", "gold -> coin: CHANCE")
+    assert "no cell of the start world" in problem(tmp_path, "2%", text=text)
+
+
+def test_the_same_rules_give_the_same_count(tmp_path):
+    assert problem(tmp_path, "2%", 0.05) == problem(tmp_path, "2%", 0.05)
+
+
+@pytest.mark.parametrize("chance", [0.001, 0.02, 0.3, 0.5, 0.9])
+def test_the_error_rate_is_as_stated(chance):
+    """The exact tails of the binomial distribution, for the true chance and for one that is off."""
+    trials = trials_for(chance)
+    off = OFF * min(chance, 1 - chance)
+    assert tail_of_rejection(trials, chance, chance) < ERROR_RATE
+    for other in (chance + off, chance - off):
+        assert 1 - tail_of_rejection(trials, chance, other) < ERROR_RATE
+
+
+def tail_of_rejection(trials: int, claimed: float, true: float) -> float:
+    """How likely a count that follows `true` is judged not to follow `claimed`."""
+    inside = [hits for hits in range(trials + 1) if not is_unlikely(hits, trials, claimed)]
+    low, high = min(inside), max(inside)
+    logs = [
+        math.lgamma(trials + 1) - math.lgamma(k + 1) - math.lgamma(trials - k + 1)
+        + k * math.log(true) + (trials - k) * math.log(1 - true)
+        for k in range(low, high + 1)
+    ]  # fmt: skip
+    return 1 - math.fsum(math.exp(one) for one in logs)
+
+
+def test_divergence_is_zero_only_for_the_same_chance():
+    assert divergence(0.3, 0.3) == 0
+    assert divergence(0.31, 0.3) > 0
+    assert divergence(0.1, 0.0) == math.inf
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "code"),
+    [
+        ("{coin -> gold: CHANCE}", "{coin -> gold: 120%}", "PD403"),
+        ("{coin -> gold: CHANCE}", "{coin -> gold: melt}", "PD405"),
+        ("{coin -> gold: CHANCE}", "{coin -> silver: 2%}", "PD301"),
+        ("{coin -> gold: CHANCE}", "{coin: 2%}", "PD201"),
+        ("{coin -> gold: CHANCE}", '{"coin -> gold if floor": 2%}', "PD110"),
+        ("{coin -> gold: CHANCE}", "2%", "PD107"),
+    ],
+)
+def test_mistakes_are_explained(tmp_path, before, after, code):
+    with pytest.raises(CompileError) as error:
+        problem(tmp_path, "2%", text=PACK.replace(before, after))
+    assert [one.code for one in error.value.diagnostics] == [code]
