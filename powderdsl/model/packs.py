@@ -440,7 +440,7 @@ class _PackReader(Reader):
         found = []
         for part in parts:
             if not isinstance(part, Mapping):
-                self.shape(part, "a mapping from changes to chances", "write `ice -> water: 2%`")
+                self.shape(part, "a mapping from changes to chances", "write `egg -> hen: 2%`")
                 continue
             for key, value in part.entries:
                 change, chance = self.line(key, "rule"), self.line(value)
@@ -451,7 +451,7 @@ class _PackReader(Reader):
                     continue
                 self.reporter.error(
                     "PD110", "`often` says what becomes of cells", key.span, "not of the form `A -> B`",
-                    helps=["write what holds in a cell before and after: `ice -> water: 2%`"],
+                    helps=["write what holds in a cell before and after: `egg -> hen: 2%`"],
                 )  # fmt: skip
         return tuple(found)
 

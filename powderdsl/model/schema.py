@@ -112,7 +112,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "expect": Key("text", "what the world looks like then; `?` matches anything"),
         "expect_fields": Key("mapping", "values of fields then; `?` matches anything, `LOW..HIGH` a range"),
         "always": Key("any", "conditions that hold in every cell after every step"),
-        "often": Key("any", "how likely cells become something else: `ice -> water: 2%`"),
+        "often": Key("any", "how likely cells become something else: `egg -> hen: 2%`"),
         "seed": Key("number", "the seed; several are tried without one"),
     },
 }
