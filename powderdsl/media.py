@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from powderdsl.draw import to_numpy
+from powderdsl.interrupts import held_back
 from powderdsl.worlds.files import failure, replacing
 
 MIN_GIF_DELAY = 20
@@ -99,17 +100,20 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
     Not imageio_ffmpeg's own writer, which ignores the exit status: a full disk would leave a broken file.
     """
     with tempfile.TemporaryFile() as log:
-        # A session of its own: Ctrl-C reaches us alone, and we end the encoder.
-        encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
-        assert encoder.stdin is not None
+        encoder = None
         try:
+            # A session of its own: Ctrl-C reaches us alone, and we end the encoder.
+            with held_back():
+                encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
+            assert encoder.stdin is not None
             with suppress(BrokenPipeError), encoder.stdin as pipe:  # the encoder died: its words say why
                 for frame in frames:
                     pipe.write(np.ascontiguousarray(frame).data)
             status = encoder.wait()
         except BaseException:
-            encoder.kill()
-            encoder.wait()
+            if encoder is not None:
+                encoder.kill()
+                encoder.wait()
             raise
         if status != 0:
             log.seek(0)

@@ -17,6 +17,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     # module or pattern: what it may import besides its own package. The longest row that fits counts.
     "user_cache": (),
     "scratch": (),
+    "interrupts": (),
     "diagnostics": (),
     "syntax": ("diagnostics", "user_cache"),
     "model": ("diagnostics", "syntax"),
@@ -25,7 +26,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir": ("diagnostics",),
     "ir.lower*": _MODEL,  # the one door from the model into the IR
     "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
-    "backends": ("diagnostics", "ir", "user_cache", "scratch"),
+    "backends": ("diagnostics", "ir", "user_cache", "scratch", "interrupts"),
     "compiler": _COMPILER[:-1],
     "native_start": _COMPILER,
     "auto_program": _COMPILER,
@@ -37,7 +38,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tracing": (*_MODEL, "reference", "provenance", "simulator"),  # explains by what the oracle does
     "worlds": (*_MODEL, "scratch"),
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
-    "media": _SCREEN[: _SCREEN.index("media")],
+    "media": (*_SCREEN[: _SCREEN.index("media")], "interrupts"),
     "terminal": _SCREEN[: _SCREEN.index("terminal")],
     "pack_test_fields": _SCREEN,
     "pack_test_chances": _SCREEN,
@@ -52,10 +53,17 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "runs": ("diagnostics", "worlds", "scratch"),
     "datasets": (*_SCREEN, "tasks", "envs", "runs"),
     "rl": (*_SCREEN, "tasks", "envs", "runs"),
-    "worldmodel": (*_SCREEN, "tasks", "runs"),
-    "studies": (*_MODEL, "compiler", "worlds", "runs", "bench"),  # calls commands, in processes of their own
+    "worldmodel": (*_SCREEN, "tasks", "runs", "interrupts"),
+    "studies": (
+        *_MODEL,
+        "compiler",
+        "worlds",
+        "runs",
+        "bench",
+        "interrupts",
+    ),  # calls commands, in processes of their own
     "web": _SCREEN,
-    "cli": (*_EVERYTHING[:-1], "user_cache", "scratch"),
+    "cli": (*_EVERYTHING[:-1], "user_cache", "scratch", "interrupts"),
     "__init__": _EVERYTHING,  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from powderdsl.backends import compiler_guard, native_cache
 from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for, processor
+from powderdsl.interrupts import held_back
 from powderdsl.scratch import scratch_folder
 from powderdsl.user_cache import cache_folder
 
@@ -134,31 +135,33 @@ def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
     guard = [] if frozen else [sys.executable, "-I", "-S", compiler_guard.__file__]
     # Nothing is ever written: the guard waits until the last process that has our end is gone.
     theirs, ours = os.pipe()
+    process: subprocess.Popen[bytes] | None = None
     try:
-        process = subprocess.Popen(
-            [*guard, *command],
-            stdin=theirs,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
-            start_new_session=True,
-        )
-    except OSError as error:
-        os.close(ours)
-        raise NoCompiler(f"{command[0]} could not be run: {error}") from None
-    finally:
-        os.close(theirs)
-    with _lock:
-        _running[process] = scratch
-    try:
+        with held_back():
+            try:
+                process = subprocess.Popen(
+                    [*guard, *command],
+                    stdin=theirs,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.PIPE,
+                    env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
+                    start_new_session=True,
+                )
+            except OSError as error:
+                raise NoCompiler(f"{command[0]} could not be run: {error}") from None
+            finally:
+                os.close(theirs)
+            with _lock:
+                _running[process] = scratch
         said = process.communicate(timeout=TIMEOUT)[1].decode(errors="replace")
     except subprocess.TimeoutExpired:
         raise NoCompiler(f"{command[0]} took longer than {TIMEOUT} s") from None
     finally:
-        _end(process)
+        if process is not None:
+            _end(process)
+            with _lock:
+                _running.pop(process, None)
         os.close(ours)
-        with _lock:
-            _running.pop(process, None)
     return process.returncode, said
 
 

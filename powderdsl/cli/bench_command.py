@@ -14,7 +14,7 @@ from powderdsl.bench.measure import measure_events
 from powderdsl.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.bench.plot import require_matplotlib, write_plot
 from powderdsl.bench.tables import report_text
-from powderdsl.cli.exits import INTERRUPTED, OK, user_values
+from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules, set_option
 from powderdsl.cli.progress import progress
 from powderdsl.compiler import BACKENDS
@@ -145,13 +145,15 @@ def command(
             rounds=rounds,
             profile=profile,
         )
-    report = _measured(plan)
+    report, interrupt = _measured(plan)
     click.echo(report_text(report))
     if data is not None:
         _write_json(data, report)
     if plot is not None and report.cells:
         write_plot(plot, report)
-    return INTERRUPTED if report.interrupted else OK
+    if interrupt is not None:
+        raise interrupt
+    return OK
 
 
 def _usual_backends(device: str) -> tuple[str, ...]:
@@ -166,11 +168,12 @@ def _usual_backends(device: str) -> tuple[str, ...]:
     return ("torch", "native")
 
 
-def _measured(plan: Plan) -> Report:
-    """The report of a plan, or of as much of it as was done when Ctrl-C came."""
+def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
+    """The report of a plan, or of as much of it as was done when Ctrl-C or another signal came."""
     machine = this_machine(plan.device)
     events: list[Event] = []
-    interrupted, done = False, 0
+    interrupt: KeyboardInterrupt | None = None
+    done = 0
     try:
         with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
             for event in measure_events(plan):
@@ -178,9 +181,10 @@ def _measured(plan: Plan) -> Report:
                 what = event.what if isinstance(event, Started) else "measure"
                 done += not isinstance(event, Started)
                 show(done, f"{what} {event.cell.backend}, batch {event.cell.batch}")
-    except KeyboardInterrupt:
-        interrupted = True
-    return make_report(plan, machine, events, load_average(), interrupted=interrupted)
+    except KeyboardInterrupt as caught:
+        interrupt = caught
+    report = make_report(plan, machine, events, load_average(), interrupted=interrupt is not None)
+    return report, interrupt
 
 
 def _write_json(path: Path, report: Report) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -11,6 +12,7 @@ import click
 
 from powderdsl.cli.exits import report_failure, version
 from powderdsl.diagnostics.printable import printable_streams
+from powderdsl.interrupts import LIFELINE, end_with_stdin, interruptible
 
 COMMANDS: dict[str, tuple[str, str]] = {
     # name: (module in powderdsl.cli, summary)
@@ -69,10 +71,14 @@ class CommandGroup(click.Group):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")
         options["standalone_mode"] = False
-        with printable_streams():
+        if os.environ.get(LIFELINE):
+            end_with_stdin()
+        # Without arguments of a caller's, the command is all that this process does.
+        with printable_streams(), interruptible(until_exit=args is None) as over:
             try:
                 status = super().main(args, prog_name or "powderdsl", *rest, **options)
             except (Exception, KeyboardInterrupt) as error:
+                over()
                 status = report_failure(error)
         sys.exit(status or 0)
 

@@ -10,6 +10,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 import click
 
+from powderdsl.interrupts import Terminated
+
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
 
@@ -20,6 +22,7 @@ BAD_INPUT = 2
 INTERNAL = 70
 """Our own mistake (EX_SOFTWARE of sysexits.h)."""
 INTERRUPTED = 130
+"""Ctrl-C. Other signals that end a command give 128 and their number, as shells have it: 143 for SIGTERM."""
 
 
 class BadInput(click.ClickException):
@@ -75,6 +78,9 @@ def report_failure(error: BaseException) -> int:
         case click.Abort(__cause__=EOFError() as cause):  # click takes it for the end of what somebody types
             _report_internal(cause)
             return INTERNAL
+        case click.Abort(__cause__=Terminated() as ending) | (Terminated() as ending):
+            click.echo(ending, err=True)
+            return 128 + ending.number
         case click.Abort() | KeyboardInterrupt():
             return INTERRUPTED
         case click.ClickException():

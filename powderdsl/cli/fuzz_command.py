@@ -13,6 +13,7 @@ import click
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.options import WholeType
 from powderdsl.cli.progress import progress
+from powderdsl.interrupts import Terminated
 
 if TYPE_CHECKING:
     from powderdsl.testing.campaign import Tally
@@ -172,7 +173,7 @@ def _campaign(
     began = time.monotonic()
     until = began + (seconds if seconds is not None else float("inf"))
     events = run_campaign(plan, tally, iter(left), jobs, folder, until)
-    interrupted = False
+    interrupt: KeyboardInterrupt | None = None
     done = 0
     with progress(_title(seconds), len(left) if seconds is None else None) as show:
         try:
@@ -182,11 +183,13 @@ def _campaign(
                 else:
                     done += 1
                     show(done)
-        except KeyboardInterrupt:
-            interrupted = True
+        except KeyboardInterrupt as caught:
+            interrupt = caught
         finally:
             events.close()  # its processes end, its state is saved
-    _report(plan, tally, folder, time.monotonic() - began, interrupted)
+    _report(plan, tally, folder, time.monotonic() - began, interrupt is not None)
+    if isinstance(interrupt, Terminated):
+        raise interrupt
     return FAILED if tally.files else OK
 
 
@@ -195,7 +198,7 @@ def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted:
 
     names = " and ".join(plan.backends)
     if interrupted:
-        click.echo(f"interrupted; `--resume` goes on from seed {tally.next}")
+        click.echo(f"interrupted; `--resume` continues from seed {tally.next}")
     click.echo(
         f"{tally.rulesets:,} rulesets and {tally.worlds:,} worlds, {counted(plan.steps, 'step')} each, in {seconds:.0f} s: "
         f"{names} against the reference"
@@ -225,6 +228,7 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
     trials = run_trials(iter(wanted), jobs, folder, began + (seconds or float("inf")))
     kinds: Counter[str] = Counter()
     accepted, slowest, largest, found = 0, 0.0, 0.0, []
+    interrupt: KeyboardInterrupt | None = None
     with progress(_title(seconds), len(wanted) if seconds is None else None) as show:
         try:
             for trial in trials:
@@ -235,7 +239,8 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
                 if trial.problem is not None:
                     found.append(trial)
                     click.echo(f"{folder / trial.file_name}: {trial.problem}", err=True)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as caught:
+            interrupt = caught
             click.echo("interrupted")
         finally:
             trials.close()  # its processes end
@@ -247,6 +252,8 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
     for trial in found:
         click.echo(f"powderdsl check {folder / trial.file_name}")
     click.echo(f"{counted(len(found), 'problem')} found")
+    if isinstance(interrupt, Terminated):
+        raise interrupt
     return FAILED if found else OK
 
 

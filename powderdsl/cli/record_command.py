@@ -13,7 +13,6 @@ import click
 
 from powderdsl.cli.exits import (
     BAD_INPUT,
-    INTERRUPTED,
     OK,
     BadInput,
     counted,
@@ -141,7 +140,7 @@ def command(
             )
     except KeyboardInterrupt:
         _say_how_to_go_on(out, episodes)
-        return INTERRUPTED
+        raise
     size = sum(row.bytes for row in dataset.manifest.shards)
     click.echo(
         f"{out}: {counted(len(dataset), 'episode')}, {dataset.steps:,} transitions, "

@@ -96,7 +96,7 @@ def command(
     try:
         outcomes = _with_progress(run, points, jobs)
     except KeyboardInterrupt:
-        click.echo("stopped; the same command goes on from here", err=True)
+        click.echo("interrupted; the same command resumes here", err=True)
         raise
     _report(found, size, folder, outcomes)
     return FAILED if any(one.problem for one in outcomes) else OK

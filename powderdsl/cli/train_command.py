@@ -140,7 +140,7 @@ def command(
 
             run = train(config, folder, progress=tell)
     except KeyboardInterrupt:
-        click.echo(f"\ninterrupted; go on with: powderdsl train --resume {folder}", err=True)
+        click.echo(f"\ninterrupted; resume with: powderdsl train --resume {folder}", err=True)
         raise
     found = run.checkpoint()
     click.echo(f"{folder}: {found.step:,} interactions")

@@ -375,7 +375,7 @@ def _run(config: TrainConfig, folder: Path, values: Mapping[str, Any], **more: A
         try:
             run = train(config, folder, machine=machine, tell=tell, save_seconds=values["save_every"], **more)
         except KeyboardInterrupt:
-            click.echo(f"stopped; the same command goes on with {folder}", err=True)
+            click.echo(f"interrupted; the same command resumes {folder}", err=True)
             raise
     took = time.monotonic() - began
     click.echo(

@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.runs.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from powderdsl.runs.metrics import Metrics
+from powderdsl.scratch import sweep
 from powderdsl.worlds.files import failure, replacing
 
 ABOUT = "run.json"
@@ -118,15 +119,18 @@ def open_run(
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing to a folder.
+def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
+    """Keep other processes from writing to a folder. What killed ones have left there is removed.
+
+    Args:
+        patience: seconds to wait for another process.
 
     Raises:
         CompileError: PD622 if another one does; PD613 if the folder cannot be written to.
     """
     lock = FileLock(folder / ".lock")
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=patience)
     except Timeout:
         raise failure(
             "PD622",
@@ -136,6 +140,9 @@ def held(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
     try:
+        sweep(folder)
+        for inner in folder.iterdir():
+            sweep(inner)
         yield
     finally:
         lock.release()

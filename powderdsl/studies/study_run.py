@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -15,7 +16,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from powderdsl.runs.folder import new_folder, read_json, write_json
+from powderdsl.diagnostics import CompileError
+from powderdsl.interrupts import GRACE, LIFELINE
+from powderdsl.runs.folder import ABOUT, held, new_folder, read_json, write_json
 from powderdsl.studies.study import Measure, Point, Step, Study, filled
 from powderdsl.worlds.files import failure
 
@@ -47,6 +50,8 @@ class StudyRun:
         self.study, self.folder, self.size, self.threads = study, folder, size, threads
         self._stopped = threading.Event()
         self._running: set[subprocess.Popen[bytes]] = set()
+        self._starting = threading.Lock()
+        """Held while a process is started or all are ended: none slips through in between."""
 
     def prepare(self) -> None:
         """Make the folder, or come back to it. Values, seeds and measures may have changed since, but no step.
@@ -75,11 +80,16 @@ class StudyRun:
     def run(
         self, points: Sequence[Point], jobs: int, told: Callable[[Outcome], None] | None = None
     ) -> list[Outcome]:
-        """Bring points to their end, `jobs` at a time. Ctrl-C ends all processes; the same call goes on later."""
-        with ThreadPoolExecutor(jobs) as pool:
-            waiting: set[Future[Outcome]] = {pool.submit(self._point, point) for point in points}
-            done: list[Outcome] = []
+        """Bring points to their end, `jobs` at a time. Signals end all processes; the same call resumes them.
+
+        Raises:
+            CompileError: PD622 if another process runs a study in this folder.
+        """
+        done: list[Outcome] = []
+        with held(self.folder):
+            pool = ThreadPoolExecutor(jobs)
             try:
+                waiting: set[Future[Outcome]] = {pool.submit(self._point, point) for point in points}
                 while waiting:
                     ended, waiting = wait(waiting, timeout=0.5, return_when=FIRST_COMPLETED)
                     for one in ended:
@@ -87,15 +97,30 @@ class StudyRun:
                         if told is not None:
                             told(done[-1])
             except BaseException:
-                self._stopped.set()
-                for process in list(self._running):
-                    with suppress(OSError):
-                        process.send_signal(signal.SIGINT)  # they save where they are
-                for one in waiting:
-                    one.cancel()
+                self._end_all(pool)
                 raise
+            pool.shutdown()
         order = {point: number for number, point in enumerate(points)}
         return sorted(done, key=lambda outcome: order[outcome.point])
+
+    def _end_all(self, pool: ThreadPoolExecutor) -> None:
+        """End all processes and wait for them: they save where they are. A second signal does not wait."""
+        self._signal(signal.SIGTERM)
+        try:
+            end = time.monotonic() + GRACE
+            pool.shutdown(wait=False, cancel_futures=True)
+            while self._running and time.monotonic() < end:
+                time.sleep(0.05)
+        finally:
+            self._signal(getattr(signal, "SIGKILL", signal.SIGTERM))
+            pool.shutdown()
+
+    def _signal(self, number: int) -> None:
+        with self._starting:
+            self._stopped.set()
+            for process in list(self._running):
+                with suppress(OSError):
+                    process.send_signal(number)
 
     def _point(self, point: Point) -> Outcome:
         kept = self.folder / "done" / f"{point.name}.json"
@@ -147,30 +172,46 @@ class StudyRun:
 
     def _step(self, step: Step, point: Point, place: Path) -> str | None:
         """Run a step; what went wrong, if something did."""
-        if self._stopped.is_set():
-            raise Cancelled("stopped")
+        if step.makes_run:
+            self._wait_for_last_call(place / step.name)
         log = place / f"{step.name}.log"
         threads = str(self.threads)
         environment = {**os.environ, "OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
+        environment[LIFELINE] = "1"
         words = [sys.executable, "-m", "powderdsl", *self.command(step, point, place)]
         with log.open("ab") as file:
-            process = subprocess.Popen(
-                words,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=file,
-                env=environment,
-                start_new_session=True,  # Ctrl-C reaches us alone: we pass it on once
-            )
-            self._running.add(process)
+            with self._starting:
+                if self._stopped.is_set():
+                    raise Cancelled("stopped")
+                process = subprocess.Popen(
+                    words,
+                    stdin=subprocess.PIPE,  # nothing is written: it closes when we are killed, which ends them
+                    stdout=file,
+                    stderr=file,
+                    env=environment,
+                    start_new_session=True,  # Ctrl-C reaches us alone: we pass it on once
+                )
+                self._running.add(process)
             try:
                 status = process.wait()
             finally:
                 self._running.discard(process)
+                assert process.stdin is not None
+                process.stdin.close()
         if status == 0:
             return None
         last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
         return "\n".join([f"{step.name} ended with {status}; {log} ends with:", *last])
+
+    def _wait_for_last_call(self, run: Path) -> None:
+        """Where a study was killed, what it had started may still be saving its last checkpoint."""
+        end = time.monotonic() + 2 * GRACE
+        while (run / ABOUT).exists() and time.monotonic() < end and not self._stopped.is_set():
+            try:
+                with held(run, patience=0.5):
+                    return
+            except CompileError:
+                continue
 
 
 def value_of(measure: Measure, run: Path, point: Point, size: str) -> float:

@@ -31,7 +31,7 @@ class Replay:
     Args:
         seed: the run's. It decides which world comes first, and which pairs a batch has.
         store: ``memory`` (of `device`), ``disk``, or ``auto``: disk where the buffer would take more than half of memory.
-        folder: where files are kept that `close` removes; only needed on disk.
+        folder: where its files lie; only needed on disk.
     """
 
     def __init__(
@@ -136,8 +136,12 @@ class Replay:
         if folder is None:
             raise ValueError("a buffer on disk needs a folder")
         path = folder / f"replay-{name}.bin"
-        self._files.append(path)
-        return torch.from_numpy(np.memmap(path, dtype=np.uint8, mode="w+", shape=shape))
+        room = torch.from_numpy(np.memmap(path, dtype=np.uint8, mode="w+", shape=shape))
+        try:
+            path.unlink()  # what is mapped lives on without its name, and not longer than this process
+        except OSError:  # Windows does not allow it
+            self._files.append(path)
+        return room
 
 
 def memory_of(device: torch.device) -> int:

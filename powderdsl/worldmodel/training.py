@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -17,6 +14,7 @@ from torch.nn import functional as F
 
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError
+from powderdsl.interrupts import held_back
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run
@@ -218,13 +216,14 @@ class _Trainer:
         self.cuda = torch.device(machine.device).type == "cuda"
 
     def go(self, tell: Callable[[Moment], None], save_seconds: float) -> None:
-        """To the end. Raises KeyboardInterrupt once a checkpoint is written."""
+        """To the end. A signal is raised once a checkpoint is written, a second one at once."""
         total, loss, simulated = self.config.iterations, None, 0.0
         saved = since = time.monotonic()
         making = 0.0
         self.model.train()
-        with self.run.metrics(self.done) as metrics, _interruptible() as interrupted:
-            while self.done < total and not interrupted.is_set():
+        # An iteration is never left half done.
+        with self.run.metrics(self.done) as metrics, held_back() as interrupted:
+            while self.done < total and not interrupted():
                 starts, ends = self.replay.batch(self.done, self.config.batch)
                 self.recent.append(self.step(starts, ends))
                 began = time.monotonic()
@@ -246,8 +245,6 @@ class _Trainer:
                     self.save()
                     saved = time.monotonic()
             self.save()
-            if interrupted.is_set():
-                raise KeyboardInterrupt
 
     def step(self, starts: Tensor, ends: Tensor) -> float:
         """One step of Adam; the loss before it: cross-entropy a cell, in nats."""
@@ -269,25 +266,6 @@ class _Trainer:
             "recent": list(self.recent),
         }
         self.run.save_checkpoint(self.done, state)
-
-
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """Set by the first Ctrl-C, so that an iteration is never left half done; the second one ends the process at once."""
-    pressed = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield pressed  # signals reach the main thread alone
-        return
-
-    def press(number: int, frame: Any) -> None:
-        pressed.set()
-        signal.signal(signal.SIGINT, before)
-
-    before = signal.signal(signal.SIGINT, press)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def load_rules_of(config: DataConfig) -> Ruleset:

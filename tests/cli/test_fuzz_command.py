@@ -48,7 +48,7 @@ def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
     assert running.returncode == 0
     next_seed = json.loads(state.read_text())["next"]
     assert next_seed > 0
-    assert f"`--resume` goes on from seed {next_seed}" in told
+    assert f"`--resume` continues from seed {next_seed}" in told
     assert "no differences found" in told
 
 

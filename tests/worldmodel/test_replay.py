@@ -114,10 +114,7 @@ def test_disk_holds_what_memory_holds(dunes: str, tmp_path: Path) -> None:
     assert torch.equal(memory.starts, disk.starts)
     assert torch.equal(memory.ends, disk.ends)
     assert all(torch.equal(a, b) for a, b in zip(memory.batch(3, 7), disk.batch(3, 7), strict=True))
-    files = list(tmp_path.glob("replay-*.bin"))
-    assert sum(path.stat().st_size for path in files) == 2 * 20 * 14 * 18
-    disk.close()
-    assert not list(tmp_path.glob("replay-*.bin"))
+    assert not list(tmp_path.glob("replay-*"))  # a killed process would leave them
 
 
 def test_batches_hang_on_seed_and_iteration_alone(dunes: str) -> None:

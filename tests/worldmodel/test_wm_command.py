@@ -137,6 +137,6 @@ def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=240)
     assert process.returncode == 130, told
-    assert f"stopped; the same command goes on with {folder}" in told
+    assert f"interrupted; the same command resumes {folder}" in told
     assert "Traceback" not in told
     assert len(list((folder / "checkpoints").glob("*.pt"))) == 1
