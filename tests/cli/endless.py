@@ -1,0 +1,212 @@
+"""Commands that run for hours, to be ended in the middle: each in a folder of its own, with its own cache."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from powderdsl.scratch import is_scratch
+from tests.cli.commands import command_line, environment_with
+from tests.processes import alive, started, waited
+
+TASK = """
+task: dig
+rules: core+sand
+size: [8, 8]
+fill: sand
+agent: {may: [empty], brush: 2, bins: 4, actions: 3}
+reward: {final: count(empty)}
+splits: {test: {generate: [frame wall]}}
+"""
+
+STUDY = """
+study: endless
+about: Two runs that are ended.
+seeds: 2
+vary: {batch: [12]}
+steps:
+  trained: {command: train, on: FOLDER/dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: dense, steps: 900000000, seed: $seed, checkpoint-every: 0}
+measures:
+  reward: {of: trained, value: splits/test/trained/mean}
+"""
+
+COMPILER = """#!/bin/bash
+if [ "${@: -1}" = --version ]; then echo "g++ 1"; exit; fi
+if [ "$POWDERDSL_ENDLESS" = no ]; then exit 1; fi
+touch FOLDER/compiling
+sleep 1000 & wait
+"""
+"""A compiler that works in another process, as compilers do, and never ends; or fails."""
+
+TINY = ("--envs", "4", "--rollout", "3", "--batch", "12", "--backend", "dense")
+SMALL = ("--backend", "reference", "--size", "8x8")
+
+
+@dataclass(frozen=True)
+class Endless:
+    """A command, and a pattern for the file that shows it is in the middle of its work. `again` ends soon, in the same
+    folder; `status` is its exit code."""
+
+    words: Sequence[str]
+    busy: str
+    again: Sequence[str] = ("run", "life", *SMALL, "--steps", "3", "--out", "x.npz")
+    status: int = 0
+
+
+COMMANDS = {
+    "run": Endless(("run", "life", *SMALL, "--steps", "900000000", "--out", "x.gif"), ".x.*.gif"),
+    "video": Endless(("run", "life", *SMALL, "--steps", "900000000", "--out", "x.mp4"), ".x.*.mp4"),
+    "compile": Endless(
+        ("run", "life", "--backend", "native", "--size", "8x8", "--out", "x.npz"),
+        "compiling",
+        ("run", "life", "--backend", "native", "--size", "8x8", "--out", "x.npz"),
+        2,  # by then the compiler fails
+    ),
+    "record": Endless(
+        ("record", "dig.yaml", "--out", "data", "--episodes", "900000", "--shard", "3", "--backend", "dense"),
+        "data/shard-*",
+    ),
+    "train": Endless(
+        ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "900000000", "--checkpoint-every", "0"),
+        "agent/checkpoints/[0-9]*.pt",
+        ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "12", "--checkpoint-every", "0"),
+    ),
+    "evaluate": Endless(
+        ("evaluate", "dig.yaml", "--episodes", "1000000", "--backend", "reference", "--out", "x.json"),
+        "",
+    ),
+    "wm train": Endless(
+        (
+            *("wm", "train", "--task", "dig.yaml", "--width", "4", "--batch", "4", "--buffer", "32"),
+            *("--refresh", "2", "--states", "100", "--backend", "dense", "--run", "model"),
+            *("--iterations", "900000000", "--store", "disk", "--save-every", "1"),
+        ),
+        "model/checkpoints/[0-9]*.pt",
+    ),
+    "bench": Endless(("bench", "life", "--backend", "torch", "--seconds", "3600", "--json", "x.json"), ""),
+    "fuzz": Endless(
+        ("fuzz", "--jobs", "2", "--seeds", "0..900000", "--backends", "dense,native", "--save", "found"),
+        "tmp/.powderdsl-*/*",
+        ("fuzz", "--jobs", "1", "--seeds", "0..1", "--backends", "dense", "--save", "found"),
+    ),
+    "test": Endless(
+        ("test", "core+sand", "--examples", "9000000", "--seconds", "86400", "--no-keep"),
+        "",
+    ),
+    "study": Endless(
+        ("study", "study.yaml", "--out", "out", "--jobs", "2"),
+        "out/runs/*seed=1/trained/checkpoints/[0-9]*.pt",
+    ),
+}
+
+
+class Place:
+    """A folder in which commands run, find their files, and leave nothing outside."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        for name in ("cache", "tmp"):
+            (folder / name).mkdir()
+        (folder / "dig.yaml").write_text(TASK, encoding="utf-8")
+        (folder / "study.yaml").write_text(STUDY.replace("FOLDER", str(folder)), encoding="utf-8")
+        self.compiler = folder / "compiler"
+        self.compiler.write_text(COMPILER.replace("FOLDER", str(folder)), encoding="utf-8")
+        self.compiler.chmod(0o755)
+
+    def environment(self, command: Endless, *, endless: bool) -> dict[str, str]:
+        found = environment_with(
+            XDG_CACHE_HOME=str(self.folder / "cache"),
+            TMPDIR=str(self.folder / "tmp"),
+            POWDERDSL_PLACE=str(self.folder),  # how its processes are found, whoever their parent is now
+            POWDERDSL_ENDLESS="yes" if endless else "no",
+        )
+        return found | {"CXX": str(self.compiler)} if command.busy == "compiling" else found
+
+    @contextmanager
+    def begun(self, command: Endless) -> Iterator[subprocess.Popen[str]]:
+        """The command, begun; it does not outlive the block."""
+        log = self.folder / "stderr"
+        with (
+            log.open("w") as errors,
+            started(
+                command_line(*command.words),
+                env=self.environment(command, endless=True),
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+            ) as running,
+        ):
+            yield running
+
+    def busy(self, command: Endless, running: subprocess.Popen[str]) -> bool:
+        """Wait until a command is in the middle of its work; False if it ended before."""
+        if command.busy:
+            pattern = command.busy
+            waited(lambda: running.poll() is not None or any(self.folder.glob(pattern)))
+        else:  # it writes nothing: it has imported everything once it has used some processor time
+            waited(lambda: running.poll() is not None or seconds_of(running.pid) > 4)
+        return running.poll() is None
+
+    def said(self) -> str:
+        """What the last command wrote to stderr."""
+        return (self.folder / "stderr").read_text(encoding="utf-8")
+
+    def survivors(self) -> list[int]:
+        """Processes that commands in this folder have started, and that still run."""
+        found = []
+        for place in Path("/proc").glob("[0-9]*"):
+            try:
+                ours = f"POWDERDSL_PLACE={self.folder}\0".encode() in (place / "environ").read_bytes()
+            except OSError:
+                continue
+            if ours and alive(int(place.name)):
+                found.append(int(place.name))
+        return found
+
+    def scratch(self) -> list[Path]:
+        """Temporary files that lie somewhere in the folder."""
+        return [path for path in self.folder.rglob("*") if is_scratch(path.name) or path.suffix == ".bin"]
+
+    def run_again(self, command: Endless) -> None:
+        """A short command in the same folder: it succeeds, whatever was killed there."""
+        run = subprocess.run(
+            command_line(*command.again),
+            env=self.environment(command, endless=False),
+            cwd=self.folder,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=False,
+        )
+        assert run.returncode == command.status, run.stderr
+
+    def checkpoint_steps(self) -> dict[str, int]:
+        """The newest checkpoint of each run, by its folder."""
+        found: dict[str, int] = {}
+        for path in sorted(self.folder.rglob("*.pt")):
+            found[str(path.parent)] = int(path.name.partition("-")[0])
+        return found
+
+
+def seconds_of(pid: int) -> float:
+    """Processor time that a process has used so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def last_step(metrics: Path) -> int:
+    """The step of the last whole line of a run's metrics; 0 if there is none."""
+    lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
+    for line in reversed(lines):
+        try:
+            return int(json.loads(line)["step"])
+        except ValueError:
+            continue
+    return 0

@@ -1,0 +1,179 @@
+"""SIGTERM and SIGKILL: commands end cleanly, leave no processes, and resume; the next one removes what is left."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.cli.commands import environment_with
+from tests.cli.endless import COMMANDS, Place, last_step
+from tests.processes import waited
+
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/environ").exists(), reason="looks for processes in /proc"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
+    if name == "video":
+        pytest.importorskip("imageio_ffmpeg")
+    place, command = Place(tmp_path), COMMANDS[name]
+    with place.begun(command) as running:
+        assert place.busy(command, running), place.said()
+        running.send_signal(signal.SIGTERM)
+        running.wait(timeout=120)
+        assert running.returncode == 143, place.said()
+        assert place.survivors() == []
+    assert place.said().endswith("terminated by SIGTERM\n")
+    assert "Traceback" not in place.said()
+    assert place.scratch() == []
+    if name in ("train", "wm train", "study"):
+        assert place.checkpoint_steps()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["video", "compile", "fuzz", "wm train"])
+def test_after_sigkill_nothing_runs_on_and_the_next_command_tidies_up(name: str, tmp_path: Path) -> None:
+    if name == "video":
+        pytest.importorskip("imageio_ffmpeg")
+    place, command = Place(tmp_path), COMMANDS[name]
+    with place.begun(command) as running:
+        assert place.busy(command, running), place.said()
+        running.kill()
+        running.wait()
+    assert waited(lambda: not place.survivors(), 60)
+    assert place.scratch() or name == "wm train"  # its buffer on disk has no name
+    place.run_again(command)
+    assert place.scratch() == []
+
+
+@pytest.mark.slow
+def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
+    """What it had started saves where it is and ends; the next call waits for that, and continues there."""
+    place, command = Place(tmp_path), COMMANDS["study"]
+    with place.begun(command) as running:
+        assert place.busy(command, running), place.said()
+        running.kill()
+        running.wait()
+    killed = time.monotonic()
+    reached = {path: last_step(path) for path in tmp_path.rglob("metrics.jsonl")}
+    with place.begun(command) as running:
+        assert waited(lambda: all(last_step(path) > step for path, step in reached.items()), 120)
+        assert time.monotonic() - killed < 60
+        running.send_signal(signal.SIGTERM)
+        running.wait(timeout=120)
+    assert waited(lambda: not place.survivors(), 60)
+    logs = [path.read_text(encoding="utf-8") for path in tmp_path.rglob("*.log")]
+    assert len(logs) == len(reached) == 2
+    for log in logs:
+        assert log.count("terminated by SIGTERM") == 2, log
+        assert "PD622" not in log
+    assert place.scratch() == []
+
+
+def test_two_studies_do_not_share_a_folder(tmp_path: Path) -> None:
+    place, command = Place(tmp_path), COMMANDS["study"]
+    with place.begun(command) as running:
+        assert waited(lambda: any(tmp_path.glob("out/runs/*")) or running.poll() is not None)
+        second = place.begun(command)
+        with second as other:
+            other.wait(timeout=120)
+            assert other.returncode == 2
+            assert "PD622" in place.said()
+        running.kill()
+    assert waited(lambda: not place.survivors(), 60)
+
+
+CAUGHT = """
+import os, signal, sys, time
+from powderdsl.interrupts import Terminated, held_back, interruptible
+
+class Unlucky:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)  # here the handler runs, where nothing can be raised
+
+def swallowed():
+    found = Unlucky()
+    del found
+    time.sleep(10)
+
+def twice():
+    with held_back() as asked:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+        print("asked" if asked() else "not asked")
+
+def held_in_a_failure():
+    try:
+        with held_back():
+            os.kill(os.getpid(), signal.SIGTERM)
+            raise OSError
+    except OSError:
+        print("lost")
+
+with interruptible():
+    try:
+        {"swallowed": swallowed, "twice": twice, "held": held_in_a_failure}[sys.argv[1]]()
+    except Terminated as error:
+        print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("case", "said"),
+    [
+        ("swallowed", ["terminated by SIGTERM"]),
+        ("twice", ["asked", "terminated by SIGTERM"]),
+        ("held", ["terminated by SIGTERM"]),
+    ],
+)
+def test_a_signal_is_never_lost(case: str, said: list[str]) -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", CAUGHT, case],
+        env=environment_with(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert run.stdout.splitlines() == said
+    assert run.stderr == ""
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=["SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_signals_at_any_moment(name: str, how: signal.Signals, tmp_path: Path) -> None:
+    """From the first import to the middle of the work, ten times each in one folder, then a command that ends well."""
+    place, command = Place(tmp_path), COMMANDS[name]
+    chance = random.Random(f"{name} {how}")
+    for turn in range(10):
+        (tmp_path / "compiling").unlink(missing_ok=True)
+        with place.begun(command) as running:
+            if turn >= 6:
+                place.busy(command, running)
+            time.sleep(chance.random() * (6 if turn < 6 else 1))
+            assert running.poll() is None, place.said()
+            running.send_signal(how)
+            running.wait(timeout=120)
+            if how == signal.SIGTERM:
+                # Before the command line is there, the system ends the process: nothing has been begun.
+                assert running.returncode in (143, -15), place.said()
+                assert waited(lambda: not place.survivors(), 5), place.said()
+                assert place.scratch() == [], place.said()
+            assert "Traceback" not in place.said()
+            assert "Exception ignored" not in place.said()
+        assert waited(lambda: not place.survivors(), 60)
+    place.run_again(command)
+    if "model" not in command.words and name != "study":
+        assert place.scratch() == []
