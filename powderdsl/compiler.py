@@ -100,13 +100,13 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
     """Declarations of everything named, each pack once, in the order of first mention."""
     packs: dict[str, PackDecl] = {}
     rulesets: list[RulesetDecl] = []
-    left_out: set[str] = set()
+    left_out: dict[str, None] = {}
     for name in names:
         plus, minus = split_names(name)
-        left_out |= set(minus)
+        left_out |= dict.fromkeys(minus)
         for word in plus:
             _read_one(word, packs, rulesets, reporter, from_ruleset=None)
-    for word in sorted(left_out - set(packs)):
+    for word in (word for word in left_out if word not in packs):
         reporter.error(
             "PD304",
             f"`{word}` is left out, but it was not there",

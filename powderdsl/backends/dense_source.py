@@ -6,6 +6,7 @@ import linecache
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
+from zlib import crc32
 
 from powderdsl.ir.ops import Node, PassGraph, nodes_of
 
@@ -208,7 +209,7 @@ def comment(text: str) -> str:
 
 def load_source(source: str, name: str, constants: Mapping[str, object]) -> Callable[..., Any]:
     """The function of some generated source. It holds only names made up here, and constants passed beside it."""
-    filename = f"<powderdsl {name} {abs(hash(source)):x}>"
+    filename = f"<powderdsl {name} {crc32(source.encode()):x}>"
     linecache.cache[filename] = (len(source), None, source.splitlines(True), filename)
     namespace: dict[str, Any] = dict(constants)
     exec(compile(source, filename, "exec"), namespace)

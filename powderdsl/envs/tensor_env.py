@@ -214,7 +214,7 @@ class TensorEnv:
         if not isinstance(given, Mapping):
             raise TypeError(f"params takes a mapping from names to values, found {type(given).__name__}")
         whole = self.simulator.parameters(given, self.num_envs)
-        names = given.keys() if bool(mask.all()) else given.keys() | self.params.keys()
+        names = given.keys() if bool(mask.all()) else {**given, **self.params}.keys()
         usual = self.simulator.parameters({}, self.num_envs)
         return {name: torch.where(mask, whole[name], self.params.get(name, usual[name])) for name in names}
 

@@ -71,7 +71,7 @@ def _wants(rule: Rule, asked: Asked, lets: list[Let], named: Ids) -> Wants:
 
 def _either(first: Wants, second: Wants) -> Wants:
     """What both of two rules ask for: one of what the first needs, or of what the second needs, must exist."""
-    joined = {a | b for a in first.needs for b in second.needs}
+    joined = dict.fromkeys(a | b for a in first.needs for b in second.needs)
     least = [ids for ids in joined if not any(other < ids for other in joined)]
     return Wants(tuple(sorted(least, key=_by_size)[:MAX_NEEDS]), first.copies & second.copies)
 

@@ -159,9 +159,9 @@ class Ledger:
 
         Raises KeyError for a name that is no element.
         """
-        start = set(start)
+        start = dict.fromkeys(start)
         self._known(start)
-        cells, known = set(start), start | set(self.named)
+        cells, known = set(start), {*start, *self.named}
         while True:
             more = {
                 after

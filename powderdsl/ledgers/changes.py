@@ -106,11 +106,8 @@ class Asked:
 
 def possible(facts: Facts, conditions: Sequence[Condition], lets: dict[str, Expr]) -> bool:
     """Whether the conditions may hold together. False is a proof; hard questions are given up, easy ones go on."""
-    budget = facts.budget
-    question = Budget(min(MAX_QUESTION, budget.left))
-    answer = satisfiable(replace(facts, budget=question), conditions, lets)
-    budget.left -= min(MAX_QUESTION, budget.left) - max(question.left, 0)
-    return answer
+    with facts.budget.question(MAX_QUESTION):
+        return satisfiable(facts, conditions, lets)
 
 
 def footprint(rule: Rule) -> tuple[Offset, ...]:

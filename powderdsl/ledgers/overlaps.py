@@ -68,7 +68,9 @@ def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[O
             same = what == "first wins" and _alike(first, second)
             if overlap in known or same:
                 continue
-            shifts = {(a[0] - b[0], a[1] - b[1]) for a in footprint(first) for b in footprint(second)}
+            shifts = dict.fromkeys(
+                (a[0] - b[0], a[1] - b[1]) for a in footprint(first) for b in footprint(second)
+            )
             if any(_meet(first.mask, second.mask, at, asked) for at in shifts if not (one and at == HERE)):
                 yield overlap
 

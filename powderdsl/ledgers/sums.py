@@ -13,10 +13,10 @@ def constant_sums(elements: tuple[str, ...], pairs: Pairs) -> tuple[tuple[str, .
     A change turns one cell of `a` into one of `b`: weights w keep the total if w(a) = w(b). So they are equal within
     each part of the graph that hangs together, and the parts are the sums.
     """
-    group = {name: {name} for name in elements}
+    group = {name: [name] for name in elements}
     for before, after in pairs:
         if group[before] is not group[after]:
-            group[before] |= group[after]
+            group[before] += group[after]
             for name in group[after]:
                 group[name] = group[before]
     parts = {id(part): part for part in group.values()}.values()
@@ -45,9 +45,9 @@ def _closure(start: str, pairs: tuple[tuple[str, str], ...]) -> frozenset[str]:
     found, fresh = {start}, [start]
     while fresh:
         name = fresh.pop()
-        more = {after for before, after in pairs if before == name} - found
-        found |= more
-        fresh.extend(more)
+        more = [after for before, after in pairs if before == name and after not in found]
+        found.update(more)
+        fresh += more
     return frozenset(found)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.operands import ELEMENT_HERE, negation
 from powderdsl.model.operands import member as member_of
-from powderdsl.model.satisfy import Facts, example, satisfiable
+from powderdsl.model.satisfy import BUDGET, Budget, Facts, decide, example, satisfiable
 from powderdsl.model.types import (
     Assign,
     Expr,
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from powderdsl.model.elaborate import Elaborated
 
 HERE: Offset = (0, 0)
+
+ALL_PASSES = 3
+"""Work for the conflicts of all passes together, as a multiple of that for one."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,10 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
     alive: dict[Span, bool] = {}
     useful: dict[Span, bool] = {}
     conflicts: dict[Conflict, tuple[str, list[str]]] = {}
+    work: list[int] = []
     for pass_ in passes:
+        given = min(BUDGET, ALL_PASSES * BUDGET - sum(work))
+        asked = replace(facts, budget=Budget(given))
         for moment in pass_.moments:
             lets = {let.name: let.value for let in moment.lets}
             live = []
@@ -82,14 +88,10 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
                 elif rule.mask is not None:
                     silent.setdefault(rule.span, []).append((rule.mask, lets))
             if moment.policy == "prove":
-                for conflict, words in _check_moment(live, facts, lets):
+                for conflict, words in _check_moment(live, asked, lets):
                     conflicts.setdefault(conflict, (words, []))[1].append(moment.label)
-    if facts.budget.is_exhausted:
-        busiest = max(passes, key=lambda pass_: sum(len(moment.rules) ** 2 for moment in pass_.moments))
-        reporter.error(
-            "PD508", f"the rules of `{busiest.name}` are too many to be checked against each other", busiest.span, "this pass",
-            helps=["put rules that need not happen at once under `then:`", "or choose what happens to conflicts: `conflicts: first_wins`"],
-        )  # fmt: skip
+        work.append(given - asked.budget.left)
+    if _too_much(passes, work, reporter):
         return
     for conflict, (words, labels) in conflicts.items():
         conflict.report(labels, words, reporter)
@@ -117,6 +119,23 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
             )  # fmt: skip
 
 
+def _too_much(passes: tuple[Pass, ...], work: list[int], reporter: Reporter) -> bool:
+    """Report passes whose rules take too much work to compare. Work is counted: the same rules always take the same."""
+    hard = [pass_ for pass_, spent in zip(passes, work, strict=True) if spent > BUDGET]
+    together = sum(work) > ALL_PASSES * BUDGET
+    for pass_ in hard or ([passes[work.index(max(work))]] if together else []):
+        rest = "" if pass_ in hard else ", together with those of the other passes"
+        reporter.error(
+            "PD508", f"comparing the rules of `{pass_.name}` with each other{rest} takes too much work", pass_.span,
+            "whether two of its rules claim one cell is not known",
+            helps=[
+                "choose what happens to conflicts, then nothing is compared: `conflicts: first_wins`",
+                "or put rules that need not happen at once under `then:`",
+            ],
+        )  # fmt: skip
+    return bool(hard) or together
+
+
 def _report_sleep(reason: str, span: Span, reporter: Reporter) -> None:
     reporter.report(
         "PD506", f"this rule is asleep: {reason}", span, "cannot happen with these packs",
@@ -135,14 +154,19 @@ def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Ite
     """The conflicts of one moment, with an example: for each rule the first one, maybe itself, that it meets."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
     for i, second in enumerate(movers):
+        undecided = None
         for first in (second, *movers[:i]):
             if facts.budget.is_exhausted:
                 return
-            questions = [((first.mask, HERE), (second.mask, at)) for at in _claims(first, second)]
-            possible = next((one for one in questions if satisfiable(facts, one, lets)), None)
-            if possible:
-                yield _conflict(first, second), _in_words(facts, possible, lets)
+            answer, question = _meet(first, second, facts, lets)
+            if answer:
+                yield _conflict(first, second), _in_words(facts, question, lets)
                 break
+            if answer is None and undecided is None:
+                undecided = first
+        else:
+            if undecided is not None and not facts.budget.is_exhausted:
+                yield _undecided(_conflict(undecided, second)), ""
     plain: list[tuple[Assign, Expr | None]] = [
         (rule, rule.mask) for rule in rules if isinstance(rule, Assign)
     ]
@@ -151,6 +175,21 @@ def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Ite
     ]
     for assigns in (plain, effects):
         yield from _check_assigns(assigns, facts, lets)
+
+
+def _meet(
+    first: Rule, second: Rule, facts: Facts, lets: dict[str, Expr]
+) -> tuple[bool | None, Sequence[tuple[Expr, Offset]]]:
+    """Whether two rules may claim one cell, and the conditions with which they do; None if that is too hard."""
+    answer: bool | None = False
+    for at in _claims(first, second):
+        question = ((first.mask, HERE), (second.mask, at))
+        found = decide(facts, question, lets)
+        if found:
+            return True, question
+        if found is None:
+            answer = None
+    return answer, ()
 
 
 def _check_assigns(
@@ -164,10 +203,14 @@ def _check_assigns(
                 continue
             shift = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
             question = ((first, HERE), (second, shift))
-            if satisfiable(facts, question, lets):
+            answer = decide(facts, question, lets)
+            if answer is not False and not facts.budget.is_exhausted:
                 message = f"two rules may assign `{a.field}` of one cell in the same moment"
                 conflict = Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
-                yield conflict, _in_words(facts, question, lets)
+                if answer:
+                    yield conflict, _in_words(facts, question, lets)
+                else:
+                    yield _undecided(conflict), ""
                 break
 
 
@@ -235,6 +278,13 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
     return Conflict(
         "PD501" if movement else "PD502", message, first.span, second.span, (), (_EXCLUDE, choice)
     )
+
+
+def _undecided(conflict: Conflict) -> Conflict:
+    """The conflict of two rules whose conditions are too hard: to say that they must exclude each other is no help."""
+    note = "their conditions combine too many values to decide whether they can meet"
+    helps = ("choose what happens if they do: `conflicts: first_wins`", "or put one of them under `then:`")
+    return replace(conflict, notes=(note,), helps=helps)
 
 
 def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:

@@ -211,7 +211,7 @@ class _Reads:
     name: str
     lets: dict[str, Expr]
     everywhere: dict[str, Expr]
-    places: set[Offset] = field(default_factory=set)
+    places: dict[Offset, None] = field(default_factory=dict)
     many: bool = False
     _opened: set[tuple[str, Offset, bool]] = field(default_factory=set)
 
@@ -219,7 +219,7 @@ class _Reads:
         """Add the places of one expression that is asked at `at`."""
         args = expr.args
         if expr.op == "property" and expr.value == self.name:
-            self.places.add(at)
+            self.places[at] = None
             self.many |= unclear
         elif expr.op == "let":
             name = str(expr.value)

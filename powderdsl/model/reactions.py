@@ -93,8 +93,10 @@ def moved_ids(ruleset: Ruleset) -> frozenset[int]:
             for rule in moment.rules:
                 if not isinstance(rule, (Swap, Move)):
                     continue
-                for number in set(facts.ids) - found:
-                    if any(_possible(rule, number, at, facts, lets) for at in (HERE, rule.offset)):
+                for number in facts.ids:
+                    if number not in found and any(
+                        _possible(rule, number, at, facts, lets) for at in (HERE, rule.offset)
+                    ):
                         found.add(number)
     return frozenset(found)
 

@@ -7,35 +7,41 @@ The answer errs to one side only: False is a proof, True may mean "could not tel
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from typing import Any, NamedTuple
 
 from powderdsl.model.types import Expr, Offset, Property
 
 Key = tuple[str, object, Offset]
 Assignment = dict[Key, object]
+Bounds = tuple[Any, Any]
 
 MAX_DOMAIN = 256
-MAX_STEPS = 20_000
 MAX_LET = 150
 """Nodes of a let's value that are looked through; a larger one is taken for free."""
 
 BUDGET = 500_000
-"""Nodes evaluated in all questions about one ruleset: a second. The largest shipped ruleset needs a fifteenth of it."""
+"""Nodes evaluated in a group of questions: half a second. The largest shipped ruleset needs a twentieth of it."""
+
+MAX_QUESTION = 100_000
+"""Nodes evaluated for one question. A harder one stays undecided, and the others keep their share."""
 
 QUESTION = 60
 """What a question costs besides its evaluations."""
 
 
 class _Exhausted(Exception):
-    """The questions take too long: from here on the answer is that it could not be told."""
+    """The question takes too much work: the answer is that it could not be told."""
 
 
 @dataclass
 class Budget:
-    """Work that is left for a ruleset's questions."""
+    """Work that is left for some questions, counted in nodes. It depends on what is asked, never on time or order."""
 
     left: int = BUDGET
 
@@ -47,6 +53,17 @@ class Budget:
     @property
     def is_exhausted(self) -> bool:
         return self.left < 0
+
+    @contextmanager
+    def question(self, most: int = MAX_QUESTION) -> Iterator[None]:
+        """Spend at most this much within. What one question may not spend is left for the next."""
+        reserve = max(self.left - most, 0)
+        self.left -= reserve
+        try:
+            yield
+        finally:
+            if reserve:
+                self.left = max(self.left, 0) + reserve
 
 
 @dataclass(frozen=True)
@@ -75,6 +92,15 @@ class _Unknown(Exception):
     """The value hangs on something free."""
 
 
+class _Joint(NamedTuple):
+    """A condition on several variables. `compares`: bounds may decide it before all of them are chosen."""
+
+    condition: Expr
+    at: Offset
+    keys: dict[Key, None]
+    compares: bool
+
+
 class Search:
     """One question. Conditions are given with the place they are asked at."""
 
@@ -84,7 +110,6 @@ class Search:
         self.conditions: list[tuple[Expr, Offset]] = []
         self._chosen: Assignment = {}
         self._domains: dict[Key, list[object]] = {}
-        self._steps = 0
         self._opened: dict[str, tuple[Expr, int]] = {}
 
     def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
@@ -137,16 +162,15 @@ class Search:
     def possible(self) -> bool:
         """False if no assignment satisfies all conditions."""
         variables = [self._variables(condition, at) for condition, at in self.conditions]
-        domains: dict[Key, list[object]] = {}
+        domains = self._domains = {}
         for keys in variables:
             for key in keys or ():
-                domains.setdefault(key, self._domain(key))
-        checks = [
-            (c, at, keys)
-            for (c, at), keys in zip(self.conditions, variables, strict=True)
-            if keys is not None
-        ]
-        for condition, at, keys in checks:
+                if key not in domains:
+                    domains[key] = self._domain(key)
+        joint = []
+        for (condition, at), keys in zip(self.conditions, variables, strict=True):
+            if keys is None:
+                continue
             if not keys and not self._holds(condition, at, {}):
                 return False
             if len(keys) == 1:
@@ -154,35 +178,35 @@ class Search:
                 domains[key] = [v for v in domains[key] if self._holds(condition, at, {key: v})]
                 if not domains[key]:
                     return False
-        rest = [(c, at, keys) for c, at, keys in checks if len(keys) > 1]
-        order = sorted({key for _, _, keys in rest for key in keys}, key=lambda key: len(domains[key]))
-        self._steps = 0
-        self._domains = domains
-        return self._assign(order, 0, domains, rest, self._chosen)
+            if len(keys) > 1:
+                compares = any(node.op in ("eq", "lt", "le") for node in condition.walk())
+                joint.append(_Joint(condition, at, keys, compares))
+        # Small domains first; what is equally small in the order in which the conditions name it.
+        order = sorted({key: None for one in joint for key in one.keys}, key=lambda key: len(domains[key]))
+        return self._assign(order, 0, joint, self._chosen)
 
     def example(self) -> dict[Offset, int]:
-        """After `possible`: an element for each place that the conditions ask about; nothing if the search gave up."""
-        if self._steps > MAX_STEPS:
-            return {}
+        """After `possible`: an element for each place that the conditions ask about."""
         keys = [key for key in self._domains if key[0] == "element"]
         return {key[2]: int(str(self._chosen.get(key, self._domains[key][0]))) for key in keys}
 
-    def _assign(
-        self, order: list[Key], index: int, domains: dict[Key, list[object]], rest: list, chosen: Assignment
-    ) -> bool:
+    def _assign(self, order: list[Key], index: int, joint: list[_Joint], chosen: Assignment) -> bool:
         if index == len(order):
             return True
         key = order[index]
-        ready = [
-            (c, at) for c, at, keys in rest if key in keys and all(k in chosen or k == key for k in keys)
-        ]
-        for value in domains[key]:
-            self._steps += 1
-            if self._steps > MAX_STEPS:
-                return True
+        ready, waiting = [], []
+        for one in joint:
+            if key in one.keys:
+                if all(k in chosen or k == key for k in one.keys):
+                    ready.append(one)
+                elif one.compares:
+                    waiting.append(one)
+        for value in self._domains[key]:
             chosen[key] = value
-            if all(self._holds(c, at, chosen) for c, at in ready) and self._assign(
-                order, index + 1, domains, rest, chosen
+            if (
+                all(self._holds(one.condition, one.at, chosen) for one in ready)
+                and all(self._bounds(one.condition, one.at, chosen)[1] for one in waiting)
+                and self._assign(order, index + 1, joint, chosen)
             ):
                 return True
         chosen.pop(key, None)
@@ -213,33 +237,33 @@ class Search:
             return [0, 1]
         return list(range(int(name.kind.lo), int(name.kind.hi) + 1))
 
-    def _variables(self, expr: Expr, at: Offset) -> frozenset[Key] | None:
-        """What the value hangs on; None if it hangs on something that cannot be enumerated."""
-        found: set[Key] = set()
+    def _variables(self, expr: Expr, at: Offset) -> dict[Key, None] | None:
+        """What the value depends on, in the order it is named; None if some of it cannot be enumerated."""
+        found: dict[Key, None] = {}
 
         def visit(node: Expr, at: Offset) -> None:
             self.facts.budget.spend(1)
             match node.op:
                 case "element":
-                    found.add(("element", None, at))
+                    found[("element", None, at)] = None
                 case "property":
                     prop = self.facts.properties[str(node.value)]
-                    found.add(("element", None, at))
+                    found[("element", None, at)] = None
                     if prop.stored:
-                        found.add(("property", prop.name, at))
+                        found[("property", prop.name, at)] = None
                     if any(isinstance(value, str) for value in prop.values):
                         raise _Unknown
                 case "field" if node.value in self.facts.field_sets:
-                    found.add(("element", None, at))
-                    found.add(_opaque(node, at))
+                    found[("element", None, at)] = None
+                    found[_opaque(node, at)] = None
                 case "draw":
-                    found.add(("draw", node.value, at))
+                    found[("draw", node.value, at)] = None
                 case "look":
                     visit(node.args[0], _plus(at, node.value))
                 case "const":
                     pass
                 case _ if _is_opaque(node):
-                    found.add(_opaque(node, at))
+                    found[_opaque(node, at)] = None
                 case _:
                     for arg in node.args:
                         visit(arg, at)
@@ -248,7 +272,7 @@ class Search:
             visit(expr, at)
         except _Unknown:
             return None
-        return frozenset(found)
+        return found
 
     def _value(self, node: Expr, at: Offset, chosen: Assignment):  # type: ignore[no-untyped-def]
         budget = self.facts.budget  # `spend` written out: this is where the time goes
@@ -285,6 +309,52 @@ class Search:
         args = [self._value(arg, at, chosen) for arg in node.args]
         return _EVALUATE[node.op](node, *args)
 
+    def _bounds(self, node: Expr, at: Offset, chosen: Assignment) -> Bounds:
+        """Between which numbers the value lies while some variables are open: a flag lies between 0 and 1."""
+        self.facts.budget.spend(1)
+        match node.op:
+            case "const":
+                return (node.value, node.value) if isinstance(node.value, (int, float, Fraction)) else _ANY
+            case "element":
+                return self._span(("element", None, at), chosen)
+            case "member":
+                known = self._bounds(node.args[0], at, chosen)
+                return (0, 1) if known[0] != known[1] else (known[0] in node.value,) * 2
+            case "property":
+                prop = self.facts.properties[str(node.value)]
+                key: Key = ("element", None, at)
+                elements = [chosen[key]] if key in chosen else self._domains[key]
+                values = [prop.values[int(str(one))] for one in elements if one not in prop.stored]
+                numbers = [value for value in values if isinstance(value, (int, float, Fraction))]
+                if len(values) < len(elements):
+                    numbers += self._span(("property", prop.name, at), chosen)
+                self.facts.budget.spend(len(elements))
+                return min(numbers), max(numbers)
+            case "field" if node.value in self.facts.field_sets:
+                default = self.facts.field_defaults[str(node.value)]
+                if not isinstance(default, (int, float)):
+                    return _ANY
+                key = ("element", None, at)
+                if key in chosen and chosen[key] not in self.facts.field_sets[str(node.value)]:
+                    return default, default
+                low, high = self._span(_opaque(node, at), chosen)
+                return (low, high) if key in chosen else (min(low, default), max(high, default))
+            case "draw":
+                return self._span(("draw", node.value, at), chosen)
+            case "look":
+                return self._bounds(node.args[0], _plus(at, node.value), chosen)
+            case _ if _is_opaque(node):
+                return self._span(_opaque(node, at), chosen)
+        args = [self._bounds(arg, at, chosen) for arg in node.args]
+        return _BOUNDS[node.op](node, *args)
+
+    def _span(self, key: Key, chosen: Assignment) -> Bounds:
+        """The least and the greatest value of a variable: domains ascend."""
+        if key in chosen:
+            return chosen[key], chosen[key]
+        domain = self._domains[key]
+        return (domain[0], domain[-1]) if key[0] != "draw" else (min(domain), max(domain))
+
 
 _EVALUATE: dict[str, Callable] = {
     "member": lambda node, a: a in node.value,
@@ -302,6 +372,42 @@ _EVALUATE: dict[str, Callable] = {
     "mod": lambda node, a: a % node.value,
 }
 """Exact evaluation of discrete operations."""
+
+
+def _chosen_bounds(node: Expr, condition: Bounds, yes: Bounds, no: Bounds) -> Bounds:
+    if condition[0] == condition[1]:
+        return yes if condition[0] else no
+    return min(yes[0], no[0]), max(yes[1], no[1])
+
+
+def _product_bounds(node: Expr, a: Bounds, b: Bounds) -> Bounds:
+    products = [x * y for x in a for y in b]
+    return min(products), max(products)
+
+
+def _abs_bounds(node: Expr, a: Bounds) -> Bounds:
+    return (0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))), max(abs(a[0]), abs(a[1]))
+
+
+_ANY: Bounds = (-math.inf, math.inf)
+_BOUNDS: dict[str, Callable[..., Bounds]] = {
+    "and": lambda node, a, b: (a[0] and b[0], a[1] and b[1]),
+    "or": lambda node, a, b: (a[0] or b[0], a[1] or b[1]),
+    "not": lambda node, a: (1 - a[1], 1 - a[0]),
+    "eq": lambda node, a, b: (a[0] == a[1] == b[0] == b[1], a[0] <= b[1] and b[0] <= a[1]),
+    "lt": lambda node, a, b: (a[1] < b[0], a[0] < b[1]),
+    "le": lambda node, a, b: (a[1] <= b[0], a[0] <= b[1]),
+    "add": lambda node, a, b: (a[0] + b[0], a[1] + b[1]),
+    "sub": lambda node, a, b: (a[0] - b[1], a[1] - b[0]),
+    "neg": lambda node, a: (-a[1], -a[0]),
+    "min": lambda node, a, b: (min(a[0], b[0]), min(a[1], b[1])),
+    "max": lambda node, a, b: (max(a[0], b[0]), max(a[1], b[1])),
+    "mod": lambda node, a: (a[0] % node.value,) * 2 if a[0] == a[1] else (0, node.value - 1),
+    "mul": _product_bounds,
+    "abs": _abs_bounds,
+    "choose": _chosen_bounds,
+}
+"""The same between bounds. Flags are 0, 1, False or True."""
 
 
 def _plus(at: Offset, offset: object) -> Offset:
@@ -335,14 +441,18 @@ def satisfiable(
     facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None
 ) -> bool:
     """False only if the conditions, each at its place, can never hold together."""
+    return decide(facts, conditions, lets) is not False
+
+
+def decide(
+    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None
+) -> bool | None:
+    """Whether the conditions may hold together; None if that takes too much work. False is a proof."""
     try:
-        facts.budget.spend(QUESTION)
-        search = Search(facts, lets)
-        for condition, at in conditions:
-            search.require(condition, at)
-        return search.possible()
+        with facts.budget.question():
+            return _search(facts, conditions, lets).possible()
     except _Exhausted:
-        return True
+        return None
 
 
 def example(
@@ -350,9 +460,16 @@ def example(
 ) -> dict[Offset, int]:
     """Elements by place with which the conditions hold together, or nothing where none can be told."""
     try:
-        search = Search(facts, lets)
-        for condition, at in conditions:
-            search.require(condition, at)
-        return search.example() if search.possible() else {}
+        with facts.budget.question():
+            search = _search(facts, conditions, lets)
+            return search.example() if search.possible() else {}
     except _Exhausted:
         return {}
+
+
+def _search(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None) -> Search:
+    facts.budget.spend(QUESTION)
+    search = Search(facts, lets)
+    for condition, at in conditions:
+        search.require(condition, at)
+    return search

@@ -160,7 +160,7 @@ class _StudyReader:
         names = dict.fromkeys(name for one in found.values() for name in one)
         self.set_names += names
         for value, _ in node.entries:
-            for name in names.keys() - found[value.text].keys():
+            for name in (name for name in names if name not in found[value.text]):
                 self.reporter.error("PD109", f"`{value.text}` does not set `{name}`", value.span, "others do")
         for word in (one for listed in lists.values() for one in self.reader.words(listed)):
             if word.text not in found:

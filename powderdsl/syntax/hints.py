@@ -183,7 +183,6 @@ def expected_words(accepted: Set[str]) -> str:
     if len(rest & _OPERATORS) > 3:
         words.add("an operator")
         rest -= _OPERATORS | {"DOT", "QMARK", "LPAR", "COMMA", "AND", "OR"}
-    for name in rest:
-        words.add(TERMINAL_WORDS.get(name, f"`{name.lower()}`"))
+    words |= {TERMINAL_WORDS.get(name, f"`{name.lower()}`") for name in rest}
     listed = sorted(words)[:8]
     return " or ".join(filter(None, [", ".join(listed[:-1]), listed[-1]])) if listed else ""

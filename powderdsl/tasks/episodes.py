@@ -108,7 +108,7 @@ class TaskProgram:
             if len(places):
                 made = maker.make(seeds[places])
                 ids[places] = made.ids
-                for name in regions.keys() - self._fixed.keys():
+                for name in (name for name in regions if name not in self._fixed):
                     regions[name][places] = made.regions[name]
                 for name, target in targets.items():
                     target[places] = made.targets[name]

@@ -52,7 +52,7 @@ class GoalChecker:
 
     def __post_init__(self) -> None:
         names: dict[str, Operand] = {name: Number(Fraction(value)) for name, value in self.knobs.items()}
-        names |= {name: Expr("let", FLAG, value=REGION_LET + name) for name in self.regions}
+        names |= {name: Expr("let", FLAG, value=REGION_LET + name) for name in sorted(self.regions)}
         self.scope = Scope("", names)
 
     def number(self, syntax: Syntax) -> Scalar | None:

@@ -321,9 +321,9 @@ class _TaskReader:
             changes["knobs"] = values
         if "let" in entries:
             given = read_lets(entries["let"][1], self.reader)
-            here = {word.text for word, _ in plan.lets}
+            here = dict.fromkeys(word.text for word, _ in plan.lets)
             for word, _ in given:
-                self.known(word, dict.fromkeys(here), "number")
+                self.known(word, here, "number")
             other = {word.text: amount for word, amount in given}
             changes["lets"] = [(word, other.get(word.text, amount)) for word, amount in plan.lets]
         if "parts" in entries:

@@ -201,7 +201,7 @@ class WorldMaker:
         if len(made) == 1:
             return made[0]
         regions = dict(made[0].regions)
-        for name in regions.keys() - self.fixed_cells.keys():
+        for name in (name for name in regions if name not in self.fixed_cells):
             regions[name] = torch.cat([one.regions[name] for one in made])
         targets = {name: torch.cat([one.targets[name] for one in made]) for name in made[0].targets}
         return Made(torch.cat([one.ids for one in made]), regions, targets)
