@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from time import monotonic
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from powderdsl.model.reactions import unchanging_ids
 from powderdsl.model.types import Ruleset
 from powderdsl.properties.running import run_sample
 from powderdsl.properties.samples import Array, Sample, State
-from powderdsl.properties.shrink import shrink_while
+from powderdsl.properties.shrink import Work, shrink_while
 from powderdsl.simulator import Simulator
 
 ROUNDS = (
@@ -40,8 +39,8 @@ GROUP = 8
 SEEDS = 16
 """With how many seeds a smaller world is tried."""
 
-SECONDS = 20.0
-"""How long a world is made smaller at most."""
+WORK = 1_000_000_000
+"""Work for making a world smaller, see `properties.shrink`."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Distinction:
 
 
 def distinguish(
-    first: Simulator, second: Simulator, focus: Sequence[int] = (), seed: int = 0, seconds: float = SECONDS
+    first: Simulator, second: Simulator, focus: Sequence[int] = (), seed: int = 0
 ) -> Distinction | None:
     """A small world on which two simulators differ, or None if none was found.
 
@@ -73,7 +72,7 @@ def distinguish(
             found = np.nonzero(when)[0]
             if len(found):
                 best = int(found[when[found].argmin()])
-                return _small(first, second, sample.one(best), int(when[best]), names, seconds)
+                return _small(first, second, sample.one(best), int(when[best]), names)
     return None
 
 
@@ -84,13 +83,13 @@ def _observed(first: Simulator, second: Simulator) -> list[tuple[str, ...]]:
 
 
 def _small(
-    first: Simulator, second: Simulator, sample: Sample, steps: int, names: tuple[str, ...], seconds: float
+    first: Simulator, second: Simulator, sample: Sample, steps: int, names: tuple[str, ...]
 ) -> Distinction:
     def judge(some: Sample, most: int) -> Array:
         return differs_after(first, second, some, most, names)
 
     tries = SEEDS if first.ruleset.streams or second.ruleset.streams else 1
-    small, steps = shrink_while(judge, sample, steps, tries, monotonic() + seconds)
+    small, steps = shrink_while(judge, sample, steps, tries, Work.of(first.ruleset, WORK))
     if tries == 1:
         small = replace(small, seeds=np.zeros_like(small.seeds))
     one, other = (run_sample(sim, small, steps)[0][-1] for sim in (first, second))

@@ -7,7 +7,6 @@ breaks an invariant refutes it. That none does says nothing; `powderdsl test` tr
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from time import monotonic
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from powderdsl.properties.breaks import Alike
 from powderdsl.properties.outcomes import Counterexample, Property, counterexample_lines
 from powderdsl.properties.samples import Sample, random_samples
 from powderdsl.properties.search import Plan, Search, counterexample
+from powderdsl.properties.shrink import Work
 
 WORLDS = 192
 """Small worlds that are tried, and a few larger ones: enough for mistakes that happen often."""
@@ -32,8 +32,8 @@ FOCUSED = 2
 FEW = 4
 """More elements than these say nothing about what a line is about."""
 
-SECONDS = 4.0
-"""How long all the worlds that were found may be made smaller."""
+WORK = 200_000_000
+"""Work for making all the worlds that were found smaller: some seconds."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class Broken:
     found: Counterexample
 
 
-def refuted(ruleset: Ruleset, ledger: Ledger, seconds: float = SECONDS) -> tuple[Diagnostic, ...]:
+def refuted(ruleset: Ruleset, ledger: Ledger) -> tuple[Diagnostic, ...]:
     """An error for each invariant that a world breaks. The same rules give the same worlds."""
     reporter = Reporter()
-    for one in broken_invariants(ruleset, ledger, seconds):
+    for one in broken_invariants(ruleset, ledger):
         steps = "1 step" if one.found.steps == 1 else f"{one.found.steps} steps"
         world = [line for line in counterexample_lines(one.found, ruleset) if not line.startswith("by ")]
         reporter.report(
@@ -62,8 +62,8 @@ def refuted(ruleset: Ruleset, ledger: Ledger, seconds: float = SECONDS) -> tuple
     return reporter.diagnostics
 
 
-def broken_invariants(ruleset: Ruleset, ledger: Ledger, seconds: float = SECONDS) -> list[Broken]:
-    """The invariants that a few worlds break, each with a world that was made small for some time."""
+def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Broken]:
+    """The invariants that a few worlds break, each with a world that was made small."""
     oracle = Oracle(ruleset, ruleset.passes)
     search = Search.of(oracle, Plan(), declared_only=True, ledger=ledger)
     for number, sample in enumerate(random_samples(ruleset, 0, WORLDS)):
@@ -72,14 +72,15 @@ def broken_invariants(ruleset: Ruleset, ledger: Ledger, seconds: float = SECONDS
         search.try_sample(sample, STEPS)
         if number < FOCUSED:
             _try_focused(search, sample)
-    found = []
-    until = monotonic() + seconds
-    for trial in search.trials:
-        if trial.sample is not None:
-            left = max(0.0, until - monotonic()) / 2
-            small = counterexample(trial.claim, oracle, trial.sample, trial.steps, left)
-            found.append(Broken(trial.prop, small))
-    return found
+    broken = [trial for trial in search.trials if trial.sample is not None]
+    return [
+        Broken(
+            one.prop,
+            counterexample(one.claim, oracle, one.sample, one.steps, Work.of(ruleset, WORK // len(broken))),
+        )
+        for one in broken
+        if one.sample is not None
+    ]
 
 
 def _try_focused(search: Search, sample: Sample) -> None:

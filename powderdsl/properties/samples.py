@@ -170,7 +170,7 @@ def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Sample]:
         shape = SHAPES[number % len(SHAPES)]
         groups = []
         for group in range(min(batch, left + ALIKE - 1) // ALIKE):
-            choices = Choices.seeded(hash((seed, number, group)))
+            choices = Choices.seeded((seed * 1_000_003 + number) * batch + group)
             sample = sample_of(random_start(ruleset, choices, (ALIKE, *shape)))
             if group % 2:
                 sample = replace(sample, fields={}, params={})

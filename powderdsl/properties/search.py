@@ -30,7 +30,7 @@ from powderdsl.properties.breaks import (
 from powderdsl.properties.outcomes import Counterexample, Property, Result
 from powderdsl.properties.proofs import prove
 from powderdsl.properties.samples import LARGE, Sample, random_samples
-from powderdsl.properties.shrink import shrink
+from powderdsl.properties.shrink import Work, shrink
 
 AUTOMATIC = "automatic"
 
@@ -177,10 +177,10 @@ class Search:
 
 
 def counterexample(
-    claim: Tested, runner: Runs, sample: Sample, steps: int, seconds: float = 10.0
+    claim: Tested, runner: Runs, sample: Sample, steps: int, work: Work | None = None
 ) -> Counterexample:
-    """A world that breaks a claim, made small for at most so many seconds."""
-    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps, seconds))
+    """A world that breaks a claim, made as small as the work allows."""
+    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps, work))
 
 
 def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Counterexample:

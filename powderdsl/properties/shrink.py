@@ -7,11 +7,11 @@ does for a smaller world what the first one did for the larger.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from time import monotonic
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from powderdsl.model.types import Ruleset
 from powderdsl.properties.breaks import Agreement, Alike, Runs, Tested, breaks, is_paired, steps_for
 from powderdsl.properties.samples import Array, Sample
 
@@ -20,41 +20,63 @@ SEEDS = 24
 
 MAX_BATCH = 1024
 
+WORK = 500_000_000
+"""Work for one world, ten seconds or so: most need a hundredth of it."""
+
+RULE = 15_000
+"""What a rule costs in each step of a batch, in cells that it looks at."""
+
+
+@dataclass
+class Work:
+    """Work that is left, counted in cells that rules look at: a limit in seconds would end elsewhere in each run."""
+
+    rules: int
+    left: int
+
+    @classmethod
+    def of(cls, ruleset: Ruleset, left: int = WORK) -> Work:
+        """So much work with the rules of a ruleset."""
+        return cls(1 + sum(len(moment.rules) for one in ruleset.passes for moment in one.moments), left)
+
+    def spend(self, batch: Sample, steps: int) -> None:
+        self.left -= self.rules * steps * (RULE + batch.ids.size)
+
 
 Judge = Callable[[Sample, int], Array]
 """After which step each world of a sample, run for so many steps, is what is looked for: int [B], 0 if it is not."""
 
 
 def shrink(
-    claim: Tested, runs: Runs, sample: Sample, steps: int, seconds: float = 10.0
+    claim: Tested, runs: Runs, sample: Sample, steps: int, work: Work | None = None
 ) -> tuple[Sample, int]:
     """The smallest world found that still breaks the claim, and after how many steps. `sample` is one world.
 
-    It ends when nothing goes any more, or after so many seconds.
+    It ends when no smaller world breaks the claim, or when the work is used up: a claim gives the same world each time.
     """
-    until = monotonic() + seconds
+    work = Work.of(runs.ruleset) if work is None else work
     tries = 1 if isinstance(claim, Agreement | Alike) or not runs.ruleset.streams else SEEDS
     sample, steps = _later(claim, runs, sample, steps)
     sample, steps = shrink_while(
-        lambda some, most: breaks(claim, runs, some, most).first, sample, steps, tries, until
+        lambda some, most: breaks(claim, runs, some, most).first, sample, steps, tries, work
     )
     if not runs.ruleset.streams:
         sample = replace(sample, seeds=np.zeros_like(sample.seeds))
     return sample, steps
 
 
-def shrink_while(judge: Judge, sample: Sample, steps: int, tries: int, until: float) -> tuple[Sample, int]:
+def shrink_while(judge: Judge, sample: Sample, steps: int, tries: int, work: Work) -> tuple[Sample, int]:
     """The smallest world found for which the judge still says yes, and after how many steps.
 
     Args:
         tries: with how many seeds each smaller world is tried, its own first.
-        until: when to end, by the monotonic clock, even if something smaller might be found.
+        work: when it is used up, the search ends, even if something smaller might be found.
     """
-    while monotonic() < until:
+    while work.left > 0:
         smaller = sample
         for group in _GROUPS:
-            while monotonic() < until:
-                found = _first(judge, group(smaller), steps, tries)
+            while work.left > 0:
+                found = _first(judge, group(smaller), steps, tries, work)
                 if found is None:
                     break
                 smaller, steps = found
@@ -73,12 +95,15 @@ def _later(claim: Tested, runs: Runs, sample: Sample, steps: int) -> tuple[Sampl
     return (late, 1) if breaks(claim, runs, late, 1).first.any() else (sample, steps)
 
 
-def _first(judge: Judge, candidates: list[Sample], steps: int, tries: int) -> tuple[Sample, int] | None:
+def _first(
+    judge: Judge, candidates: list[Sample], steps: int, tries: int, work: Work
+) -> tuple[Sample, int] | None:
     """The first of these worlds of one shape that the judge accepts, with the seed that does it soonest."""
     most = max(MAX_BATCH // tries, 1)
     for start in range(0, len(candidates), most):
         some = candidates[start : start + most]
         batch = _together([_seeded(one, number) for one in some for number in range(tries)])
+        work.spend(batch, steps)
         first = judge(batch, steps)
         broken = np.nonzero(first)[0]
         if len(broken):

@@ -88,7 +88,7 @@ def try_mutation(mutation: Mutation, folder: Path) -> Caught:
         results = run_examples(replace(ruleset, tests=named))
         return Caught((), tuple(result.example.name for result in results if not result.passed))
     some = tuple(one for one in ruleset.invariants if not statement or one_line(one.span) == statement)
-    broken = broken_invariants(replace(ruleset, invariants=some), ledger(ruleset), seconds=60.0)
+    broken = broken_invariants(replace(ruleset, invariants=some), ledger(ruleset))
     sizes = [(*one.found.before.shape, one.found.steps) for one in broken]
     return Caught(("PD512",), (), sizes[0]) if sizes else Caught()
 
