@@ -109,7 +109,7 @@ def add(folder: Path, key: str, built: Path, about: dict[str, Any]) -> Path:
 def entries(folder: Path) -> list[Entry]:
     """What lies in the cache, the last used first."""
     found = []
-    for place in folder.iterdir():
+    for place in sorted(folder.iterdir()):
         about = None if place.name.startswith(".") else _about(place)
         if about is not None:
             with suppress(OSError):
@@ -123,7 +123,7 @@ def clear(folder: Path, older_than: float = 0.0) -> list[Entry]:
     for entry in gone:
         _discard(folder / entry.key)
     if older_than <= 0:
-        for place in folder.iterdir():
+        for place in sorted(folder.iterdir()):
             # A lock may be held, and what is being built belongs to another process.
             if place.suffix != ".lock" and not is_scratch(place.name):
                 _discard(place)
@@ -139,7 +139,7 @@ def tidy(folder: Path, limit: int = LIMIT, keep: str = "") -> None:
         if total > limit and entry.key != keep:
             _discard(folder / entry.key)
     sweep(folder)
-    for place in folder.iterdir():
+    for place in sorted(folder.iterdir()):
         if place.suffix == ".lock":
             _remove_free_lock(place)
         with suppress(OSError):

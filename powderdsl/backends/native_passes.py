@@ -45,7 +45,7 @@ class PassWriter(ValueWriter):
             key
             for step in pass_.moments
             for guard in dict.fromkeys(step.guards)
-            for key in {id(part) for part in _conjunctions(guard)}
+            for key in dict.fromkeys(id(part) for part in _conjunctions(guard))
         )
         self.shared = {key for key, count in asked.items() if count > 1}
         """Parts of several masks: where such a plane is empty, all of them are."""

@@ -64,7 +64,7 @@ def asked_now(guards: list[Node], planes: int, elements: dict[int, int]) -> Aske
 
 def _asked(masks: list[Node], planes: int, elements: dict[int, int]) -> Asked | None:
     found = _Needs(planes, elements)
-    asked = {found.asked(mask) for mask in masks}
+    asked = dict.fromkeys(found.asked(mask) for mask in masks)
     return None if frozenset() in asked else tuple(sorted(asked, key=sorted))
 
 

@@ -125,7 +125,7 @@ def _held(folder: Path) -> Iterator[None]:
 
 def _begun(folder: Path, recipe: Recipe) -> Manifest:
     """The manifest to go on with: a new one, or that of the same recipe with the shards that are whole."""
-    for left in [*folder.glob(".shard-*.npz"), *folder.glob(".dataset-*.json")]:
+    for left in sorted([*folder.glob(".shard-*.npz"), *folder.glob(".dataset-*.json")]):
         left.unlink(missing_ok=True)  # of a process that was killed
     if not (folder / FILE).exists():
         manifest = new_manifest(recipe)

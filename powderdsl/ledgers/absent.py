@@ -55,7 +55,9 @@ def _wants(rule: Rule, asked: Asked, lets: list[Let], named: Ids) -> Wants:
     nodes = list(_nodes_of(rule, {**{let.name: let.value for let in lets}, **asked.lets}))
     reads_names = any(node.op in ("field", "let") and node.kind == ELEMENT for node in nodes)
     sets = [frozenset(node.value) for node in nodes if node.op == "member"]
-    candidates = [frozenset({number}) for number in asked.facts.ids] + sorted(set(sets), key=_by_size)
+    candidates = [frozenset({number}) for number in asked.facts.ids] + sorted(
+        dict.fromkeys(sets), key=_by_size
+    )
     needs: list[Ids] = []
     copies: set[int] = set()
     for ids in candidates:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.apart import Glances
 from powderdsl.model.operands import ELEMENT_HERE, negation
 from powderdsl.model.operands import member as member_of
 from powderdsl.model.satisfy import BUDGET, Budget, Facts, decide, example, satisfiable
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 
 HERE: Offset = (0, 0)
 
-ALL_PASSES = 3
-"""Work for the conflicts of all passes together, as a multiple of that for one."""
+ALL_MOMENTS = 3
+"""Work for the conflicts of all moments together, as a multiple of that for one."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,9 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
     alive: dict[Span, bool] = {}
     useful: dict[Span, bool] = {}
     conflicts: dict[Conflict, tuple[str, list[str]]] = {}
-    work: list[int] = []
+    work: list[tuple[int, int, Pass]] = []
+    left = ALL_MOMENTS * BUDGET
     for pass_ in passes:
-        given = min(BUDGET, ALL_PASSES * BUDGET - sum(work))
-        asked = replace(facts, budget=Budget(given))
         for moment in pass_.moments:
             lets = {let.name: let.value for let in moment.lets}
             live = []
@@ -88,10 +88,13 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
                 elif rule.mask is not None:
                     silent.setdefault(rule.span, []).append((rule.mask, lets))
             if moment.policy == "prove":
+                given = min(BUDGET, left)
+                asked = replace(facts, budget=Budget(given))
                 for conflict, words in _check_moment(live, asked, lets):
                     conflicts.setdefault(conflict, (words, []))[1].append(moment.label)
-        work.append(given - asked.budget.left)
-    if _too_much(passes, work, reporter):
+                work.append((given - asked.budget.left, len(live), pass_))
+                left -= work[-1][0]
+    if _too_much(work, reporter):
         return
     for conflict, (words, labels) in conflicts.items():
         conflict.report(labels, words, reporter)
@@ -119,21 +122,27 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
             )  # fmt: skip
 
 
-def _too_much(passes: tuple[Pass, ...], work: list[int], reporter: Reporter) -> bool:
-    """Report passes whose rules take too much work to compare. Work is counted: the same rules always take the same."""
-    hard = [pass_ for pass_, spent in zip(passes, work, strict=True) if spent > BUDGET]
-    together = sum(work) > ALL_PASSES * BUDGET
-    for pass_ in hard or ([passes[work.index(max(work))]] if together else []):
-        rest = "" if pass_ in hard else ", together with those of the other passes"
+def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
+    """Report moments whose rules take too much work to compare. Work is counted: the same rules always take the same.
+
+    Args:
+        work: for each moment the work that was spent, the number of its rules, and its pass.
+    """
+    hard = {pass_.name: (count, pass_) for spent, count, pass_ in work if spent > BUDGET}
+    together = sum(spent for spent, _, _ in work) > ALL_MOMENTS * BUDGET
+    if together and not hard:
+        _, count, most = max(work, key=lambda one: one[0])
+        hard = {most.name: (count, most)}
+    for count, pass_ in hard.values():
         reporter.error(
-            "PD508", f"comparing the rules of `{pass_.name}` with each other{rest} takes too much work", pass_.span,
-            "whether two of its rules claim one cell is not known",
+            "PD508", f"comparing the rules of `{pass_.name}` with each other takes too much work", pass_.span,
+            f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs",
             helps=[
                 "choose what happens to conflicts, then nothing is compared: `conflicts: first_wins`",
-                "or put rules that need not happen at once under `then:`",
+                "or divide the list until its parts are short enough: rules that need not happen at once go under `then:`",
             ],
         )  # fmt: skip
-    return bool(hard) or together
+    return bool(hard)
 
 
 def _report_sleep(reason: str, span: Span, reporter: Reporter) -> None:
@@ -153,12 +162,13 @@ def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
 def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Iterator[tuple[Conflict, str]]:
     """The conflicts of one moment, with an example: for each rule the first one, maybe itself, that it meets."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
+    glances = Glances([rule.mask for rule in movers], facts, lets)
     for i, second in enumerate(movers):
         undecided = None
         for first in (second, *movers[:i]):
             if facts.budget.is_exhausted:
                 return
-            answer, question = _meet(first, second, facts, lets)
+            answer, question = _meet(first, second, glances, facts, lets)
             if answer:
                 yield _conflict(first, second), _in_words(facts, question, lets)
                 break
@@ -178,11 +188,15 @@ def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Ite
 
 
 def _meet(
-    first: Rule, second: Rule, facts: Facts, lets: dict[str, Expr]
+    first: Rule, second: Rule, glances: Glances, facts: Facts, lets: dict[str, Expr]
 ) -> tuple[bool | None, Sequence[tuple[Expr, Offset]]]:
     """Whether two rules may claim one cell, and the conditions with which they do; None if that is too hard."""
     answer: bool | None = False
+    assert first.mask is not None
+    assert second.mask is not None
     for at in _claims(first, second):
+        if glances.apart(first.mask, second.mask, at):
+            continue
         question = ((first.mask, HERE), (second.mask, at))
         found = decide(facts, question, lets)
         if found:
@@ -197,11 +211,14 @@ def _check_assigns(
 ) -> Iterator[tuple[Conflict, str]]:
     """Two `:=` of one field must not meet in a cell with different values."""
     sets = [(assign, mask) for assign, mask in assigns if assign.op == ":=" and mask is not None]
+    glances = Glances([mask for _, mask in sets], facts, lets)
     for i, (b, second) in enumerate(sets):
         for a, first in sets[:i]:
             if a.field != b.field or a.value == b.value or facts.budget.is_exhausted:
                 continue
             shift = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
+            if glances.apart(first, second, shift):
+                continue
             question = ((first, HERE), (second, shift))
             answer = decide(facts, question, lets)
             if answer is not False and not facts.budget.is_exhausted:

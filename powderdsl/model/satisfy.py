@@ -161,6 +161,24 @@ class Search:
 
     def possible(self) -> bool:
         """False if no assignment satisfies all conditions."""
+        joint = self._narrow()
+        if joint is None:
+            return False
+        # Small domains first; what is equally small in the order in which the conditions name it.
+        order = sorted(
+            {key: None for one in joint for key in one.keys}, key=lambda key: len(self._domains[key])
+        )
+        return self._assign(order, 0, joint, self._chosen)
+
+    def alone(self) -> dict[Key, frozenset[object]] | None:
+        """What conditions on one variable leave of it, draws left out; None if one of them leaves nothing."""
+        if self._narrow() is None:
+            return None
+        cut = {key: values for key, values in self._domains.items() if key[0] != "draw"}
+        return {key: frozenset(values) for key, values in cut.items() if len(values) < len(self._domain(key))}
+
+    def _narrow(self) -> list[_Joint] | None:
+        """Apply the conditions on one variable; the others, or None if no assignment is left."""
         variables = [self._variables(condition, at) for condition, at in self.conditions]
         domains = self._domains = {}
         for keys in variables:
@@ -172,18 +190,16 @@ class Search:
             if keys is None:
                 continue
             if not keys and not self._holds(condition, at, {}):
-                return False
+                return None
             if len(keys) == 1:
                 (key,) = keys
                 domains[key] = [v for v in domains[key] if self._holds(condition, at, {key: v})]
                 if not domains[key]:
-                    return False
+                    return None
             if len(keys) > 1:
                 compares = any(node.op in ("eq", "lt", "le") for node in condition.walk())
                 joint.append(_Joint(condition, at, keys, compares))
-        # Small domains first; what is equally small in the order in which the conditions name it.
-        order = sorted({key: None for one in joint for key in one.keys}, key=lambda key: len(domains[key]))
-        return self._assign(order, 0, joint, self._chosen)
+        return joint
 
     def example(self) -> dict[Offset, int]:
         """After `possible`: an element for each place that the conditions ask about."""
@@ -353,7 +369,7 @@ class Search:
         if key in chosen:
             return chosen[key], chosen[key]
         domain = self._domains[key]
-        return (domain[0], domain[-1]) if key[0] != "draw" else (min(domain), max(domain))
+        return (domain[0], domain[-1]) if key[0] != "draw" else (0.0, 1.0)
 
 
 _EVALUATE: dict[str, Callable] = {
@@ -453,6 +469,15 @@ def decide(
             return _search(facts, conditions, lets).possible()
     except _Exhausted:
         return None
+
+
+def alone(facts: Facts, condition: Expr, lets: dict[str, Expr]) -> dict[Key, frozenset[object]]:
+    """What a condition leaves of variables that parts of it decide alone: an element, a field, a count at a place."""
+    try:
+        with facts.budget.question():
+            return _search(facts, [(condition, (0, 0))], lets).alone() or {}
+    except _Exhausted:
+        return {}
 
 
 def example(

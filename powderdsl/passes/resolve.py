@@ -140,8 +140,8 @@ def _substitute(
         members = known[node.args[0]]
         assert isinstance(members, frozenset)
         assert isinstance(node.attr, tuple)
-        values = {node.attr[i] for i in members if i < len(node.attr)}
-        return build.whole(values.pop()) if len(values) == 1 else node
+        values = sorted({node.attr[i] for i in members if i < len(node.attr)})
+        return build.whole(values[0]) if len(values) == 1 else node
     if node.op not in _LOGIC or _tables(node, tables).isdisjoint(known):
         return node
     if node not in done:

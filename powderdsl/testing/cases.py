@@ -172,9 +172,7 @@ def _values(ruleset: Ruleset, slot: Slot, ids: np.ndarray, fill: _Fill) -> np.nd
 
 def _wholes(lo: int, hi: int, choices: Choices) -> list[int]:
     near = {min(max(v, lo), hi) for v in (0, 1, -1, 2, lo, hi, lo + 1, hi - 1)}
-    return sorted(
-        {*near, *(choices.whole(lo, hi) for _ in range(3))}, key=lambda number: (abs(number), number)
-    )
+    return sorted(sorted({*near, *(choices.whole(lo, hi) for _ in range(3))}), key=abs)
 
 
 def _reals(lo: float, hi: float, choices: Choices) -> list[float]:

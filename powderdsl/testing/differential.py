@@ -169,7 +169,7 @@ def _compiled(ruleset: Ruleset, backend: str, how: Building, threads: int) -> Si
 
 def _forget(folder: Path) -> None:
     """Remove the libraries that this process has just loaded: no other ruleset has the same, and they pile up."""
-    for entry in folder.iterdir():
+    for entry in sorted(folder.iterdir()):
         if entry.is_dir():
             shutil.rmtree(entry, ignore_errors=True)
         else:
