@@ -21,7 +21,7 @@ from powderdsl.properties.samples import Sample, random_samples
 from powderdsl.properties.search import Plan, Search, counterexample
 from powderdsl.properties.shrink import Work
 
-WORLDS = 192
+WORLDS = 256
 """Small worlds that are tried, and a few larger ones: enough for mistakes that happen often."""
 
 STEPS = 2
