@@ -141,7 +141,7 @@ def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
         raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
     try:
         sweep(folder)
-        for inner in folder.iterdir():
+        for inner in sorted(folder.iterdir()):
             sweep(inner)
         yield
     finally:
