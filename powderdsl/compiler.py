@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import Reporter, Severity, Source, suggest
 from powderdsl.model.check import check
+from powderdsl.model.compose import compose
 from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.layout import own_slots
 from powderdsl.model.packs import read_file
 from powderdsl.model.palette import Palette
 from powderdsl.model.types import Param, Ruleset, Value
@@ -94,6 +96,27 @@ def load_with_diagnostics(
         model = set_params(model, params, reporter)
     reporter.raise_if_errors()
     return model, tuple(d for d in reporter.diagnostics if d.severity is not Severity.ERROR)
+
+
+def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
+    """Where a model has room for the elements of some rules: by slot, a qualified name or None.
+
+    Packs that are left out have their places too. The ids of a ruleset's own packs, or of a list of packs, stay as they
+    are; the elements of packs that are added to a ruleset follow without gaps.
+
+    Raises:
+        CompileError: with what is wrong with the files, their names and ids.
+    """
+    reporter = Reporter()
+    packs, ruleset = read([word for name in names for word in split_names(name)[0]], reporter)
+    reporter.raise_if_errors()
+    composition = compose(packs, ruleset, reporter)
+    reporter.raise_if_errors()
+    own = own_slots(composition) if ruleset else composition.slots
+    by_id = {element.id: element.qualified for element in composition.elements.values()}
+    return tuple(by_id.get(number) for number in range(own)) + tuple(
+        name for number, name in by_id.items() if number >= own
+    )
 
 
 def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl], RulesetDecl | None]:

@@ -35,7 +35,7 @@ def start_key(ruleset: Ruleset) -> str:
     """What native code of a ruleset is remembered under. Raises NoCompiler if none could be made here."""
     compiler = find_compiler()
     params = tuple(replace(param, default=0, about="") for param in ruleset.params)
-    said = fingerprint(replace(ruleset, params=params, tests=(), invariants=(), about=""))
+    said = fingerprint(replace(ruleset, params=params))
     return cache_key(said + generator(), compiler, flags_for(compiler, current().level))
 
 

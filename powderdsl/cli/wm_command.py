@@ -136,6 +136,9 @@ def command() -> None:
 )
 @_data_options
 @click.option("--width", type=WholeType(1, 1024), help="Features of the first block.")
+@click.option(
+    "--slots", type=WholeType(1, 256), help="Room for this many elements, for packs that come later."
+)
 @_training_options
 def train_command(
     preset: str,
@@ -186,7 +189,7 @@ def train_command(
         ),
     )
     changes = _given(
-        **{name: values[name] for name in ("width", "iterations", "batch", "learning_rate", "seed")}
+        **{name: values[name] for name in ("width", "iterations", "batch", "learning_rate", "seed", "slots")}
     )
     config = replace(config, data=data, **changes)
     _run(config, folder or Path("runs") / _file_word(data.task), values)
@@ -194,7 +197,7 @@ def train_command(
 
 @command.command("finetune", cls=ManyWords)
 @click.argument("run", metavar="RUN")
-@_words("--packs", "The packs to learn: added to the run's rules, and all that worlds draw.")
+@_words("--packs", "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.")
 @_training_options
 def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
     """Go on from a run's weights, on worlds of other packs' elements alone.
@@ -209,7 +212,8 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     trained = load_trained(run, device="cpu")
     names = ("iterations", "batch", "learning_rate", "seed")
     config = finetuned(trained, packs, **_given(**{name: values[name] for name in names}))
-    target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{'-'.join(packs)}")
+    words = "-".join(config.data.only)
+    target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
     note = {"parent": {"path": str(trained.run.path), "iterations": trained.checkpoint.step}}
     _run(config, target, values, parent=trained.checkpoint, note=note)
 
@@ -357,7 +361,7 @@ def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_ou
     from powderdsl.tasks.shipped_tasks import load_task
     from powderdsl.worldmodel.rule_words import keep, leave_out
 
-    base = rules or load_task(task).ruleset.name
+    base = rules or "+".join(load_task(task).rules)
     return keep(base, packs) if packs else leave_out(base, held_out)
 
 

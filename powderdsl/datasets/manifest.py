@@ -16,7 +16,8 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.worlds.files import failure, replacing
 
 FORMAT = "powderdsl-dataset"
-VERSION = 1
+VERSION = 2
+"""Version 1 had other fingerprints, which say nothing any more: they are read as unknown."""
 FILE = "dataset.json"
 MAX_BYTES = 1 << 28
 """Of a manifest's text."""
@@ -135,7 +136,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise damaged(f"{path} is no manifest", " ".join(str(error).split())) from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise damaged(f"{path} is no manifest", f'it lacks "format": "{FORMAT}"')
-    if data.get("version") != VERSION:
+    if data.get("version") not in (1, VERSION):
         raise damaged(
             f"{path} has the version {_short(data.get('version'))}", f"this powderdsl reads {VERSION}"
         )
@@ -150,6 +151,8 @@ def read_manifest(folder: Path) -> Manifest:
     if problems:
         raise many_damaged(path, problems)
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in recipe.items()}
+    if data["version"] == 1:
+        values |= dict.fromkeys(FINGERPRINTS, "")
     checked = Recipe(**values)
     problems = list(_misfits(checked))
     rows = [] if problems else _rows(checked, data["shards"], problems)
@@ -186,11 +189,16 @@ def many_damaged(path: Path, problems: list[str]) -> CompileError:
     )
 
 
+FINGERPRINTS = ("task_fingerprint", "ruleset_fingerprint")
+
+
 def differences(old: Recipe, new: Recipe) -> list[str]:
-    """Where two recipes differ, with both values."""
+    """Where two recipes differ, with both values. An unknown fingerprint differs from none."""
     found = []
     for field in fields(Recipe):
         a, b = getattr(old, field.name), getattr(new, field.name)
+        if field.name in FINGERPRINTS and not (a and b):
+            continue
         if isinstance(a, Mapping):
             keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
             found += [f"{field.name}.{key}: {_short(a.get(key))}, not {_short(b.get(key))}" for key in keys]

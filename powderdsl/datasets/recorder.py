@@ -135,7 +135,9 @@ def _begun(folder: Path, recipe: Recipe) -> Manifest:
         if differ:
             helps = ("take another folder, or the values that it was begun with",)
             raise failure("PD631", f"{folder} has another dataset", notes=tuple(differ[:20]), helps=helps)
-        manifest = replace(manifest, shards=tuple(row for row in manifest.shards if is_whole(folder, row)))
+        manifest = replace(
+            manifest, recipe=recipe, shards=tuple(row for row in manifest.shards if is_whole(folder, row))
+        )
     write_manifest(folder, manifest)
     return manifest
 

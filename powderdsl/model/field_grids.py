@@ -83,7 +83,7 @@ class GridReader:
         return FieldGrid(self._name(key), tuple(cells), everywhere, key.span)
 
     def _name(self, key: Scalar) -> str:
-        """The field's name in all packs."""
+        """The global name of the field that the pack means."""
         return self.typer.symbols.composition.names.of(self.pack, key.text.removesuffix("?"))
 
     def _kind(self, key: Scalar) -> Kind:

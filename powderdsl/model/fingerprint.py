@@ -1,16 +1,22 @@
-"""A name for what a model says: equal models have equal fingerprints, in every process and on every machine."""
+"""A name for what a model means: equal models have equal fingerprints, in every process and on every machine."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from fractions import Fraction
+from types import MappingProxyType
+from typing import Any
+
+UNMEANING = MappingProxyType({"meaning": False})
+"""Metadata of dataclass fields that change nothing about what happens: texts, colors, tests."""
 
 
 def fingerprint(model: object) -> str:
     """64 hexadecimal digits for a value made of frozen dataclasses, tuples, frozen sets, numbers and text.
 
-    Fields that take no part in comparisons, such as places in files, take none here.
+    Fields that take no part in comparisons, such as places in files, take none here, nor do those with `UNMEANING` as
+    metadata. A field at its default counts as absent, so that new fields change no fingerprint.
 
     Raises:
         TypeError: something else was found.
@@ -22,7 +28,7 @@ def fingerprint(model: object) -> str:
 def _digest(value: object, known: dict[int, str]) -> str:
     if is_dataclass(value):
         if id(value) not in known:
-            parts = [_digest(getattr(value, field.name), known) for field in fields(value) if field.compare]
+            parts = [f"{field.name}={_digest(part, known)}" for field, part in _meaning(value)]
             text = f"{type(value).__name__}({','.join(parts)})"
             known[id(value)] = hashlib.sha256(text.encode()).hexdigest()
         return known[id(value)]
@@ -33,3 +39,13 @@ def _digest(value: object, known: dict[int, str]) -> str:
     if value is None or isinstance(value, str | int | float | Fraction):
         return repr(value)
     raise TypeError(f"no fingerprint of a {type(value).__name__}")
+
+
+def _meaning(value: Any) -> list[tuple[Field[Any], Any]]:
+    found = []
+    for field in fields(value):
+        part = getattr(value, field.name)
+        default = field.default_factory() if field.default_factory is not MISSING else field.default
+        if field.compare and field.metadata.get("meaning", True) and (default is MISSING or part != default):
+            found.append((field, part))
+    return found

@@ -30,7 +30,7 @@ def matrix_channels(
     elements = composition.elements
     by_id = {element.id: element for element in elements.values()}
     channels: list[MatrixChannel] = []
-    size = _own_slots(composition)
+    size = own_slots(composition)
     first = [MatrixChannel(by_id[n].name if n in by_id else "", id=n) for n in range(size)]
     written = composition.ruleset.matrix if composition.ruleset else ()
     if written:
@@ -64,7 +64,7 @@ def matrix_channels(
     return tuple(channels)
 
 
-def _own_slots(composition: Composition) -> int:
+def own_slots(composition: Composition) -> int:
     """How many ids the first packs have room for."""
     if composition.ruleset is not None and composition.ruleset.slots:
         return composition.ruleset.slots

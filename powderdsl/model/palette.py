@@ -57,7 +57,10 @@ def composed_ids(claims: Iterable[Claim]) -> dict[str, int]:
 
 
 def recorded_ids(claims: Iterable[Claim], palette: Palette) -> dict[str, int]:
-    """Ids by global name, where a palette has them; others get its free ids, then those behind its end."""
+    """Ids by global name, where a palette has them; others get its free ids, then those behind its end.
+
+    An element that asks for a free id of the palette gets it.
+    """
     known = {name: number for number, name in enumerate(palette) if name is not None}
     ids: dict[str, int] = {}
     later: list[Claim] = []
@@ -67,7 +70,15 @@ def recorded_ids(claims: Iterable[Claim], palette: Palette) -> dict[str, int]:
             later.append(claim)
         else:
             ids[claim.name] = found
-    free = [n for n in range(MAX_ELEMENTS) if n >= len(palette) or palette[n] is None]
+    for claim in tuple(later):
+        wanted = claim.decl.id
+        known = wanted is not None and wanted < len(palette) and palette[wanted] is None
+        if wanted is not None and known and wanted not in ids.values():
+            ids[claim.name] = wanted
+            later.remove(claim)
+    taken = set(ids.values())
+    vacant = [n for n in range(len(palette)) if palette[n] is None and n not in taken]
+    free = [*vacant, *range(len(palette), MAX_ELEMENTS)]
     return ids | {claim.name: number for claim, number in zip(later, free, strict=False)}
 
 

@@ -13,6 +13,7 @@ from fractions import Fraction
 from typing import Any
 
 from powderdsl.diagnostics import Span
+from powderdsl.model.fingerprint import UNMEANING
 
 Offset = tuple[int, int]
 """(rows down, columns right)."""
@@ -121,10 +122,10 @@ class Element:
     name: str
     pack: str
     id: int
-    color: str
-    glyph: str
-    about: str
-    tags: frozenset[str]
+    color: str = field(metadata=UNMEANING)
+    glyph: str = field(metadata=UNMEANING)
+    about: str = field(metadata=UNMEANING)
+    tags: frozenset[str] = field(metadata=UNMEANING)
     span: Span = field(compare=False, repr=False)
 
     @property
@@ -185,7 +186,7 @@ class Param:
     name: str
     kind: Kind
     default: Any
-    about: str
+    about: str = field(metadata=UNMEANING)
     span: Span = field(compare=False, repr=False)
 
 
@@ -415,9 +416,9 @@ class MatrixChannel:
 class Ruleset:
     """A checked ruleset. `slots` is the number of ids, some of which may be vacant."""
 
-    name: str
-    about: str
-    packs: tuple[str, ...]
+    name: str = field(metadata=UNMEANING)
+    about: str = field(metadata=UNMEANING)
+    packs: tuple[str, ...] = field(metadata=UNMEANING)
     elements: tuple[Element, ...]
     slots: int
     properties: tuple[Property, ...]
@@ -428,8 +429,8 @@ class Ruleset:
     matrix: tuple[MatrixChannel, ...]
     order: tuple[str, ...] = ()
     """What a cell holds besides its element, as `model/layout.py` orders it."""
-    tests: tuple[Example, ...] = ()
-    invariants: tuple[Invariant, ...] = ()
+    tests: tuple[Example, ...] = field(default=(), metadata=UNMEANING)
+    invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
 
     def element(self, name: str) -> Element | None:
         """The element of a plain or qualified name."""

@@ -24,7 +24,10 @@ from powderdsl.scratch import sweep
 from powderdsl.worlds.files import failure, replacing
 
 ABOUT = "run.json"
-FORMAT = 1
+FORMAT = 2
+FIRST_FORMAT = 1
+FINGERPRINTS = ("rules_fingerprint", "task_fingerprint", "worlds")
+"""Settings that are hashes of what files said."""
 MAX_JSON = 1 << 24
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
 
@@ -181,7 +184,7 @@ def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
     whole = isinstance(about, dict) and isinstance(about.get("kind"), str)
     if not whole or not isinstance(about.get("config"), dict):
         raise _no_run(folder, f"its {ABOUT} is damaged")
-    if about.get("format") != FORMAT:
+    if about.get("format") not in (FIRST_FORMAT, FORMAT):
         raise _no_run(folder, f"its format is {about.get('format')!r}; this version reads {FORMAT}")
     if kind is not None and about["kind"] != kind:
         raise _no_run(folder, f"it is a run of the kind `{about['kind']}`; `{kind}` is needed here")
@@ -246,9 +249,12 @@ def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tupl
     if found.kind != kind:
         return (f"it is of the kind `{found.kind}`, not `{kind}`",)
     there, here = dict(_flat(found.config)), dict(_flat(config))
+    # Runs of the first format lack settings that came later, and have fingerprints that are no longer made.
+    first = found.about["format"] == FIRST_FORMAT
+    names = ({*there} & {*here}) - {*FINGERPRINTS} if first else {*there, *here}
     return tuple(
         f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
-        for name in sorted({*there, *here})
+        for name in sorted(names)
         if there.get(name) != here.get(name)
     )
 

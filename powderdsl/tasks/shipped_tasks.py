@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from powderdsl.compiler import read_source, shipped
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, suggest
+from powderdsl.model.palette import Palette
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.task_file import read_task
 from powderdsl.tasks.task_names import shipped_tasks
@@ -18,17 +19,23 @@ def load_task(
     *,
     knobs: Mapping[str, int] | None = None,
     params: Mapping[str, Any] | None = None,
+    packs: Sequence[str] = (),
+    palette: Palette | None = None,
 ) -> Task:
     """A shipped task by name, or a file.
 
     Args:
         knobs: values for knobs of the task.
         params: values for parameters of its rules, by qualified name.
+        packs: names or files of packs that are added to its rules.
+        palette: ids that were recorded, as `compiler.load` takes them.
 
     Raises:
         CompileError: with everything that is wrong.
     """
-    return load_task_with_diagnostics(name_or_path, knobs=knobs, params=params)[0]
+    return load_task_with_diagnostics(name_or_path, knobs=knobs, params=params, packs=packs, palette=palette)[
+        0
+    ]
 
 
 def load_task_with_diagnostics(
@@ -36,6 +43,8 @@ def load_task_with_diagnostics(
     *,
     knobs: Mapping[str, int] | None = None,
     params: Mapping[str, Any] | None = None,
+    packs: Sequence[str] = (),
+    palette: Palette | None = None,
 ) -> tuple[Task, tuple[Diagnostic, ...]]:
     """Like `load_task`; the second value has the warnings and notes."""
     reporter = Reporter()
@@ -50,7 +59,7 @@ def load_task_with_diagnostics(
     source = None if reporter.has_errors else read_source(path, reporter)
     reporter.raise_if_errors()
     assert source is not None
-    task = read_task(source, reporter, knobs=knobs, params=params)
+    task = read_task(source, reporter, knobs=knobs, params=params, packs=packs, palette=palette)
     return task, tuple(one for one in reporter.diagnostics if one.severity is not Severity.ERROR)
 
 

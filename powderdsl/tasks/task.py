@@ -195,6 +195,8 @@ class Task:
     agent: Agent
     goal: Goal
     splits: tuple[Split, ...]
+    rules: tuple[str, ...] = field(default=(), compare=False, repr=False)
+    """What was loaded as its ruleset, as `compiler.load` takes it."""
 
     def split(self, name: str) -> Split:
         """The split of a name. Raises KeyError."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from powderdsl.diagnostics import CompileError, Reporter, Source, Span, suggest
 from powderdsl.model.builtins import FUNCTIONS as RULE_FUNCTIONS
 from powderdsl.model.check import resolve_names
 from powderdsl.model.expressions import Typer
+from powderdsl.model.palette import Palette
 from powderdsl.model.schema import Reader, first_line
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
@@ -41,8 +42,12 @@ def read_task(
     *,
     knobs: Mapping[str, int] | None = None,
     params: Mapping[str, Any] | None = None,
+    packs: Sequence[str] = (),
+    palette: Palette | None = None,
 ) -> Task:
     """The checked task of a file's text; warnings stay with the reporter.
+
+    `packs` are added to its rules; `palette` has ids that were recorded.
 
     Raises:
         CompileError: with everything that is wrong in the file, and in its rules.
@@ -55,7 +60,7 @@ def read_task(
     assert tree is not None
     reader = Reader(reporter, TASK_KEYS)
     entries = reader.mapping(tree, "task", "a task")
-    rules = _read_rules(reader, entries, source, params)
+    rules = _read_rules(reader, entries, source, params, packs, palette)
     if rules is None:
         reporter.raise_if_errors()
         raise AssertionError("a task without rules was not reported")
@@ -63,9 +68,17 @@ def read_task(
 
 
 def _read_rules(
-    reader: Reader, entries: Entries, source: Source, params: Mapping[str, Any] | None
-) -> tuple[Ruleset, Typer] | None:
-    """The ruleset, and what checks expressions against it. What is wrong with the rules is reported here."""
+    reader: Reader,
+    entries: Entries,
+    source: Source,
+    params: Mapping[str, Any] | None,
+    packs: Sequence[str],
+    palette: Palette | None,
+) -> tuple[Ruleset, Typer, tuple[str, ...]] | None:
+    """The ruleset, what checks expressions against it, and what was loaded.
+
+    What is wrong with the rules is reported here.
+    """
     word = reader.scalar(entries, "rules")
     if word is None or not word.text:
         return None
@@ -85,8 +98,9 @@ def _read_rules(
             label = "rules lie beside the task, or below it"
             reader.reporter.error("PD101", f"`{name}` lies elsewhere", word.span, label)
             return None
+    rules = ("+".join(names), *packs)
     try:
-        ruleset, _ = load_with_diagnostics("+".join(names), params={**written, **(params or {})})
+        ruleset, _ = load_with_diagnostics(*rules, params={**written, **(params or {})}, palette=palette)
     except CompileError as error:
         for one in error.diagnostics:
             place = one.primary.span or word.span
@@ -94,20 +108,30 @@ def _read_rules(
                 one.code, one.message, place, one.primary.text, notes=one.notes, helps=one.helps
             )
         return None
-    packs, decl = read(["+".join(names)], Reporter())
-    typer, _ = resolve_names(packs, decl, Reporter())
+    loaded, decl = read(rules, Reporter())
+    typer, _ = resolve_names(loaded, decl, Reporter(), palette)
     typer.reporter = typer.unknown.reporter = reader.reporter
-    return ruleset, typer
+    return ruleset, typer, rules
 
 
 class _TaskReader:
     """Reads one task, section by section."""
 
     def __init__(
-        self, reader: Reader, entries: Entries, ruleset: Ruleset, typer: Typer, given: Mapping[str, int]
+        self,
+        reader: Reader,
+        entries: Entries,
+        ruleset: Ruleset,
+        typer: Typer,
+        rules: tuple[str, ...],
+        given: Mapping[str, int],
     ):
         self.reader, self.reporter, self.entries = reader, reader.reporter, entries
         self.ruleset, self.typer, self.given = ruleset, typer, given
+        self.rules = rules
+        own, _ = read(rules[:1], Reporter())
+        self.own = {pack.name.text for pack in own}
+        """The packs of the task's own rules: it knows no names of those that are added."""
         self.taken: dict[str, Span] = {}
         self.broken: set[str] = set()
 
@@ -141,7 +165,7 @@ class _TaskReader:
         assert name is not None
         assert agent is not None
         about = self.reader.text(self.entries, "about")
-        return Task(name.text, about, self.ruleset, size, knobs, agent, goal, splits)
+        return Task(name.text, about, self.ruleset, size, knobs, agent, goal, splits, self.rules)
 
     def node(self, key: str) -> yaml_tree.Node | None:
         return self.entries[key][1] if key in self.entries else None
@@ -177,10 +201,18 @@ class _TaskReader:
             self.reporter.error(
                 "PD308", f"`{word.text}` already means something", word.span, "second meaning"
             )
-        elif self.ruleset.element(word.text) or self.typer.symbols.constants.get(word.text):
+        elif self._is_name(word.text):
             label = "the rules use this word"
             self.reporter.error("PD308", f"`{word.text}` hides another `{word.text}`", word.span, label)
         self.taken[word.text] = word.span
+
+    def _is_name(self, word: str) -> bool:
+        """Whether a word means something in the task's own rules."""
+        symbols = self.typer.symbols
+        owner = symbols.composition.names.owners.get(word)
+        return (owner is None or owner[0] in self.own) and bool(
+            self.ruleset.element(word) or symbols.constants.get(word)
+        )
 
     def names(self, lets: list[tuple[Word, Any]]) -> list[tuple[Word, Any]]:
         for word, _ in lets:

@@ -12,6 +12,7 @@ from torch import Tensor
 from powderdsl.compiler import load
 from powderdsl.diagnostics import suggest
 from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.palette import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -140,23 +141,25 @@ def task_worlds(
     threads: int = 1,
     backend: str = "auto",
     partly: bool = False,
+    palette: Palette | None = None,
 ) -> TaskWorlds | VariedWorlds:
     """The worlds that a configuration speaks of, ready to run.
 
     Args:
         partly: leave out worlds that the rules cannot have; `TaskWorlds.found.missing` says which.
+        palette: the ids of a network's slots, as `compiler.load` takes them.
 
     Raises:
         CompileError: with all that is wrong in the task, the rules, the knobs or the parameters; PD604 where worlds need
             elements that the rules do not have; PD701 for a backend or device that is not there.
     """
     own = not config.rules
-    task = load_task(config.task, knobs=config.knobs, params=config.params if own else None)
+    task = load_task(config.task, knobs=config.knobs, params=config.params if own else None, palette=palette)
     check_split(task, config.split)
-    rules = task.ruleset if own else load(config.rules, params=config.params)
+    rules = task.ruleset if own else load(config.rules, params=config.params, palette=palette)
     _check_packs(config.only, rules)
     if config.rulesets:
-        source = RulesetSource(config.rules or rules.name, config.variety, config.params)
+        source = RulesetSource(config.rules or task.rules, config.variety, config.params, palette)
         return VariedWorlds(
             task,
             config.split,

@@ -4,28 +4,57 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from powderdsl.compiler import load, split_names
+from powderdsl.compiler import load, read, split_names
+from powderdsl.diagnostics import Reporter
+
+
+def pack_names(rules: str, words: Iterable[str]) -> tuple[str, ...]:
+    """The names of packs that are given by name or as files. Raises CompileError for a file that is not a pack.
+
+    A name of a pack of the rules, left out or not, stands for that pack.
+    """
+    known = _known(rules)
+    found: dict[str, None] = {}
+    for word in words:
+        found |= dict.fromkeys([word] if word in known else _names_of(word))
+    return tuple(found)
 
 
 def leave_out(rules: str, packs: Iterable[str]) -> str:
-    """The rules without some packs."""
+    """The rules without some packs, which are given by name or as files."""
     plus, minus = split_names(rules)
-    return _written(plus, [*minus, *packs])
+    return _written(plus, [*minus, *pack_names(rules, packs)])
 
 
 def add(rules: str, packs: Iterable[str]) -> str:
-    """The rules with some packs: those that were left out come back, others are added."""
+    """The rules with some packs, by name or as files: those that were left out come back, others are added."""
     plus, minus = split_names(rules)
-    packs = list(packs)
-    minus = [name for name in minus if name not in packs]
-    there = load(_written(plus, minus)).packs
-    return _written([*plus, *(pack for pack in packs if pack not in there)], minus)
+    known = _known(rules)
+    for word in packs:
+        names = [word] if word in known else _names_of(word)
+        minus = [name for name in minus if name not in names]
+        if not all(name in known for name in names):
+            plus.append(word)
+    return _written(plus, minus)
 
 
 def keep(rules: str, packs: Sequence[str]) -> str:
     """The rules with these packs alone. Those that the rules do not have are added."""
-    gone = [pack for pack in load(rules).packs if pack not in packs]
+    kept = pack_names(rules, packs)
+    gone = [pack for pack in load(rules).packs if pack not in kept]
     return add(leave_out(rules, gone), packs)
+
+
+def _known(rules: str) -> tuple[str, ...]:
+    """The packs that rules name, those that are left out among them."""
+    return _names_of(*split_names(rules)[0])
+
+
+def _names_of(*words: str) -> tuple[str, ...]:
+    reporter = Reporter()
+    packs, _ = read(words, reporter)
+    reporter.raise_if_errors()
+    return tuple(pack.name.text for pack in packs)
 
 
 def _written(plus: Sequence[str], minus: Iterable[str]) -> str:

@@ -17,6 +17,7 @@ from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.palette import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -81,14 +82,23 @@ class Drawn:
 class RulesetSource:
     """Draws rulesets around one, which is `rules` as everywhere. The same number gives the same ruleset.
 
+    `palette` has ids that were recorded, as `compiler.load` takes them.
+
     Raises:
         CompileError: what loading the rules raises; PD301 for a property that they do not have.
     """
 
-    def __init__(self, rules: str, variety: Variety, params: Mapping[str, Any] | None = None):
+    def __init__(
+        self,
+        rules: str | Sequence[str],
+        variety: Variety,
+        params: Mapping[str, Any] | None = None,
+        palette: Palette | None = None,
+    ):
         reporter = Reporter()
-        self.packs, self.ruleset_decl = read([rules], reporter)
+        self.packs, self.ruleset_decl = read([rules] if isinstance(rules, str) else rules, reporter)
         reporter.raise_if_errors()
+        self.palette = palette
         self.base = self._checked(self.packs, params)
         self.variety, self.params = variety, params
         for name in variety.swaps:
@@ -133,7 +143,8 @@ class RulesetSource:
 
     def _checked(self, packs: Sequence[PackDecl], params: Mapping[str, Any] | None) -> Ruleset:
         reporter = Reporter()
-        model = check(list(packs), self.ruleset_decl, reporter)
+        model = check(list(packs), self.ruleset_decl, reporter, self.palette)
+        self.palette = self.palette or model.palette  # ids stay where they are when packs are left out
         if params:
             model = set_params(model, params, reporter)
         reporter.raise_if_errors()

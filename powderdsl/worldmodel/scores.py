@@ -142,7 +142,7 @@ class Tested:
     worlds: int
     scores: Mapping[str, Mapping[str, Score]]
     missing: Mapping[str, tuple[str, ...]]
-    palette: list[str | None]
+    palette: tuple[str | None, ...]
     step: int
 
     def mean(self, predictor: str) -> float:
@@ -259,21 +259,32 @@ def unseen_worlds(
         rulesets=rulesets,
         first_ruleset=UNSEEN_RULESETS,
     )
-    check_palette(trained.run.path, trained.palette, load_rules_of(tested_on))
+    check_palette(trained.run.path, trained.palette, load_rules_of(tested_on, trained.palette))
     return task_worlds(
-        tested_on, device=machine.device, threads=machine.threads, backend=machine.backend, partly=True
+        tested_on,
+        device=machine.device,
+        threads=machine.threads,
+        backend=machine.backend,
+        partly=True,
+        palette=trained.palette,
     )
 
 
 def _counted(trained: Trained, machine: Machine) -> Tensor:
     """Outcomes of some of the run's training worlds."""
     data = trained.config.data
-    found = task_worlds(data, device=machine.device, threads=machine.threads, backend=machine.backend)
+    found = task_worlds(
+        data,
+        device=machine.device,
+        threads=machine.threads,
+        backend=machine.backend,
+        palette=trained.palette,
+    )
     seeds = torch.arange(min(FIT_WORLDS, data.states), device=machine.device)
     return outcomes(pairs_of(found, seeds, data.steps, data.pairs), len(trained.palette))
 
 
-def elements_of(found: Score, palette: list[str | None]) -> dict[str, dict[str, float | int | None]]:
+def elements_of(found: Score, palette: tuple[str | None, ...]) -> dict[str, dict[str, float | int | None]]:
     """By element: cells that ended as it, the share of these that was predicted (recall), and the share of cells
     predicted as it that were (precision). None where there are no such cells."""
     table: dict[str, dict[str, float | int | None]] = {}

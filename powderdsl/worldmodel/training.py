@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from powderdsl.compiler import load
+from powderdsl.compiler import load, whole_palette
 from powderdsl.diagnostics import CompileError
 from powderdsl.interrupts import held_back
 from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.palette import MAX_ELEMENTS, Palette
 from powderdsl.model.types import Ruleset
-from powderdsl.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run
+from powderdsl.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run, read_run
 from powderdsl.tasks.shipped_tasks import load_task
 from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
 from powderdsl.worldmodel.replay import Replay
@@ -41,6 +42,8 @@ class TrainConfig:
     """All that decides which weights come out (on one kind of device). The defaults are the paper's.
 
     `parent` is the name of the checkpoint that a fine-tuned network starts from; without it weights are random.
+    `palette` has the qualified name of the element of each of the network's slots, or None; empty: those of the task's
+    and the data's rules. `slots` is how many there are at least: free ones are room for packs that come later.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -50,6 +53,8 @@ class TrainConfig:
     learning_rate: float = 0.005
     seed: int = 0
     parent: str | None = None
+    slots: int = 0
+    palette: tuple[str | None, ...] = ()
 
     def __post_init__(self) -> None:
         """Raises ValueError for numbers that cannot be."""
@@ -60,12 +65,14 @@ class TrainConfig:
             raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
         if not 0 <= self.seed < 2**63:
             raise ValueError(f"seed must be 0 or more, found {self.seed}")
+        if not 0 <= max(self.slots, len(self.palette)) <= MAX_ELEMENTS:
+            raise ValueError(f"slots must lie in 0..{MAX_ELEMENTS}")
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
         """From what JSON gave back; what belongs to the run besides is left out. Raises TypeError, ValueError."""
-        own = {one.name: values[one.name] for one in fields(TrainConfig)}
-        return TrainConfig(**{**own, "data": DataConfig.of(own["data"])})
+        own = {one.name: values[one.name] for one in fields(TrainConfig) if one.name in values}
+        return TrainConfig(**{**own, "data": DataConfig.of(own["data"]), "palette": ()})
 
 
 PAPER = TrainConfig()
@@ -140,12 +147,17 @@ def train(
         ValueError: your own network gives logits of another shape.
         KeyboardInterrupt: Ctrl-C, after a last checkpoint.
     """
+    palette = _palette_for(config, Path(folder), worlds)
     if worlds is None:
         found = task_worlds(
-            config.data, device=machine.device, threads=machine.threads, backend=machine.backend
+            config.data,
+            device=machine.device,
+            threads=machine.threads,
+            backend=machine.backend,
+            palette=palette,
         )
         worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
-    palette = palette_of(config.data, worlds.rules)
+    check_palette(Path(folder), palette, worlds.rules)
     plain = {
         **asdict(config),
         "palette": palette,
@@ -187,7 +199,7 @@ def _restore(
     found = run.latest_checkpoint(device)
     if found is None:
         if parent is not None:
-            fit_weights(model, parent)
+            fit_weights(model, parent, grow=True)
         return 0, []
     fit_weights(model, found)
     optimizer.load_state_dict(found.state["optimizer"])
@@ -268,49 +280,106 @@ class _Trainer:
         self.run.save_checkpoint(self.done, state)
 
 
-def load_rules_of(config: DataConfig) -> Ruleset:
-    """The rules that a configuration speaks of. Raises CompileError."""
+def load_rules_of(config: DataConfig, palette: Palette) -> Ruleset:
+    """The rules that a configuration speaks of, with the ids of a palette. Raises CompileError."""
     if config.rules:
-        return load(config.rules, params=config.params)
-    return load_task(config.task, knobs=config.knobs, params=config.params).ruleset
+        return load(config.rules, params=config.params, palette=palette)
+    return load_task(config.task, knobs=config.knobs, params=config.params, palette=palette).ruleset
 
 
-def palette_of(config: DataConfig, rules: Ruleset) -> list[str | None]:
-    """The qualified name of the element of each slot: those of the rules, and of the task's own rules.
+def palette_of(config: DataConfig, slots: int = 0) -> tuple[str | None, ...]:
+    """The qualified name of the element of each slot: those of the task's own rules, and of the rules.
 
-    So slots stay where they are when packs are left out, and those of packs that come later are there already.
+    Packs that are left out have slots too, so those that come later need no others. `slots` is how many there are at
+    least. Raises CompileError.
     """
-    task = load_task(config.task, knobs=config.knobs)
-    palette: list[str | None] = [None] * max(task.ruleset.slots, rules.slots)
-    for element in (*task.ruleset.elements, *rules.elements):
-        palette[element.id] = element.qualified
-    return palette
+    found = list(whole_palette(*load_task(config.task, knobs=config.knobs).rules))
+    found += [name for name in whole_palette(config.rules) if name not in found] if config.rules else []
+    return (*found, *[None] * (slots - len(found)))
 
 
-def check_palette(folder: Path, palette: Sequence[str | None], rules: Ruleset) -> None:
+def extended_palette(palette: Palette, rules: Ruleset) -> tuple[str | None, ...]:
+    """A palette with the elements of rules that were loaded with it: in its free slots, then behind its end."""
+    ids = [element.id for element in rules.elements]
+    found = [*palette, *[None] * (max(ids) + 1 - len(palette))]
+    for element in rules.elements:
+        found[element.id] = element.qualified
+    return tuple(found)
+
+
+def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tuple[str | None, ...]:
+    """The slots of a run: as asked for, as recorded in its folder, or those that its rules need."""
+    if config.palette:
+        return config.palette
+    if worlds is not None:
+        found = worlds.rules.palette
+        return (*found, *[None] * (config.slots - len(found)))
+    palette = palette_of(config.data, config.slots)
+    try:
+        recorded = _recorded_palette(read_run(folder, KIND))
+    except (CompileError, KeyError, TypeError):
+        return palette  # a new run; or another one, which `open_run` refuses
+    fits = len(recorded) >= config.slots and {*palette} <= {*recorded, None}
+    return recorded if fits else palette
+
+
+def _recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
+    """Raises KeyError, TypeError."""
+    return tuple(None if one is None else str(one) for one in run.config["palette"])
+
+
+def check_palette(folder: Path, palette: Palette, rules: Ruleset) -> None:
     """Whether a run's network has slots for the elements of some rules.
 
     Raises:
         CompileError: PD623, with every element that has no slot, or whose slot is another's.
     """
-    why = []
+    why, lacking = [], 0
     for element in rules.elements:
         if element.id >= len(palette):
-            why.append(f"id {element.id} is `{element.qualified}` here; there are {len(palette)} slots there")
+            lacking += 1
+            why.append(f"there is no free slot for `{element.qualified}`: the network has {len(palette)}")
         elif palette[element.id] not in (None, element.qualified):
             why.append(f"id {element.id} is `{palette[element.id]}` there, `{element.qualified}` here")
     if why:
-        raise does_not_fit(folder, *why)
+        helps = (
+            f"train with `--slots {len(palette) + lacking}` to leave room for packs that come later",
+            "or teach the network those packs: `powderdsl wm finetune RUN --packs PACK`",
+        )
+        raise failure("PD623", f"{folder} does not fit", notes=tuple(why), helps=helps if lacking else ())
 
 
-def fit_weights(model: nn.Module, checkpoint: Checkpoint) -> None:
-    """Give a network the weights of a checkpoint. Raises CompileError (PD623) if they are those of another network."""
+def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False) -> None:
+    """Give a network the weights of a checkpoint.
+
+    Args:
+        grow: the network may be larger: what the checkpoint lacks keeps the weights that it has.
+
+    Raises:
+        CompileError: PD623 if they are those of another network.
+    """
     state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
     try:
-        model.load_state_dict(state if isinstance(state, dict) else {})
+        found = dict(state) if isinstance(state, dict) else {}
+        model.load_state_dict(_grown(found, model) if grow else found)
     except (RuntimeError, TypeError, AttributeError) as error:
         words = [line.strip()[:200] for line in str(error).splitlines()[:4]]
         raise does_not_fit(checkpoint.path, "its weights are those of another network", *words) from None
+
+
+def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:
+    """Weights in the shapes of a network that has more slots, first in each dimension."""
+    for name, fresh in model.state_dict().items():
+        old = state.get(name)
+        if (
+            isinstance(old, Tensor)
+            and old.ndim == fresh.ndim
+            and old.shape != fresh.shape
+            and all(a <= b for a, b in zip(old.shape, fresh.shape, strict=True))
+        ):
+            state[name] = fresh.clone()
+            state[name][tuple(slice(size) for size in old.shape)] = old
+    return state
 
 
 @dataclass(frozen=True)
@@ -319,7 +388,7 @@ class Trained:
 
     run: RunFolder
     config: TrainConfig
-    palette: list[str | None]
+    palette: tuple[str | None, ...]
     network: nn.Module
     checkpoint: Checkpoint
 
@@ -334,8 +403,7 @@ def load_trained(
     """
     run = path if isinstance(path, RunFolder) else find_run(path, KIND)
     try:
-        config = TrainConfig.of(run.config)
-        palette = [None if one is None else str(one) for one in run.config["palette"]]
+        config, palette = TrainConfig.of(run.config), _recorded_palette(run)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise failure("PD620", f"{run.path} is no run that can be used here", notes=(str(error),)) from None
     checkpoint = run.checkpoint(device)

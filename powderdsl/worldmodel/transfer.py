@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from powderdsl.tasks.shipped_tasks import load_task
-from powderdsl.worldmodel.rule_words import add
-from powderdsl.worldmodel.training import TrainConfig, Trained, check_palette, load_rules_of
+from powderdsl.worldmodel.rule_words import add, pack_names
+from powderdsl.worldmodel.training import TrainConfig, Trained, extended_palette, load_rules_of
 
 SIMPLER = "kinds"
 """The knob that says how many elements are drawn: other packs' elements come after all of these."""
@@ -19,20 +19,23 @@ def finetuned(
 ) -> TrainConfig:
     """The configuration that goes on from a network, on worlds in which elements of `packs` alone are drawn.
 
-    The rules are those of the run with the packs added; ids and channels stay where they are. A knob for the number of
-    elements is left at its default, for its list may end before the packs' elements. Rulesets are not varied.
+    The rules are those of the run with the packs added. Elements that the network knows keep their slots; others get
+    its free slots, and where none are left the network grows. A knob for the number of elements is left at its default,
+    for its list may end before the packs' elements. Rulesets are not varied.
 
     Args:
+        packs: names of shipped packs or of packs that the run left out, or files.
         changes: other fields of `TrainConfig`.
 
     Raises:
-        CompileError: PD623 if the network has no slots for the packs' elements; what `load` raises.
+        CompileError: what `load` raises.
     """
     config = trained.config
     data = config.data
-    rules = add(data.rules or load_task(data.task).ruleset.name, packs)
+    own = data.rules or "+".join(load_task(data.task).rules)
+    rules, names = add(own, packs), pack_names(own, packs)
     knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
-    data = replace(data, rules=rules, only=tuple(packs), knobs=knobs, rulesets=0)
-    check_palette(trained.run.path, trained.palette, load_rules_of(data))
+    data = replace(data, rules=rules, only=names, knobs=knobs, rulesets=0)
+    palette = extended_palette(trained.palette, load_rules_of(data, trained.palette))
     values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
-    return replace(config, data=data, **values)
+    return replace(config, data=data, palette=palette, **values)

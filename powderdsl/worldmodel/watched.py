@@ -35,7 +35,8 @@ def watched(
     """The worlds of a split under other rules.
 
     Elements are found by qualified name. A statement that draws one of several draws among those that the rules have,
-    and of these among the elements of the packs `only`, if any are given. An element that is named alone must be there.
+    and also among the elements of packs that the task does not know; of these among the elements of the packs `only`,
+    if any of them has elements. An element that is named alone must be there.
 
     Args:
         partly: leave out variants that the rules cannot have, as long as one remains.
@@ -70,11 +71,17 @@ class _Narrowing:
             if (other := rules.element(element.qualified)) is not None
         }
         self.names = {element.id: element.name for element in own.elements}
+        only = only & {element.pack for element in rules.elements}
         self.drawn = {
             element.id
             for element in own.elements
             if element.id in self.ids and (not only or element.pack in only)
         }
+        self.added = tuple(
+            element.id
+            for element in rules.elements
+            if element.pack not in own.packs and (not only or element.pack in only)
+        )
         self.missing: list[str] = []
         self.span: Span | None = None
 
@@ -92,7 +99,7 @@ class _Narrowing:
 
     def drawing(self, drawing: Drawing) -> Drawing:
         if len(drawing.ids) > 1:
-            ids = tuple(self.ids[one] for one in drawing.ids if one in self.drawn)
+            ids = tuple(self.ids[one] for one in drawing.ids if one in self.drawn) + self.added
             if not ids:
                 self.lack(drawing.ids, drawing.span)
         else:

@@ -135,7 +135,7 @@ def test_rows_that_lead_astray(change: Callable[[Any], Any], words: str, folder:
         (b"\xff\xfe", "decode"),
         (b"[" * 100_000, "recursion"),
         (b"[]", "it lacks"),
-        (b'{"format": "powderdsl-dataset", "version": 2}', "this powderdsl reads 1"),
+        (b'{"format": "powderdsl-dataset", "version": 3}', "this powderdsl reads 2"),
         (b'{"format": "powderdsl-dataset", "version": 1}', "`recipe` must be"),
         (b'{"format": "powderdsl-dataset", "version": 1, "recipe": {"seed": 1}}', "`recipe.task` must be"),
     ],

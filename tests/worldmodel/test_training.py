@@ -25,6 +25,7 @@ from powderdsl.worldmodel import (
     load_trained,
     train,
 )
+from powderdsl.worldmodel.scores import unseen_worlds
 from powderdsl.worldmodel.training import Moment
 from tests.processes import started, waited
 
@@ -205,20 +206,22 @@ def test_stands_are_tested_one_by_one(dunes: str, tmp_path: Path) -> None:
     assert without.plain()["left_out"] == {"lying": ["stone"]}
 
 
-def test_rules_of_other_elements_are_refused(dunes: str, garden: str, tmp_path: Path) -> None:
+def test_other_elements_get_free_slots_and_are_refused_where_none_are_left(
+    dunes: str, garden: str, tmp_path: Path
+) -> None:
     trained = load_trained(train(tiny(dunes, iterations=1), tmp_path / "run", machine=HERE))
-    with pytest.raises(CompileError) as error:
-        evaluate(trained, split="train", rules="core+lava+cloner", machine=HERE)
-    assert codes(error) == ["PD623"]
-    assert error.value.diagnostics[0].notes == (
-        "id 10 is `lava.lava` here; there are 10 slots there",
-        "id 13 is `cloner.cloner` here; there are 10 slots there",
-    )
+    assert [number for number, name in enumerate(trained.palette) if name is None] == [4, 5, 7, 8]
     moss = Path(garden).with_name("moss.yaml")
     moss.write_text(moss.read_text(encoding="utf-8").replace("id: 5", "id: 2"), encoding="utf-8")
+    found = unseen_worlds(trained, split="train", rules=f"core+{moss}", machine=HERE)
+    assert found.rules.element("moss.moss").id == 4  # 2 is another's in this network
     with pytest.raises(CompileError) as error:
-        evaluate(trained, split="train", rules=f"core+{moss}", machine=HERE)
-    assert error.value.diagnostics[0].notes == ("id 2 is `sand.sand` there, `moss.moss` here",)
+        evaluate(trained, split="train", rules="core+lava+cloner+fire", machine=HERE)
+    assert codes(error) == ["PD623"]
+    assert error.value.diagnostics[0].notes == (
+        "there is no free slot for `cloner.cloner`: the network has 10",
+    )
+    assert "--slots 11" in error.value.diagnostics[0].helps[0]
 
 
 def test_damaged_runs_are_refused(dunes: str, tmp_path: Path) -> None:
