@@ -72,8 +72,8 @@ def recorded_ids(claims: Iterable[Claim], palette: Palette) -> dict[str, int]:
             ids[claim.name] = found
     for claim in tuple(later):
         wanted = claim.decl.id
-        known = wanted is not None and wanted < len(palette) and palette[wanted] is None
-        if wanted is not None and known and wanted not in ids.values():
+        vacant_there = wanted is not None and wanted < len(palette) and palette[wanted] is None
+        if wanted is not None and vacant_there and wanted not in ids.values():
             ids[claim.name] = wanted
             later.remove(claim)
     taken = set(ids.values())
