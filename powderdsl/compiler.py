@@ -5,13 +5,16 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.diagnostics import Reporter, Severity, Source, suggest
+from powderdsl.bounded_files import inside, is_path
+from powderdsl.diagnostics import Reporter, Severity, Span, suggest
 from powderdsl.model.check import check
 from powderdsl.model.compose import compose
 from powderdsl.model.declarations import PackDecl, RulesetDecl
@@ -19,7 +22,7 @@ from powderdsl.model.layout import own_slots
 from powderdsl.model.packs import read_file
 from powderdsl.model.palette import Palette
 from powderdsl.model.types import Param, Ruleset, Value
-from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
+from powderdsl.syntax.sources import path_beside, read_source
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
@@ -35,6 +38,10 @@ BACKENDS = {
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""
+
+
+MAX_PLUSES = 16
+"""Of one path."""
 
 
 def shipped(folder: str) -> Path:
@@ -149,29 +156,62 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:
-    """``a+b-c`` as names to load and names to leave out. Paths of files stay whole."""
+    """``a+b-c`` as names to load and names to leave out.
+
+    A file that exists is a path, whatever characters it has: of the parts between ``+``, the longest run that names a
+    file is one path. After ``.yaml`` a ``-`` leaves out too.
+    """
     text = str(name)
-    if (
-        isinstance(name, Path)
-        or (Path(text).suffix in (".yaml", ".yml") and "+" not in text)
-        or _is_file(text)
-    ):
+    if isinstance(name, Path) or _is_there(text):
         return [text], []
     plus: list[str] = []
     minus: list[str] = []
-    for part in text.split("+"):
-        if part.endswith((".yaml", ".yml")) or _is_file(part):
-            plus.append(part)
-            continue
-        head, *rest = part.split("-")
+    parts = text.split("+")
+    while parts:
+        spans = range(min(len(parts), MAX_PLUSES + 1), 0, -1)
+        count = next((n for n in spans if _is_there(_without("+".join(parts[:n]))[0])), 1)
+        head, rest = _without("+".join(parts[:count]))
+        parts = parts[count:]
         plus.append(head)
         minus.extend(rest)
     return plus, minus
 
 
-def _is_file(text: str) -> bool:
+def _without(part: str) -> tuple[str, list[str]]:
+    """What a word without ``+`` names, and what it leaves out."""
+    if _is_there(part):
+        return part, []
+    path = re.fullmatch(r"(.*\.ya?ml)((?:-[^-/\\]*)*)", part, re.DOTALL)
+    head, *rest = (path[1], *path[2].split("-")[1:]) if path else part.split("-")
+    return head, rest
+
+
+def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None:
+    """Names for `read` from rules that a file names at `span`: shipped names, and paths of files beside it or below.
+
+    None after reporting what leads elsewhere (PD112), or is neither (PD304).
+    """
+    names: list[str] = []
+    known = shipped_rules()
+    good = True
+    for part in text.split("+"):
+        head = part.split("-")[0]
+        if is_path(part):
+            path = path_beside(part, span, reporter)
+            names += [str(path)] if path is not None else []
+            good = good and path is not None
+        elif head in known:
+            names.append(part)
+        else:
+            _report_unknown(head, span, reporter)
+            good = False
+    return names if good else None
+
+
+def _is_there(text: str) -> bool:
+    """Whether a text names something that is not a folder: a file, or what reading will refuse."""
     try:
-        return Path(text).is_file()
+        return os.path.exists(text) and not os.path.isdir(text)
     except (OSError, ValueError):
         return False
 
@@ -214,63 +254,52 @@ def _read_one(
 
 
 def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | None:
-    """A file by path or shipped name; packs of a ruleset are also looked for beside its file."""
-    span = next((s.span for s in ruleset.packs if s.text == word), None) if ruleset else None
-    looks_like_path = "/" in word or "\\" in word or word.endswith((".yaml", ".yml"))
-    if looks_like_path and ruleset is not None:
-        reporter.error(
-            "PD304",
-            f"a ruleset names packs, not paths: `{word}`",
-            span,
-            helps=["put the file beside the ruleset and write its name"],
-        )
-        return None
-    candidates = [Path(word)] if looks_like_path else []
+    """A file by path or shipped name; packs of a ruleset lie beside its file or are shipped."""
     if ruleset is not None:
-        candidates.append(Path(ruleset.source.name).parent / f"{word}.yaml")
-    if not looks_like_path:
-        candidates += [shipped("rules") / f"{word}.yaml", Path(word)]
+        return _find_beside(word, reporter, ruleset)
+    looks_like_path = is_path(word)
+    candidates = [Path(word)] if looks_like_path else [shipped("rules") / f"{word}.yaml", Path(word)]
     for path in candidates:
-        if _is_file(str(path)):
+        if _is_there(str(path)):
             return path
+    folder = os.path.isdir(word)
     if looks_like_path:
-        reporter.error("PD101", f"no file `{word}`", None, helps=["check the path"])
+        message = f"`{word}` is a folder" if folder else f"no file `{word}`"
+        helps = ["name a rule file in it"] if folder else ["check the path"]
+        reporter.error("PD101", message, None, helps=helps)
         return None
-    close = get_close_matches(word, shipped_rules(), n=1)
-    helps = [f"did you mean `{close[0]}`?"] if close else ["shipped: " + ", ".join(shipped_rules())]
-    reporter.error(
-        "PD304", f"no pack or ruleset `{word}`", span, "not shipped, and no file" if span else "", helps=helps
-    )
+    notes = [f"`{word}` is a folder: name a rule file in it"] if folder else []
+    _report_unknown(word, None, reporter, notes)
     return None
 
 
-def read_source(path: Path, reporter: Reporter) -> Source | None:
-    """The text of a file with its shortest name; reports what cannot be read."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(4 * MAX_CHARACTERS + 1)
-        if len(data) > 4 * MAX_CHARACTERS:
-            reporter.error(
-                "PD102",
-                f"`{path}` is larger than {4 * MAX_CHARACTERS:,} bytes",
-                None,
-                helps=["check that this is the file you meant"],
-            )
+def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl) -> Path | None:
+    """The file of a pack that a ruleset lists."""
+    span = next((s.span for s in ruleset.packs if s.text == word), None)
+    if is_path(word):
+        helps = ["put the file beside the ruleset and write its name"]
+        message = f"a ruleset names packs, not paths: `{word}`"
+        reporter.error("PD304", message, span, helps=helps)
+        return None
+    folder, name = Path(ruleset.source.name).parent, f"{word}.yaml"
+    if _is_there(str(folder / name)):
+        try:
+            return inside(folder, name)
+        except ValueError as error:
+            reporter.error("PD112", f"`{name}` leaves the ruleset's folder", span, str(error))
             return None
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        reporter.error(
-            "PD101", f"`{path}` is not UTF-8 text", None, notes=[f"byte {error.start} cannot be read"]
-        )
-        return None
-    except OSError as error:
-        reporter.error("PD101", f"cannot read `{path}`", None, notes=[error.strerror or "not readable"])
-        return None
-    try:
-        name = str(path.resolve().relative_to(Path.cwd()))
-    except ValueError:
-        name = str(path)
-    return Source(name, text)
+    path = shipped("rules") / name
+    if path.is_file():
+        return path
+    _report_unknown(word, span, reporter)
+    return None
+
+
+def _report_unknown(word: str, span: Span | None, reporter: Reporter, notes: Sequence[str] = ()) -> None:
+    close = get_close_matches(word, shipped_rules(), n=1)
+    helps = [f"did you mean `{close[0]}`?"] if close else ["shipped: " + ", ".join(shipped_rules())]
+    label = "not shipped, and no file" if span else ""
+    reporter.error("PD304", f"no pack or ruleset `{word}`", span, label, notes=notes, helps=helps)
 
 
 def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) -> Ruleset:

@@ -24,7 +24,7 @@ MIN_GIF_DELAY = 20
 
 def write_png(path: str | Path, image: Any) -> None:
     """Write one picture, uint8 [H, W, 3] (array or tensor). Raises ValueError for another shape or type."""
-    with replacing(Path(path)) as temporary:
+    with replacing(Path(path), follow=True) as temporary:
         Image.fromarray(_frame(image)).save(temporary, format="PNG", optimize=True)
 
 
@@ -38,7 +38,7 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop:
     images = (_indexed(frame) for frame in _same_size(frames))
     first = next(images)
     endless = {"loop": 0} if loop else {}
-    with replacing(Path(path)) as temporary:
+    with replacing(Path(path), follow=True) as temporary:
         first.save(
             temporary,
             format="GIF",
@@ -70,7 +70,7 @@ def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
     size = f"{first.shape[1]}x{first.shape[0]}"
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", size, "-r", str(fps), "-i", "-", *_ENCODING]
-    with replacing(Path(path)) as temporary:
+    with replacing(Path(path), follow=True) as temporary:
         _encode([*command, str(temporary)], chain([first], map(_even, checked)))
 
 

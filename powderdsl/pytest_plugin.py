@@ -40,21 +40,32 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> PackFile |
     if file_path.suffix not in (".yaml", ".yml"):
         return None
     try:
-        text = file_path.read_text(encoding="utf-8")
+        text = _text(file_path)
     except (OSError, UnicodeDecodeError):
         return None
     return PackFile.from_parent(parent, path=file_path) if HEAD.search(text) else None
+
+
+def _text(path: Path) -> str:
+    """The text of a rule file. Raises OSError, UnicodeDecodeError."""
+    from powderdsl.bounded_files import read_bytes
+    from powderdsl.syntax.sources import MAX_BYTES
+
+    return read_bytes(path, MAX_BYTES).decode("utf-8")
 
 
 def home_of(path: Path) -> str:
     """The rules that a pack is tried in, as `powderdsl.load` takes them."""
     from powderdsl.compiler import shipped_rules
 
-    text = path.read_text(encoding="utf-8")
+    text = _text(path)
     if re.search(r"^ruleset:", text, re.MULTILINE):
         return str(path)
     for other in sorted(path.parent.glob("*.yaml")):
-        head = other.read_text(encoding="utf-8", errors="replace")
+        try:
+            head = _text(other)
+        except (OSError, UnicodeDecodeError):
+            continue
         listed = LISTED.search(head) if re.search(r"^ruleset:", head, re.MULTILINE) else None
         if listed and path.stem in re.findall(r"\w+", listed[1]):
             return str(other)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_MODEL = ("diagnostics", "syntax", "model")
+_MODEL = ("bounded_files", "diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
 _PROGRAMS = ("programs", "native_start", "auto_program")
 _STEPS = ("observe", "simulator", "provenance")
@@ -18,15 +18,16 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "user_cache": (),
     "scratch": (),
     "interrupts": (),
+    "bounded_files": (),
     "diagnostics": (),
-    "syntax": ("diagnostics", "user_cache"),
+    "syntax": ("bounded_files", "diagnostics", "user_cache"),
     "model": ("diagnostics", "syntax"),
     "ledgers": _MODEL,  # decides from the model alone: no world is run
     "reference": _MODEL,  # never ir: an oracle that shares the lowering cannot see a bug in it
     "ir": ("diagnostics",),
     "ir.lower*": _MODEL,  # the one door from the model into the IR
     "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
-    "backends": ("diagnostics", "ir", "user_cache", "scratch", "interrupts"),
+    "backends": ("bounded_files", "diagnostics", "ir", "user_cache", "scratch", "interrupts"),
     "compiler": _COMPILER[:-1],
     "native_start": _COMPILER,
     "auto_program": _COMPILER,
@@ -50,7 +51,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "bench": _SCREEN,
     "tasks": (*_COMPILER, "simulator", "worlds"),
     "envs": (*_SCREEN, "tasks"),
-    "runs": ("diagnostics", "worlds", "scratch"),
+    "runs": ("bounded_files", "diagnostics", "worlds", "scratch"),
     "datasets": (*_SCREEN, "tasks", "envs", "runs"),
     "rl": (*_SCREEN, "tasks", "envs", "runs"),
     "worldmodel": (*_SCREEN, "tasks", "runs", "interrupts"),

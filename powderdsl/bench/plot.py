@@ -43,7 +43,7 @@ def write_plot(path: Path, report: Report) -> None:
     figure.suptitle(
         f"{report.plan.ruleset.name}, {report.plan.workload}: {report.machine.processor}", fontsize=9
     )
-    with replacing(path) as temporary:
+    with replacing(path, follow=True) as temporary:
         figure.savefig(temporary, dpi=150)
 
 

@@ -190,5 +190,5 @@ def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
 def _write_json(path: Path, report: Report) -> None:
     from powderdsl.worlds.files import replacing
 
-    with replacing(path) as temporary:
+    with replacing(path, follow=True) as temporary:
         temporary.write_text(json.dumps(report_data(report), indent=2, ensure_ascii=False) + "\n", "utf-8")

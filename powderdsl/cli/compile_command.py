@@ -49,7 +49,7 @@ def command(
         return
     from powderdsl.worlds.files import replacing
 
-    with replacing(out) as temporary:
+    with replacing(out, follow=True) as temporary:
         temporary.write_text(text if text.endswith("\n") else text + "\n", encoding="utf-8")
 
 

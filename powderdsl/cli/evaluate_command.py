@@ -108,7 +108,7 @@ def command(
             device=device,
         )
     if out is not None:
-        write_json(out, found.as_json())
+        write_json(out, found.as_json(), follow=True)
     if layout == "json":
         click.echo(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
     else:

@@ -11,12 +11,13 @@ import click
 
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
-from powderdsl.compiler import read, read_source, shipped, shipped_rules
+from powderdsl.compiler import read, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.model.check import check
 from powderdsl.model.declarations import ElementDecl, PackDecl
 from powderdsl.model.packs import read_file
 from powderdsl.model.schema import MAX_NAME, NAME
+from powderdsl.syntax.sources import read_source
 from powderdsl.worlds.files import replacing
 
 TEMPLATE = Path(__file__).with_name("first_pack.yaml")

@@ -106,11 +106,9 @@ def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
 
 def check_writable(path: Path) -> None:
     """Fail before long work if a file cannot be written. Raises CompileError (PD613)."""
-    from powderdsl.worlds.files import failure
+    from powderdsl.worlds.files import destination, failure
 
-    folder = path.parent
-    if path.is_dir():
-        raise failure("PD613", f"cannot write {path}", notes=("it is a folder",))
+    folder = destination(path, follow=True).parent
     if not folder.is_dir():
         raise failure("PD613", f"cannot write {path}", notes=(f"there is no folder {folder}",))
     if not os.access(folder, os.W_OK):

@@ -17,6 +17,7 @@ from powderdsl.cli.progress import progress
 from powderdsl.diagnostics.printable import printable
 from powderdsl.studies.study import SIZES, Point, Study
 from powderdsl.studies.study_file import load_study, shipped_studies
+from powderdsl.studies.study_paths import FILE, RULES, RUN, RUN_OR_TASK, TASK, TEXT
 from powderdsl.studies.study_run import Outcome, StudyRun
 
 CALLED: tuple[tuple[str, ...], ...] = (
@@ -29,16 +30,38 @@ CALLED: tuple[tuple[str, ...], ...] = (
 """Commands that steps of a study may call: those that write runs and evaluate them."""
 
 
-def commands() -> Mapping[tuple[str, ...], frozenset[str]]:
-    """These commands, and their options without dashes."""
-    found: dict[tuple[str, ...], frozenset[str]] = {}
+MEANS = {
+    "TASK": TASK,
+    "RUN": RUN,
+    "RUN|TASK": RUN_OR_TASK,
+    "RULES": RULES,
+    "PACK…": RULES,
+    "FILE": FILE,
+    "FILE.json": FILE,
+}
+"""What arguments and options are, by the word that stands for their values."""
+
+
+def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
+    """These commands, with what their options and their argument (``on``) are.
+
+    Options that name folders are left out, but for `run`, which the study gives: a step writes where the study says.
+    """
+    found: dict[tuple[str, ...], dict[str, str]] = {}
     for words in CALLED:
         command: click.Command = import_module(f"powderdsl.cli.{COMMANDS[words[0]][0]}").command
         for word in words[1:]:
             assert isinstance(command, click.Group)
             command = command.commands[word]
-        options = [option for one in command.params if isinstance(one, click.Option) for option in one.opts]
-        found[words] = frozenset(option[2:] for option in options if option.startswith("--"))
+        found[words] = {}
+        for one in command.params:
+            if isinstance(one, click.Argument):
+                found[words]["on"] = MEANS[one.metavar or ""]
+                continue
+            means = MEANS.get(one.metavar or "", TEXT)
+            if isinstance(one.type, click.Path) and means != FILE and "--run" not in one.opts:
+                continue
+            found[words] |= {name[2:]: means for name in one.opts if name.startswith("--")}
     return found
 
 

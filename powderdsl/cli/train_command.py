@@ -127,7 +127,7 @@ def command(
             raise BadInput("say which TASK, or --resume DIR")
         short = {"lines": n_lines, "disks": n_disks, "complexity": complexity}
         chosen = {**knob_values(knobs), **{name: one for name, one in short.items() if one is not None}}
-        name = str(Path(task).resolve()) if Path(task).suffix else task
+        name = str(Path(task).absolute()) if Path(task).suffix else task
         config = preset(preset_name, name, **asked, knobs=chosen, params=settings)
         folder = folder or Path("runs") / f"{Path(task).stem}-seed{config.seed}"
     from powderdsl.rl.ppo_training import train

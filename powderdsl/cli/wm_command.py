@@ -278,7 +278,10 @@ def eval_command(
         machine=machine,
     )
     plain = tested.plain()
-    write_json(out or trained.run.path / "evaluation.json", plain)
+    if out is not None:
+        write_json(out, plain, follow=True)
+    else:
+        trained.run.write_json("evaluation.json", plain)
     if layout == "json":
         click.echo(json.dumps(plain, indent=2, ensure_ascii=False))
     else:

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from math import prod
 from pathlib import Path
-from stat import S_ISREG
 from typing import Any
 
+from powderdsl.bounded_files import check_links, parse_json, read_bytes
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.worlds.files import failure, replacing
 
@@ -19,12 +19,14 @@ FORMAT = "powderdsl-dataset"
 VERSION = 2
 """Version 1 had other fingerprints, which say nothing any more: they are read as unknown."""
 FILE = "dataset.json"
-MAX_BYTES = 1 << 28
+MAX_BYTES = 1 << 24
 """Of a manifest's text."""
+MAX_VALUES = 1 << 19
+"""In a manifest."""
 MAX_SHARD_BYTES = 1 << 32
 """Of the arrays of one shard, unpacked."""
 MAX_EPISODES = 1 << 32
-MAX_SHARDS = 1 << 20
+MAX_SHARDS = 1 << 16
 MAX_SIDE = 1 << 20
 
 
@@ -124,15 +126,12 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / FILE
     try:
-        found = path.stat()
-        if not S_ISREG(found.st_mode):
-            raise damaged(f"{folder} is no dataset", f"{FILE} is no file")
-        if found.st_size > MAX_BYTES:
-            raise damaged(f"{path} is no manifest", f"it has more than {MAX_BYTES:,} bytes")
-        data = json.loads(path.read_bytes().decode("utf-8"))
+        data = parse_json(read_bytes(path, MAX_BYTES), MAX_VALUES)
+        check_links(folder)
     except OSError as error:
-        raise damaged(f"{folder} is no dataset", f"{FILE}: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:  # also of a NUL in the name
+        name = Path(error.filename or path).name
+        raise damaged(f"{folder} is no dataset", f"{name}: {error.strerror or error}") from None
+    except ValueError as error:  # also of a NUL in the name
         raise damaged(f"{path} is no manifest", " ".join(str(error).split())) from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise damaged(f"{path} is no manifest", f'it lacks "format": "{FORMAT}"')

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from powderdsl.bounded_files import open_regular
 from powderdsl.datasets.manifest import Recipe, ShardRow, damaged, shard_file
 from powderdsl.worlds.files import failure, replacing
 
@@ -103,7 +104,7 @@ class Shard:
 def is_whole(folder: Path, row: ShardRow) -> bool:
     """Whether a shard's file is there, and what the manifest says it is."""
     try:
-        with (folder / row.file).open("rb") as file:
+        with open_regular(folder / row.file) as file:
             if os.fstat(file.fileno()).st_size != row.bytes:
                 return False
             return hashlib.file_digest(file, "sha256").hexdigest() == row.sha256
@@ -119,8 +120,10 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
     """
     path = folder / row.file
     try:
-        if path.stat().st_size != row.bytes:
-            raise _Wrong(f"{path.stat().st_size:,} bytes instead of {row.bytes:,}")
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+        if size != row.bytes:
+            raise _Wrong(f"{size:,} bytes instead of {row.bytes:,}")
         if not is_whole(folder, row):
             raise _Wrong("its SHA-256 is another than the manifest's")
         shard = _read(path, shapes(recipe, row.number, row.transitions))

@@ -38,6 +38,7 @@ _ROWS = (
     ("PD109", "missing-key", _ERROR),
     ("PD110", "invalid-literal", _ERROR),
     ("PD111", "invalid-name", _ERROR),
+    ("PD112", "path-leaves-folder", _ERROR),
     # PD2xx: the syntax of one line
     ("PD201", "syntax-error", _ERROR),
     ("PD202", "expression-too-large", _ERROR),

@@ -15,12 +15,13 @@ from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
 from powderdsl.properties.outcomes import Counterexample, Property
 from powderdsl.properties.samples import Sample
+from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.reducer import to_tree
 from powderdsl.testing.rulemaker import write_yaml
 from powderdsl.testing.vocabulary import Tree
 from powderdsl.testing.written_arrays import entries_of, line_of, read_array, write_array
-from powderdsl.worlds.files import failure, read_source, replacing
+from powderdsl.worlds.files import failure, replacing
 
 FOLDER = ".powderdsl"
 """Where counterexamples are kept, under the working directory."""
@@ -59,6 +60,8 @@ def write_example(path: Path, rules: str, prop: Property, found: Counterexample)
         tree["params"] = {name: repr(float(values[0])) for name, values in sample.params.items()}
     head = f"# Breaks `{prop.text}` ({prop.place or prop.owner})\n"
     head += f"# Again: powderdsl test {rules} --replay {path}\n"
+    if not path.resolve().is_relative_to(Path.cwd()) and not path.is_absolute():
+        raise failure("PD112", f"{path} leaves the working directory through a link")
     path.parent.mkdir(exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_text(head + write_yaml(tree), encoding="utf-8")

@@ -14,9 +14,13 @@ from typing import Any
 
 import torch
 
+from powderdsl.bounded_files import read_bytes
 from powderdsl.worlds.files import failure, replacing
 
 NAME = re.compile(r"([0-9]{12})-([0-9a-f]{16})\.pt")
+
+
+MAX_BYTES = 1 << 33
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ def latest_checkpoint(folder: Path, device: str | torch.device = "cpu") -> Check
     """
     for step, digest, path in _named(folder):
         try:
-            data = path.read_bytes()
+            data = read_bytes(path, MAX_BYTES)
         except OSError:
             continue
         if hashlib.sha256(data).hexdigest()[:16] == digest:

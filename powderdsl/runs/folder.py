@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
+from powderdsl.bounded_files import check_links, read_json
 from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.runs.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from powderdsl.runs.metrics import Metrics
@@ -28,7 +29,6 @@ FORMAT = 2
 FIRST_FORMAT = 1
 FINGERPRINTS = ("rules_fingerprint", "task_fingerprint", "worlds")
 """Settings that are hashes of what files said."""
-MAX_JSON = 1 << 24
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
 
 
@@ -131,6 +131,7 @@ def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
     Raises:
         CompileError: PD622 if another one does; PD613 if the folder cannot be written to.
     """
+    check_folder(folder)
     lock = FileLock(folder / ".lock")
     try:
         lock.acquire(timeout=patience)
@@ -180,6 +181,7 @@ def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
     folder = Path(path)
     if not (folder / ABOUT).exists():
         raise _no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
+    check_folder(folder)
     about = read_json(folder / ABOUT)
     whole = isinstance(about, dict) and isinstance(about.get("kind"), str)
     if not whole or not isinstance(about.get("config"), dict):
@@ -202,6 +204,15 @@ def find_run(text: str | Path, kind: str | None = None) -> RunFolder:
     return read_run(folder, kind)
 
 
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that may come from a stranger and has links that lead out of it. Raises CompileError (PD112)."""
+    try:
+        check_links(folder)
+    except OSError as error:
+        helps = ("move what it leads to into the folder; the folder itself may be a link",)
+        raise failure("PD112", f"{error.filename}: {error.strerror}", helps=helps) from None
+
+
 def does_not_fit(folder: Path, *why: str) -> CompileError:
     """What to raise where a run's model or data was made for something else (PD623)."""
     return failure("PD623", f"{folder} does not fit", notes=why)
@@ -222,10 +233,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-def write_json(path: Path, value: Any) -> Path:
-    """Write a file whole or not at all. Raises CompileError (PD613)."""
+def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
+    """Write a file whole or not at all. `follow`: write to where a link leads. Raises CompileError (PD613)."""
     try:
-        with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        with replacing(path, follow=follow) as temporary, temporary.open("w", encoding="utf-8") as file:
             json.dump(value, file, indent=1, ensure_ascii=False)
             file.write("\n")
             file.flush()
@@ -233,16 +244,6 @@ def write_json(path: Path, value: Any) -> Path:
     except OSError as error:
         raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
     return path
-
-
-def read_json(path: Path) -> Any:
-    """The value in a file of at most 16 MiB; None if there is none or it is damaged."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_JSON + 1)
-        return None if len(data) > MAX_JSON else json.loads(data)
-    except (OSError, ValueError, RecursionError):
-        return None
 
 
 def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tuple[str, ...]:

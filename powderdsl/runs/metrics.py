@@ -10,10 +10,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from powderdsl.bounded_files import open_regular, parse_json
 from powderdsl.worlds.files import replacing
 
 LINES = "metrics.jsonl"
 EVENTS = "tensorboard"
+MAX_LINE = 1 << 16
+"""Bytes of a line."""
 
 
 class Metrics:
@@ -55,10 +58,10 @@ class Metrics:
 
 def read_metrics(folder: Path) -> Iterator[dict[str, Any]]:
     """The lines of a run, each with ``step``. A last line that a kill cut short is left out."""
-    with suppress(FileNotFoundError), (folder / LINES).open(encoding="utf-8") as file:
-        for text in file:
+    with suppress(FileNotFoundError), open_regular(folder / LINES) as file:
+        for text in iter(lambda: file.readline(MAX_LINE), b""):
             with suppress(ValueError):
-                line = json.loads(text)
+                line = parse_json(text)
                 if isinstance(line, dict) and isinstance(line.get("step"), int):
                     yield line
 

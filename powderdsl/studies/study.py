@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from string import Template
 
 SIZES = ("small", "paper")
@@ -17,7 +18,8 @@ SEED, SIZE = "seed", "size"
 class Step:
     """A call of a command: what it works on, and its options as text, in which ``$NAME`` stands for a value.
 
-    `on` is the argument of the command: a step before it, whose run is meant, or text.
+    `on` is the argument of the command: a step before it, whose run is meant, or text. `means` says what the argument
+    (``on``) and each option are: see `powderdsl.studies.study_paths`.
     """
 
     name: str
@@ -26,6 +28,7 @@ class Step:
     on_step: bool
     options: tuple[tuple[str, tuple[str, ...]], ...]
     makes_run: bool
+    means: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Study:
-    """A checked study. `text` is the file it was read from."""
+    """A checked study. `text` is what its file says, `folder` is where the file lies."""
 
     name: str
     about: str
@@ -81,6 +84,7 @@ class Study:
     steps: tuple[Step, ...]
     measures: tuple[Measure, ...]
     text: str
+    folder: Path = Path()
 
     def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
         """All combinations, each with every seed; the seeds outside, so that early ends leave whole sets."""

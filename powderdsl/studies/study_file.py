@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from string import Template
 
-from powderdsl.compiler import read_source, shipped
+from powderdsl.compiler import shipped
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.model.schema import Key, Reader
-from powderdsl.studies.study import EXPECTED, SCALES, SEED, SIZE, SIZES, Axis, Measure, Step, Study
+from powderdsl.studies.study import EXPECTED, SCALES, SEED, SIZE, SIZES, Axis, Measure, Step, Study, filled
+from powderdsl.studies.study_paths import TEXT, confined
 from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.sources import read_source
 
 STUDY_KEYS: dict[str, dict[str, Key]] = {
     "study": {
@@ -46,11 +48,15 @@ def shipped_studies() -> list[str]:
     return sorted(path.stem for path in (shipped("tasks") / "studies").glob("*.yaml"))
 
 
-def load_study(name_or_path: str, commands: Mapping[tuple[str, ...], frozenset[str]]) -> Study:
+Commands = Mapping[tuple[str, ...], Mapping[str, str]]
+"""Commands that steps may call; what their options are (without dashes), and what their argument (``on``) is."""
+
+
+def load_study(name_or_path: str, commands: Commands) -> Study:
     """A shipped study by name, or a file.
 
     Args:
-        commands: those that steps may call, with their options without dashes.
+        commands: those that steps may call.
 
     Raises:
         CompileError: with everything that is wrong.
@@ -68,9 +74,7 @@ def load_study(name_or_path: str, commands: Mapping[tuple[str, ...], frozenset[s
     return read_study(source, reporter, commands)
 
 
-def read_study(
-    source: Source, reporter: Reporter, commands: Mapping[tuple[str, ...], frozenset[str]]
-) -> Study:
+def read_study(source: Source, reporter: Reporter, commands: Commands) -> Study:
     """The checked study of a file's text. Raises CompileError with everything that is wrong."""
     tree = yaml_tree.parse_yaml(source, reporter)
     if tree is None and not reporter.has_errors:
@@ -86,11 +90,13 @@ def read_study(
 class _StudyReader:
     """Reads one study, section by section."""
 
-    def __init__(self, reader: Reader, commands: Mapping[tuple[str, ...], frozenset[str]]):
+    def __init__(self, reader: Reader, commands: Commands):
         self.reader, self.reporter, self.commands = reader, reader.reporter, commands
         self.axes: list[Axis] = []
         self.set_names: list[str] = []
         self.steps: list[Step] = []
+        self.words: list[tuple[str, str, Span]] = []
+        """What a word of a command is, the word, and where it stands."""
 
     def study(self, tree: yaml_tree.Node, text: str) -> Study:
         entries = self.reader.mapping(tree, "study", "a study")
@@ -121,7 +127,25 @@ class _StudyReader:
                 )
         about = self.reader.text(entries, "about")
         word = "" if name is None else name.text
-        return Study(word, about, seeds, tuple(self.axes), tuple(self.steps), measures, text)
+        folder = Path(tree.span.source.name).parent
+        study = Study(word, about, seeds, tuple(self.axes), tuple(self.steps), measures, text, folder)
+        if not self.reporter.has_errors:
+            self.check_paths(study)
+        return study
+
+    def check_paths(self, study: Study) -> None:
+        """Report paths that lead out of the study's folder, with any of its values."""
+        points = [point for size in SIZES for point in study.points(size, 1)]
+        for means, text, span in self.words:
+            if means == TEXT:
+                continue
+            for word in dict.fromkeys(filled(text, point, size) for point in points for size in SIZES):
+                try:
+                    confined(means, word, study.folder, study.folder)
+                except ValueError as error:
+                    self.reporter.error(
+                        "PD112", f"the path `{word}` leaves the study's folder", span, str(error)
+                    )
 
     def section(
         self, entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], key: str, what: str
@@ -203,13 +227,14 @@ class _StudyReader:
         for name, value in node.entries:
             if name.text in ("command", "on"):
                 continue
-            if name.text == "run" or name.text not in options:
-                helps = suggest(name.text, options - {"run"}, "options")
+            if name.text not in options or name.text in ("on", "run"):
+                helps = suggest(name.text, options.keys() - {"on", "run"}, "options")
                 text = f"`{word.text}` has no option `{name.text}` for a study"
                 self.reporter.error("PD806", text, name.span, helps=helps)
             words = self.reader.words(value)
             for one in words:
                 self.check_names(one.text, one.span)
+                self.words.append((options.get(name.text, TEXT), one.text, one.span))
             found.append((name.text, tuple(one.text for one in words)))
         on = given.get("on")
         target = None
@@ -221,7 +246,9 @@ class _StudyReader:
         elif on is not None:
             self.reader.shape(on, "a word")
         on_step = target in [step.name for step in self.steps]
-        return Step(key.text, command, target, on_step, tuple(found), "run" in options)
+        if isinstance(on, yaml_tree.Scalar) and not on_step:
+            self.words.append((options.get("on", TEXT), on.text, on.span))
+        return Step(key.text, command, target, on_step, tuple(found), "run" in options, options)
 
     def measure(self, key: yaml_tree.Scalar, node: yaml_tree.Node) -> Measure | None:
         entries = self.reader.mapping(node, "measure", "a measure")

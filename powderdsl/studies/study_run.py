@@ -16,10 +16,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from powderdsl.bounded_files import read_json
 from powderdsl.diagnostics import CompileError
 from powderdsl.interrupts import GRACE, LIFELINE
-from powderdsl.runs.folder import ABOUT, held, new_folder, read_json, write_json
+from powderdsl.runs.folder import ABOUT, check_folder, held, new_folder, write_json
 from powderdsl.studies.study import Measure, Point, Step, Study, filled
+from powderdsl.studies.study_paths import TEXT, confined
 from powderdsl.worlds.files import failure
 
 EVALUATION = "evaluation.json"
@@ -66,6 +68,8 @@ class StudyRun:
             "steps": [asdict(step) for step in self.study.steps],
         }
         decides = json.loads(json.dumps(decides))  # as it will be read
+        if self.folder.is_dir():
+            check_folder(self.folder)
         kept = self.folder / "study.json"
         if kept.exists():
             found = read_json(kept)
@@ -155,12 +159,21 @@ class StudyRun:
         words = list(step.command)
         if step.on is not None:
             words.append(
-                str(place / self._maker(step.on)) if step.on_step else filled(step.on, point, self.size)
+                str(place / self._maker(step.on)) if step.on_step else self._word(step, "on", step.on, point)
             )
         for name, values in step.options:
             for value in values:
-                words += [f"--{name}", filled(value, point, self.size)]
+                words += [f"--{name}", self._word(step, name, value, point)]
         return [*words, "--run", str(place / step.name)] if step.makes_run else words
+
+    def _word(self, step: Step, name: str, text: str, point: Point) -> str:
+        """A word of a command. Raises CompileError (PD112) if it names a path elsewhere."""
+        word, place = filled(text, point, self.size), self.folder / "runs" / point.name
+        try:
+            return confined(step.means.get(name, TEXT), word, self.study.folder, place)
+        except ValueError as error:
+            notes = (f"in the step `{step.name}`: {error}",)
+            raise failure("PD112", f"the path `{word}` leaves the study's folder", notes=notes) from None
 
     def _maker(self, name: str) -> str:
         """The step whose run a step means: itself, or what it works on, if it makes no run."""

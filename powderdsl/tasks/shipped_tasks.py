@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from powderdsl.compiler import read_source, shipped
+from powderdsl.compiler import shipped
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, suggest
 from powderdsl.model.palette import Palette
+from powderdsl.syntax.sources import read_source
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.task_file import read_task
 from powderdsl.tasks.task_names import shipped_tasks

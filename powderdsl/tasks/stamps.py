@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from powderdsl.diagnostics import CompileError, Span
+from powderdsl.diagnostics import CompileError, Span, suggest
 from powderdsl.model.schema import Reader
 from powderdsl.model.types import Element, Ruleset
 from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.sources import path_beside
 from powderdsl.tasks.task import MAX_SIDE, Stamp
 from powderdsl.worlds.ascii import load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import Setting
-from powderdsl.worlds.scene import draw_scene, find_scene
+from powderdsl.worlds.scene import draw_scene, find_scene, shipped_scenes
 
 LEAVE = 255
 """In a stamp: the cell stays as it is."""
@@ -83,27 +84,31 @@ def _first(scalar: yaml_tree.Scalar) -> Span:
 
 def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> np.ndarray | None:
     """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
-    path = Path(word.text)
-    if path.is_absolute() or ".." in path.parts:
-        label = "pictures lie beside the task, or below it"
-        reader.reporter.error("PD101", f"`{word.text}` lies elsewhere", word.span, label)
+    file, _, name = word.text.rpartition("#") if "#" in word.text else (word.text, "", "")
+    suffix = Path(file).suffix.lower()
+    known = [one.name for one in shipped_scenes()]
+    if word.text not in known and suffix not in (".png", ".txt", ".yaml", ".yml"):
+        helps = suggest(word.text, known) or ("shipped: " + ", ".join(known),)
+        reader.reporter.error("PD601", f"unknown scene `{word.text[:80]}`", word.span, helps=helps)
         return None
-    suffix = path.suffix.partition("#")[0].lower()
-    beside = str(Path(word.span.source.name).parent / word.text)
+    path = word.text if word.text in known else path_beside(file, word.span, reader.reporter)
+    if path is None:
+        return None
+    beside = f"{path}#{name}" if name else str(path)
     try:
         if suffix == ".png":
             return read_image(beside, ruleset.elements)
         if suffix == ".txt":
             return load_ascii(beside, ruleset.elements)
-        scene = find_scene(beside if suffix in (".yaml", ".yml") else word.text)
-        setting = next((one for one in scene.paints if isinstance(one, Setting)), None)
+        found = find_scene(beside)
+        setting = next((one for one in found.paints if isinstance(one, Setting)), None)
         if setting is not None:
             label = "a picture is made of elements only"
             reader.reporter.error(
-                "PD605", f"the scene `{scene.name}` sets `{setting.name}`", word.span, label
+                "PD605", f"the scene `{found.name}` sets `{setting.name}`", word.span, label
             )
             return None
-        return draw_scene(scene, ruleset)
+        return draw_scene(found, ruleset)
     except CompileError as error:
         for one in error.diagnostics:
             reader.reporter.error(one.code, one.message, word.span, notes=one.notes, helps=one.helps)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from powderdsl.compiler import load_with_diagnostics, read
+from powderdsl.compiler import load_with_diagnostics, names_in_file, read
 from powderdsl.diagnostics import CompileError, Reporter, Source, Span, suggest
 from powderdsl.model.builtins import FUNCTIONS as RULE_FUNCTIONS
 from powderdsl.model.check import resolve_names
@@ -89,16 +88,10 @@ def _read_rules(
             written[key.text] = value.text
         else:
             reader.shape(value, "a single value")
-    folder = Path(source.name).parent
-    names = [
-        str(folder / name) if name.endswith((".yaml", ".yml")) else name for name in word.text.split("+")
-    ]
-    for name in word.text.split("+"):
-        if Path(name).is_absolute() or ".." in Path(name).parts:
-            label = "rules lie beside the task, or below it"
-            reader.reporter.error("PD101", f"`{name}` lies elsewhere", word.span, label)
-            return None
-    rules = ("+".join(names), *packs)
+    names = names_in_file(word.text, word.span, reader.reporter)
+    if names is None:
+        return None
+    rules = (*names, *packs)
     try:
         ruleset, _ = load_with_diagnostics(*rules, params={**written, **(params or {})}, palette=palette)
     except CompileError as error:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+from powderdsl.bounded_files import open_regular
 from powderdsl.compiler import shipped
+
+MAX_HEAD = 1 << 16
+"""Bytes of comments that a task's file may begin with."""
 
 
 def shipped_tasks() -> list[str]:
@@ -19,8 +21,9 @@ def is_task(name: str) -> bool:
     if not name.lower().endswith((".yaml", ".yml")):
         return False
     try:
-        with Path(name).open(encoding="utf-8-sig") as file:
-            lines = (line.strip() for line, _ in zip(file, range(1000), strict=False))
-            return next((line for line in lines if line and not line.startswith("#")), "").startswith("task:")
-    except (OSError, ValueError):
+        with open_regular(name) as file:
+            head = file.read(MAX_HEAD).decode("utf-8-sig", errors="replace")
+    except OSError:
         return False
+    lines = (line.strip() for line in head.splitlines())
+    return next((line for line in lines if line and not line.startswith("#")), "").startswith("task:")

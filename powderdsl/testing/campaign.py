@@ -15,6 +15,7 @@ from tempfile import gettempdir
 
 import torch
 
+from powderdsl.bounded_files import parse_json, read_bytes
 from powderdsl.scratch import scratch_folder
 from powderdsl.testing.case_files import write_case
 from powderdsl.testing.cases import Case, load_text
@@ -82,7 +83,7 @@ def load_tally(folder: Path, plan: Plan) -> Tally:
     """The state file of a folder. Raises CompileError: PD101 there is none, PD602 it is of another plan, or none."""
     path = folder / STATE_FILE
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
+        rows = parse_json(read_bytes(path, 1 << 22))
         used = Counter({(str(group), str(name)): int(count) for group, name, count in rows.pop("used")})
         tally = Tally(**rows, used=used)
     except OSError as error:

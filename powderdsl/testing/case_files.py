@@ -6,13 +6,14 @@ from pathlib import Path
 
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.state import slots
+from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.cases import Case, Start, load_text
 from powderdsl.testing.reducer import to_tree
 from powderdsl.testing.rulemaker import write_yaml
 from powderdsl.testing.vocabulary import Tree
 from powderdsl.testing.written_arrays import entries_of, line_of, read_array, write_array
-from powderdsl.worlds.files import failure, read_source, replacing
+from powderdsl.worlds.files import failure, replacing
 
 
 def write_case(path: Path, case: Case, problem: str = "") -> None:

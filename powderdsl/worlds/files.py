@@ -1,4 +1,4 @@
-"""Reading world files within bounds, and writing files whole or not at all."""
+"""Writing files whole or not at all, and errors about files. `powderdsl.bounded_files` reads them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source
+from powderdsl.bounded_files import refuse_irregular
+from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.scratch import scratch_file
-from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
 
 
 def failure(
@@ -19,50 +19,50 @@ def failure(
     return CompileError([Diagnostic(code, message, Label(None), notes=notes, helps=helps)])
 
 
-def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_CHARACTERS) -> Source | None:
-    """The text of a UTF-8 file of at most `limit` bytes, or None after reporting PD101 or PD102."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(limit + 1)  # never more, whatever a file or a device says about its size
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or str(error)
-        reporter.error("PD101", f"cannot read {path}", None, notes=[reason])
-        return None
-    if len(data) > limit:
-        reporter.error("PD102", f"{path} is too large", None, notes=[f"it may have {limit:,} bytes"])
-        return None
-    try:
-        return Source(str(path), data.decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        reporter.error(
-            "PD101", f"{path} is not UTF-8 text", None, notes=[f"byte {error.start} cannot be decoded"]
-        )
-        return None
-
-
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
     """A temporary path beside `path`, with its suffix, that takes its place when the block ends well.
 
     When the block fails or is interrupted, nothing is left and an older file stays as it was. When the process is
-    killed, the next one that writes to the folder removes what is left. Raises CompileError (PD613) if the place cannot
+    killed, the next one that writes to the folder removes what is left. Raises CompileError (PD613) if the file cannot
     be written.
+
+    Args:
+        follow: for paths that the user named: a link stays a link, and the file that it leads to is replaced. Otherwise
+            the link itself is replaced, which may come from a stranger's folder.
     """
+    target = destination(path, follow=follow)
     with ExitStack() as stack:
         try:
-            temporary = stack.enter_context(scratch_file(path))
+            temporary = stack.enter_context(scratch_file(target))
         except (OSError, ValueError) as error:
-            raise _not_writable(path, error) from None
+            raise not_writable(path, error) from None
         yield temporary
         # Scratch files are private to their owner; an ordinary new file follows the umask.
         temporary.chmod(0o666 & ~_umask())
         try:
-            os.replace(temporary, path)
+            os.replace(temporary, target)
         except OSError as error:
-            raise _not_writable(path, error) from None
+            raise not_writable(path, error) from None
 
 
-def _not_writable(path: Path, error: Exception) -> CompileError:
+def destination(path: Path, *, follow: bool) -> Path:
+    """Where a file of this name is written: the path itself, or where a link leads.
+
+    Raises:
+        CompileError: PD613 if a folder, a pipe, a socket or a device is there, or links form a loop.
+    """
+    try:
+        target = path.resolve() if follow and path.is_symlink() else path
+        if target.exists() and (follow or not path.is_symlink()):
+            refuse_irregular(target)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise not_writable(path, error) from None
+    return target
+
+
+def not_writable(path: Path, error: Exception) -> CompileError:
+    """PD613, with what the system said."""
     reason = getattr(error, "strerror", None) or str(error)
     return failure("PD613", f"cannot write {path}", notes=(reason,))
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from powderdsl.bounded_files import open_regular
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.model.types import Element
 from powderdsl.worlds.files import failure
@@ -60,10 +61,9 @@ def _pack(color: str) -> int:
 def _pixels(path: Path) -> NDArray[np.uint8]:
     """The picture as uint8 [H, W, 4], red, green, blue, opacity."""
     try:
-        file = path.open("rb")
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or str(error)
-        raise failure("PD101", f"cannot read {path}", notes=(reason,)) from None
+        file = open_regular(path)
+    except OSError as error:
+        raise failure("PD101", f"cannot read {path}", notes=(error.strerror or str(error),)) from None
     with file:
         try:
             return _decode(file, path)

@@ -35,7 +35,7 @@ def save(world: World, path: str | Path) -> None:
     }
     arrays = {f"slot_{name}": value.cpu().numpy() for name, value in world.state.items()}
     clock = {name: getattr(world, name).cpu().numpy() for name in ("seed", "index", "step")}
-    with replacing(target) as temporary:
+    with replacing(target, follow=True) as temporary:
         try:
             with temporary.open("wb") as file:
                 np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays, **clock)  # type: ignore[arg-type]

@@ -133,7 +133,7 @@ def test_rows_that_lead_astray(change: Callable[[Any], Any], words: str, folder:
     [
         (b"", "Expecting value"),
         (b"\xff\xfe", "decode"),
-        (b"[" * 100_000, "recursion"),
+        (b"[" * 100_000, "deep"),
         (b"[]", "it lacks"),
         (b'{"format": "powderdsl-dataset", "version": 3}', "this powderdsl reads 2"),
         (b'{"format": "powderdsl-dataset", "version": 1}', "`recipe` must be"),
@@ -157,7 +157,7 @@ def test_an_undamaged_dataset_passes(folder: Path) -> None:
 def test_a_folder_without_a_manifest(tmp_path: Path) -> None:
     assert "dataset.json" in reasons(tmp_path)[0]
     assert "dataset.json" in reasons(tmp_path / "gone")[0]
-    assert "null" in reasons(Path("a\0b"))[0]
+    assert "NUL" in reasons(Path("a\0b"))[0]
 
 
 # Shards

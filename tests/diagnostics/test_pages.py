@@ -35,6 +35,7 @@ from powderdsl.properties.refute import refuted
 from powderdsl.rl import preset
 from powderdsl.runs import does_not_fit, find_run, open_run
 from powderdsl.studies.study_file import load_study
+from powderdsl.studies.study_paths import TEXT
 from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
 from powderdsl.worldmodel.training import diverged
 from powderdsl.worlds.ascii import read_ascii
@@ -105,7 +106,8 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
             return load_task_with_diagnostics(path)[1]
         if "study" in one.info.split():
             load_study(
-                "page.yaml", {("train",): frozenset({"run", "seed", "steps"}), ("evaluate",): frozenset()}
+                "page.yaml",
+                {("train",): dict.fromkeys(("on", "run", "seed", "steps"), TEXT), ("evaluate",): {}},
             )
             return ()
         if "world" in one.info.split():

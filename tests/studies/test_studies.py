@@ -15,11 +15,12 @@ from powderdsl.studies.figure import write_figure
 from powderdsl.studies.results import Interval, as_data, as_markdown, findings, interval, shown
 from powderdsl.studies.study import Point, Study
 from powderdsl.studies.study_file import load_study, read_study, shipped_studies
+from powderdsl.studies.study_paths import FILE, RUN_OR_TASK, TASK, TEXT
 from powderdsl.studies.study_run import Outcome, StudyRun
 
-KNOWN: Mapping[tuple[str, ...], frozenset[str]] = {
-    ("train",): frozenset({"run", "seed", "steps", "knob"}),
-    ("evaluate",): frozenset({"episodes"}),
+KNOWN: Mapping[tuple[str, ...], Mapping[str, str]] = {
+    ("train",): {"on": TASK, **dict.fromkeys(("run", "seed", "steps", "knob"), TEXT)},
+    ("evaluate",): {"on": RUN_OR_TASK, "episodes": TEXT, "out": FILE},
 }
 
 TEXT = """

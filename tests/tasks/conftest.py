@@ -20,8 +20,10 @@ def loaded():  # type: ignore[no-untyped-def]
 
 @pytest.fixture(autouse=True)
 def _rules_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    def load(name, params=None, palette=None):  # type: ignore[no-untyped-def]
-        return loaded()[0] if name == RULES and not params else load_with_diagnostics(name, params=params)
+    def load(*names, params=None, palette=None):  # type: ignore[no-untyped-def]
+        return (
+            loaded()[0] if names == (RULES,) and not params else load_with_diagnostics(*names, params=params)
+        )
 
     def read_names(names, reporter):  # type: ignore[no-untyped-def]
         return loaded()[1] if list(names) == [RULES] else read(names, reporter)

@@ -218,9 +218,7 @@ def test_other_elements_get_free_slots_and_are_refused_where_none_are_left(
     with pytest.raises(CompileError) as error:
         evaluate(trained, split="train", rules="core+lava+cloner+fire", machine=HERE)
     assert codes(error) == ["PD623"]
-    assert error.value.diagnostics[0].notes == (
-        "there is no free slot for `fire.dust`: the network has 10",
-    )
+    assert error.value.diagnostics[0].notes == ("there is no free slot for `fire.dust`: the network has 10",)
     assert "--slots 11" in error.value.diagnostics[0].helps[0]
 
 

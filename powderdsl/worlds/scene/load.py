@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.types import Element
-from powderdsl.worlds.files import failure, read_source
+from powderdsl.syntax.sources import read_source
+from powderdsl.worlds.files import failure
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, paint
 from powderdsl.worlds.scene.read import SIZE_RULE, Scene, read_scenes
 

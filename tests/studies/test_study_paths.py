@@ -1,0 +1,148 @@
+"""A study from a stranger reads beside its own file and writes in its own results, whatever it names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import pytest
+
+from powderdsl.cli.study_command import CALLED, MEANS, commands
+from powderdsl.diagnostics import CompileError
+from powderdsl.studies.study_file import load_study
+from powderdsl.studies.study_paths import FILE, RULES, RUN_OR_TASK, TASK, confined
+from powderdsl.studies.study_run import StudyRun
+from tests.cli.commands import powderdsl
+
+STUDY = """
+study: odd
+seeds: 1
+vary: {steps: [10]}
+steps:
+  trained: {command: train, on: sand-pushing, steps: $steps}
+  tested: {command: evaluate, on: trained, out: scores.json}
+measures:
+  reward: {of: trained, value: test/trained/mean}
+"""
+
+ELSEWHERE = (
+    "/tmp/x.json",
+    "../x.json",
+    "a/../../x.json",
+    "~/x.json",
+    "..\\\\x.json",
+    "C:\\\\x.json",
+    '"a\\0b"',
+    '"\\e[2J"',
+    "link/x.json",
+)
+
+
+def errors(path: Path, text: str) -> list[str]:
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(CompileError) as caught:
+        load_study(str(path), commands())
+    return [one.code for one in caught.value.diagnostics]
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_a_file_to_write_stays_in_the_results(name, tmp_path):
+    (tmp_path / "link").symlink_to("/tmp")
+    assert errors(tmp_path / "s.yaml", STUDY.replace("scores.json", name)) == ["PD112"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("on: sand-pushing", "on: ../task.yaml"),
+        ("on: sand-pushing", "on: /etc/task.yaml"),
+        ("on: trained", "on: ../run"),
+        ("on: trained", "on: /home/run"),
+        ("on: trained", 'on: "~/run"'),
+    ],
+)
+def test_what_a_step_works_on_lies_beside_the_study(old, new, tmp_path):
+    assert errors(tmp_path / "s.yaml", STUDY.replace(old, new)) == ["PD112"]
+
+
+@pytest.mark.parametrize("option", ["rules", "packs", "held-out", "task"])
+def test_rules_and_tasks_lie_beside_the_study(option, tmp_path):
+    text = STUDY.replace("{command: train, on: sand-pushing,", f"{{command: wm train, {option}: OTHER,")
+    text = text.replace(
+        "{command: evaluate, on: trained, out: scores.json}", "{command: wm eval, on: trained}"
+    )
+    text = text.replace("steps: $steps", "iterations: $steps")
+    assert errors(tmp_path / "s.yaml", text.replace("OTHER", "../x.yaml")) == ["PD112"]
+    assert errors(
+        tmp_path / "s.yaml", text.replace("OTHER", "/etc/x.yaml" if option == "task" else "core+/etc/x.yaml")
+    ) == ["PD112"]
+
+
+def test_a_path_made_of_values_is_checked_too(tmp_path):
+    text = STUDY.replace("vary: {steps: [10]}", "vary: {steps: [10], up: [a, ..]}")
+    assert errors(tmp_path / "s.yaml", text.replace("scores.json", "$up/x.json")) == ["PD112"]
+    text = STUDY.replace(
+        "vary: {steps: [10]}", "vary: {steps: {small: [10], paper: [10], sets: {10: {to: /etc/x.json}}}}"
+    )
+    assert errors(tmp_path / "s.yaml", text.replace("scores.json", "$to")) == ["PD112"]
+
+
+@pytest.mark.parametrize("option", ["run", "resume"])
+def test_a_study_cannot_choose_folders(option, tmp_path):
+    text = STUDY.replace("steps: $steps}", f"steps: $steps, {option}: elsewhere}}")
+    assert errors(tmp_path / "s.yaml", text) == ["PD806"]
+
+
+def test_good_paths_become_paths_of_the_study_and_of_its_results(tmp_path):
+    (tmp_path / "s.yaml").write_text(STUDY.replace("on: sand-pushing", "on: mine/task.yaml"))
+    study = load_study(str(tmp_path / "s.yaml"), commands())
+    run = StudyRun(study, tmp_path / "results", "small")
+    point = next(iter(study.points("small")))
+    place = tmp_path / "results" / "runs" / point.name
+    assert str(tmp_path / "mine" / "task.yaml") in run.command(study.steps[0], point, place)
+    assert run.command(study.steps[1], point, place)[-1] == str(place / "scores.json")
+
+
+def test_each_kind_of_word(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder, results = tmp_path / "a+b", tmp_path / "r"
+    assert confined(FILE, "x.json", folder, results) == str(results / "x.json")
+    assert confined(TASK, "sand-pushing", folder, results) == "sand-pushing"
+    assert confined(RUN_OR_TASK, "sand-pushing", folder, results) == "sand-pushing"
+    assert confined(RUN_OR_TASK, "base", folder, results) == str(folder / "base")
+    assert confined(RULES, "core+x.yaml+water-gas", folder, results) == f"core+{folder / 'x.yaml'}+water-gas"
+    (tmp_path / "secret").write_text("x")
+    with pytest.raises(ValueError, match="shipped rules"):
+        confined(RULES, "core+secret", folder, results)
+
+
+def test_results_with_a_link_that_leads_out_are_refused(tmp_path):
+    (tmp_path / "s.yaml").write_text(STUDY)
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "runs").symlink_to(victim)
+    result = powderdsl("study", tmp_path / "s.yaml", "--out", tmp_path / "results")
+    assert result.exit_code == 2
+    assert "PD112" in result.stderr
+    assert list(victim.iterdir()) == []
+
+
+def test_every_word_that_stands_for_a_value_is_known():
+    """An option with a new kind of value must say what it is before studies may give it."""
+    plain = {"N", "A,B", "NAME=N", "PACK.PARAM=VALUE", "PROPERTY", "CHANCE", "MINUTES", "SPLIT", "DIR", ""}
+    found = commands()
+    assert set(found) == set(CALLED)
+    from importlib import import_module
+
+    for words in CALLED:
+        name = {"train": "train_command", "evaluate": "evaluate_command", "wm": "wm_command"}[words[0]]
+        command: click.Command = import_module(f"powderdsl.cli.{name}").command
+        for word in words[1:]:
+            command = command.commands[word]  # type: ignore[attr-defined]
+        for one in command.params:
+            assert (one.metavar or "") in {*MEANS, *plain}, one.name
+        paths = [one for one in command.params if isinstance(one.type, click.Path)]
+        for one in paths:
+            name = one.opts[0][2:]
+            assert name == "run" or found[words].get(name, FILE) == FILE

@@ -1,0 +1,209 @@
+"""Files from strangers are read within bounds, and paths that they name stay in their folders."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+import powderdsl
+from powderdsl.bounded_files import check_links, inside, parse_json, read_bytes, read_json
+from powderdsl.compiler import split_names
+from powderdsl.diagnostics import CompileError
+from powderdsl.worlds.files import replacing
+from tests.cli.commands import PACK
+from tests.cli.commands import powderdsl as command
+
+
+def irregular(folder: Path, suffix: str) -> dict[str, tuple[Path, str]]:
+    """Things that are no files, by what they are, with the words that say so."""
+    os.mkfifo(folder / f"pipe{suffix}")
+    (folder / f"folder{suffix}").mkdir()
+    (folder / f"link{suffix}").symlink_to("/dev/zero")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(folder / f"s{suffix}"))
+    return {
+        "pipe": (folder / f"pipe{suffix}", "it is a pipe"),
+        "folder": (folder / f"folder{suffix}", "folder"),
+        "device": (folder / f"link{suffix}", "it is a device"),
+        "socket": (folder / f"s{suffix}", "it is a socket"),
+    }
+
+
+def test_only_regular_files_are_read(tmp_path):
+    for path, says in irregular(tmp_path, "").values():
+        with pytest.raises(OSError, match=says):
+            read_bytes(path, 100)
+    with pytest.raises(OSError, match="NUL"):
+        read_bytes("a\0b", 100)
+
+
+def test_no_more_than_the_limit_is_read(tmp_path):
+    (tmp_path / "x").write_bytes(b"x" * 100)
+    assert len(read_bytes(tmp_path / "x", 100)) == 100
+    with pytest.raises(OSError, match="more than 99 bytes"):
+        read_bytes(tmp_path / "x", 99)
+    with pytest.raises(OSError, match="more than 10 bytes"):
+        read_bytes("/proc/self/status", 10)  # says that it has 0
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "socket"])
+@pytest.mark.parametrize(
+    ("words", "suffix"),
+    [
+        (("check",), ".yaml"),
+        (("show",), ".yaml"),
+        (("train",), ".yaml"),
+        (("study",), ".yaml"),
+        (("run", "core", "--world"), ".yaml"),
+        (("run", "core", "--world"), ".txt"),
+        (("run", "core", "--world"), ".png"),
+        (("fuzz", "--replay"), ".yaml"),
+        (("test", "core", "--replay"), ".yaml"),
+    ],
+)
+def test_every_command_says_what_is_no_file(words, suffix, kind, tmp_path):
+    path, says = irregular(tmp_path, suffix)[kind]
+    result = command(*words, path)
+    assert result.exit_code == 2
+    assert says in result.output
+    assert "no file" not in result.output.replace("not a file", "")
+
+
+def test_json_has_a_bounded_number_of_values(tmp_path):
+    with pytest.raises(ValueError, match="values"):
+        parse_json(b"[" + b"[]," * 1000 + b"[]]", values=1000)
+    with pytest.raises(ValueError, match="deep"):
+        parse_json(b"[" * 200_000 + b"]" * 200_000)
+    assert parse_json(b'{"a": [1, 2]}') == {"a": [1, 2]}
+    assert read_json(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/etc/passwd",
+        "../x",
+        "a/../../x",
+        "a/..",
+        "..",
+        ".",
+        "",
+        " ",
+        "~",
+        "~root/x",
+        "a\0b",
+        "a\nb",
+        "\x1b[2J",
+        "C:\\x",
+        "C:x",
+        "\\x",
+        "..\\x",
+        "//host/x",
+        "out/x",
+        "out2",
+        "loop",
+        "loop/x",
+    ],
+)
+def test_a_path_that_leads_elsewhere(name, tmp_path):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "out").symlink_to(tmp_path)
+    (tmp_path / "home" / "out2").symlink_to("/etc/passwd")
+    (tmp_path / "home" / "loop").symlink_to("loop")
+    with pytest.raises(ValueError, match=r"\w"):
+        inside(tmp_path / "home", name)
+
+
+def test_a_path_that_stays(tmp_path):
+    (tmp_path / "in").symlink_to(tmp_path / "sub")
+    for name in ("x.yaml", "a/b.yaml", "./x", "a b", "..x", "x..", "in/x", "ünï"):
+        assert inside(tmp_path, name) == tmp_path / name
+
+
+def test_links_that_lead_out_of_a_folder(tmp_path):
+    home = tmp_path / "home"
+    (home / "deep").mkdir(parents=True)
+    (home / "deep" / "here").symlink_to("../deep")
+    check_links(home)
+    (home / "deep" / "there").symlink_to(tmp_path)
+    with pytest.raises(OSError, match="leads out"):
+        check_links(home)
+    # The folder itself may be a link: the user named it.
+    (tmp_path / "alias").symlink_to(home / "deep" / "here")
+    (home / "deep" / "there").unlink()
+    check_links(tmp_path / "alias")
+
+
+def test_a_pack_beside_a_ruleset_is_no_link_out(tmp_path):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "secret.yaml").write_text(PACK)
+    (tmp_path / "home" / "grit.yaml").symlink_to("../secret.yaml")
+    (tmp_path / "home" / "r.yaml").write_text("ruleset: r\npacks: [core, grit]\n")
+    with pytest.raises(CompileError) as caught:
+        powderdsl.load(tmp_path / "home" / "r.yaml")
+    assert [one.code for one in caught.value.diagnostics] == ["PD112"]
+
+
+def test_a_ruleset_reads_nothing_of_the_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "home").mkdir()
+    (tmp_path / "secret").write_text("pack: secret\n")
+    (tmp_path / "home" / "r.yaml").write_text("ruleset: r\npacks: [core, secret]\n")
+    with pytest.raises(CompileError) as caught:
+        powderdsl.load("home/r.yaml")
+    assert [one.code for one in caught.value.diagnostics] == ["PD304"]
+
+
+# Names with a `+`
+
+
+def test_files_with_a_plus_in_their_path_can_be_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a+b-c").mkdir()
+    path = "a+b-c/g+r.yaml"
+    (tmp_path / path).write_text(PACK)
+    assert split_names(f"core+{path}") == (["core", path], [])
+    assert split_names(f"{path}+core+{path}") == ([path, "core", path], [])
+    assert split_names(f"core+{path}-sand") == (["core", path], ["sand"])
+    assert split_names("powderworld-gas+x.yaml-sand-acid") == (
+        ["powderworld", "x.yaml"],
+        ["gas", "sand", "acid"],
+    )
+    assert powderdsl.load(f"core+{path}").packs == ("core", "grit")
+    assert command("check", f"core+{tmp_path / path}").exit_code == 0
+
+
+# Writing
+
+
+def test_a_link_stays_a_link_and_its_target_is_written(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "x.txt").write_text("old")
+    (tmp_path / "x.txt").symlink_to("far/x.txt")
+    with replacing(tmp_path / "x.txt", follow=True) as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "x.txt").is_symlink()
+    assert (tmp_path / "far" / "x.txt").read_text() == "new"
+    (tmp_path / "y.txt").symlink_to("far/new.txt")  # which is not there yet
+    result = command("compile", "core", "--emit", "ir", "--out", tmp_path / "y.txt")
+    assert result.exit_code == 0
+    assert (tmp_path / "far" / "new.txt").read_text()
+    assert (tmp_path / "y.txt").is_symlink()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "socket"])
+def test_nothing_but_files_is_replaced(kind, tmp_path):
+    path, says = irregular(tmp_path, ".txt")[kind]
+    result = command("compile", "core", "--emit", "ir", "--out", path)
+    assert result.exit_code == 2
+    assert "PD613" in result.stderr
+    assert says in result.output
+    assert not path.is_file()
+
+
+def test_a_loop_of_links_is_not_written(tmp_path):
+    (tmp_path / "x.txt").symlink_to("x.txt")
+    assert command("compile", "core", "--emit", "ir", "--out", tmp_path / "x.txt").exit_code == 2
