@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.bounded_files import inside, is_path
-from powderdsl.diagnostics import Reporter, Severity, Span, suggest
+from powderdsl.diagnostics import Label, Reporter, Severity, Span, suggest
 from powderdsl.model.check import check
 from powderdsl.model.compose import compose
 from powderdsl.model.declarations import PackDecl, RulesetDecl
@@ -38,6 +38,9 @@ BACKENDS = {
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""
+
+MAX_BASES = 8
+"""Rulesets that extend each other, in a row."""
 
 
 MAX_PLUSES = 16
@@ -150,9 +153,12 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
     kept = [pack for name, pack in packs.items() if name not in left_out]
     if not rulesets:
         return kept, None
-    own = {scalar.text for scalar in rulesets[-1].packs}
-    gone = tuple(pack for name, pack in packs.items() if name in left_out and name in own)
-    return kept, replace(rulesets[-1], left_out=gone)
+    *beside, last = rulesets
+    loaded = {pack.name.text for pack in kept}
+    gone = [name for one in last.lineage for name in one.members if name not in loaded]
+    spare = packs | _left_out_by(last, reporter)
+    reserved = tuple(spare[name] for name in dict.fromkeys(gone) if name in spare)
+    return kept, replace(last, beside=tuple(beside), left_out=reserved)
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:
@@ -244,19 +250,89 @@ def _read_one(
             return
         packs[decl.name.text] = decl
     elif from_ruleset is not None:
+        span = next(scalar.span for scalar in from_ruleset.packs if scalar.text == word)
         reporter.error(
-            "PD304", f"`{word}` is a ruleset, not a pack", decl.name.span, helps=["a ruleset lists packs"]
-        )
+            "PD304", f"`{word}` is a ruleset, not a pack", span, "under `packs:` stand packs",
+            helps=[f"to start from it, write `extends: {word}`"],
+        )  # fmt: skip
     else:
-        rulesets.append(decl)
-        for scalar in decl.packs:
-            _read_one(scalar.text, packs, rulesets, reporter, decl)
+        _read_ruleset(decl, packs, rulesets, reporter)
+
+
+def _read_ruleset(
+    written: RulesetDecl, packs: dict[str, PackDecl], rulesets: list[RulesetDecl], reporter: Reporter
+) -> None:
+    """A ruleset with what it inherits, and its packs: each is looked for beside the file that lists it."""
+    found = _with_base(written, (written,), reporter)
+    if found is None or any(one.source.name == found.source.name for one in rulesets):
+        return
+    rulesets.append(found)
+    for name in found.members:
+        lister = found.lister(name)
+        assert lister is not None
+        _read_one(name, packs, rulesets, reporter, lister)
+
+
+def _left_out_by(ruleset: RulesetDecl, reporter: Reporter) -> dict[str, PackDecl]:
+    """The packs that rulesets leave out of those that they extend: the ids of their elements stay reserved."""
+    packs: dict[str, PackDecl] = {}
+    for one in ruleset.lineage:
+        for scalar in one.without:
+            lister = one.base.lister(scalar.text) if one.base else None
+            if lister is not None and scalar.text not in ruleset.members:
+                _read_one(scalar.text, packs, [], reporter, lister)
+    return packs
+
+
+def _with_base(decl: RulesetDecl, path: tuple[RulesetDecl, ...], reporter: Reporter) -> RulesetDecl | None:
+    """The ruleset with the one that it extends; `path` leads from the first one to this one."""
+    if decl.extends is None:
+        return decl
+    file = _find_beside(decl.extends.text, reporter, decl, decl.extends.span)
+    source = read_source(file, reporter) if file else None
+    base = read_file(source, reporter) if source else None
+    if base is None:
+        return None
+    span, name = decl.extends.span, decl.extends.text
+    if isinstance(base, PackDecl):
+        reporter.error(
+            "PD304", f"`{name}` is a pack, not a ruleset", span, "only a ruleset can be extended",
+            helps=["list it under `packs:`"],
+        )  # fmt: skip
+        return None
+    sources = [one.source.name for one in path]
+    if base.source.name in sources:
+        cycle = [one.name.text for one in path[sources.index(base.source.name) :]]
+        reporter.error(
+            "PD314", "rulesets extend each other: " + " extends ".join(f"`{one}`" for one in [*cycle, cycle[0]]),
+            span, "this leads back" if len(cycle) > 1 else "this is the ruleset itself",
+            secondary=[Label(one.extends.span, "by way of this") for one in path[:-1] if one.extends],
+            helps=["take one `extends` out"],
+        )  # fmt: skip
+        return None
+    if len(path) > MAX_BASES:
+        reporter.error(
+            "PD508", f"more than {MAX_BASES} rulesets extend each other in a row", span, "one too many",
+            helps=["list packs instead of extending"],
+        )  # fmt: skip
+        return None
+    whole = _with_base(base, (*path, base), reporter)
+    if whole is None:
+        return None
+    for scalar in decl.without:
+        if scalar.text not in whole.members:
+            reporter.error(
+                "PD304", f"`{scalar.text}` is left out, but `{name}` does not have it", scalar.span, "not there",
+                helps=list(suggest(scalar.text, whole.members, "packs")),
+            )  # fmt: skip
+    return replace(decl, base=whole)
 
 
 def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | None:
     """A file by path or shipped name; packs of a ruleset lie beside its file or are shipped."""
     if ruleset is not None:
-        return _find_beside(word, reporter, ruleset)
+        span = next((s.span for s in ruleset.packs if s.text == word), None)
+        return _find_beside(word, reporter, ruleset, span)
     looks_like_path = is_path(word)
     candidates = [Path(word)] if looks_like_path else [shipped("rules") / f"{word}.yaml", Path(word)]
     for path in candidates:
@@ -273,12 +349,11 @@ def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | 
     return None
 
 
-def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl) -> Path | None:
-    """The file of a pack that a ruleset lists."""
-    span = next((s.span for s in ruleset.packs if s.text == word), None)
+def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl, span: Span | None) -> Path | None:
+    """The file of what a ruleset names at some place: a pack, or the ruleset that it extends."""
     if is_path(word):
-        helps = ["put the file beside the ruleset and write its name"]
-        message = f"a ruleset names packs, not paths: `{word}`"
+        helps = ["put the file beside the ruleset and write its name, without `.yaml`"]
+        message = f"a ruleset names other files without a path: `{word}`"
         reporter.error("PD304", message, span, helps=helps)
         return None
     folder, name = Path(ruleset.source.name).parent, f"{word}.yaml"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from powderdsl import reference
 from powderdsl.draw import to_numpy
+from powderdsl.model.restrict import restricted, without
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Ruleset
 from powderdsl.pack_test_chances import chance_problem, world_context
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 SEEDS = (0, 1, 2, 3, 4)
 """What a test runs with if it names no seed: a rule that needs luck should not pass by luck."""
 
+MOST = 8
+"""Added packs that are left out in turn, to see which of them change what a test shows."""
+
 ANYTHING = "?"
 """The character of `expect` that matches every element."""
 
@@ -34,6 +38,8 @@ class ExampleResult:
     `problem` is empty if it passed with every seed, otherwise a sentence about the first seed it failed with:
     `seed`, after how many steps, and the world then, in the test's characters. `field` is the field that is not as
     expected, if one is, and `field_after` its rows, a word a cell.
+    `added` are loaded packs that the test does not speak of, without which it passes: then it has not failed, it comes
+    out differently.
     """
 
     example: Example
@@ -44,10 +50,17 @@ class ExampleResult:
     after: tuple[str, ...] = ()
     field: str = ""
     field_after: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
+        """Whether it came out as it says, with all seeds."""
         return not self.problem
+
+    @property
+    def failed(self) -> bool:
+        """Whether it did not, and no added pack is the reason."""
+        return bool(self.problem) and not self.added
 
 
 def run_examples(
@@ -62,7 +75,8 @@ def run_examples(
 
     A test runs with its own seed, or with each of SEEDS. It passes if the last world looks as `expect` says, its
     fields hold what `expect_fields` says, every condition under `always` holds in every cell after every step, and
-    what `often` says happens about as often. Tests of one size run as one batch.
+    what `often` says happens about as often. Tests of one size run as one batch. One that does not pass runs again with
+    the packs of its scope alone, if more are loaded.
 
     Args:
         sim: what runs them, instead of a new simulator of this ruleset.
@@ -77,7 +91,32 @@ def run_examples(
         batch = [_Running.of(ruleset.tests[number], sim) for number in numbers]
         found = _run(batch, sim, seen)
         results |= dict(zip(numbers, found, strict=True))
-    return [results[number] for number in range(len(ruleset.tests))]
+    return [_judged(results[number], ruleset, sim) for number in range(len(ruleset.tests))]
+
+
+def _judged(result: ExampleResult, ruleset: Ruleset, sim: Simulator) -> ExampleResult:
+    """The result; one that is wrong only with packs that the test does not speak of names them."""
+    scope = result.example.scope
+    added = ruleset.added_to(scope) if scope and not result.passed else ()
+
+    def passes(fewer: Ruleset | None) -> bool:
+        own = [one for one in fewer.tests if one.span == result.example.span] if fewer else []
+        if fewer is None or not own:
+            return False
+        some = replace(fewer, tests=(replace(own[0], scope=()),))
+        return run_examples(some, sim.backend, str(sim.device))[0].passed
+
+    if not added or not passes(restricted(ruleset, scope)):
+        return result
+    alone = [pack for pack in added[:MOST] if len(added) == 1 or passes(without(ruleset, pack))]
+    return replace(result, added=tuple(alone) or added)
+
+
+def start_of(example: Example, sim: Simulator, seed: int) -> World:
+    """The start world of a test, one of a seed."""
+    ids = {char: _id(sim.ruleset, name) for char, name in example.legend}
+    grid = np.array([[[ids[char] for char in row] for row in example.given]], dtype=np.uint8)
+    return with_fields(sim.world(grid, seed=[seed]), [example])
 
 
 @dataclass(frozen=True)

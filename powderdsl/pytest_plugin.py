@@ -143,7 +143,7 @@ class PackItem(pytest.Item):
 
         if isinstance(self.subject, Example):
             (result,) = run_examples(replace(self.ruleset, tests=(self.subject,)))
-            if not result.passed:
+            if result.failed:
                 after = "\n".join(result.after)
                 raise Failed(f"{result.problem} (seed {result.seed}, after {result.step} steps)\n{after}")
             return
@@ -154,7 +154,7 @@ class PackItem(pytest.Item):
         if search.trials:
             search.try_random()
             for outcome in search.finish():
-                if outcome.counterexample is not None:
+                if outcome.counterexample is not None and not outcome.holds:
                     raise Failed("\n".join(counterexample_lines(outcome.counterexample, self.ruleset)))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:

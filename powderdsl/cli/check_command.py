@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from powderdsl.tasks.task import Task
 
 
+ALWAYS_TOLD = ("PD515",)
+"""Notes that stand below the summary without `--notes` too, in a line each: what added packs change."""
+
+
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
 @click.option(
@@ -73,11 +77,15 @@ def command(
         counts = Counter(one.severity for one in diagnostics)
         errors += counts[Severity.ERROR]
         warnings += counts[Severity.WARNING]
-        found |= dict.fromkeys(one for one in diagnostics if notes or one.severity is not Severity.NOTE)
+        shown = [one for one in diagnostics if notes or one.severity is not Severity.NOTE]
+        differences = [one for one in diagnostics if one.code in ALWAYS_TOLD and not notes]
+        found |= dict.fromkeys(shown if layout == "text" else [*shown, *differences])
         if found_task is not None:
             lines.append(_task_summary(name, found_task[0], counts))
             continue
         lines.append(_summary(name, ruleset, counts, notes))
+        if layout == "text":
+            lines += [f"  {one.message}" for one in differences]
         if cost and ruleset is not None:
             expenses[name] = _costs(ruleset)
             lines += ["", *_cost_lines(expenses[name])]

@@ -126,15 +126,19 @@ class _Session:
     def test(self, name: str, ruleset: Ruleset) -> None:
         """Tests, invariants, coverage of one ruleset."""
         from powderdsl.pack_tests import run_examples
+        from powderdsl.properties.differences import difference_of_test
+        from powderdsl.properties.outcomes import difference_lines, difference_words
         from powderdsl.properties.running import Runner
 
         start = monotonic()
         runner = Runner(ruleset, self.backend)
         tests = run_examples(ruleset, sim=runner.sim, seen=lambda world: runner.note(world.state))
         for test in tests:
-            self.say(f"{'ok  ' if test.passed else 'FAIL'}  {test.example.pack}: {test.example.name}")
+            self.say(f"{_word(test)}  {test.example.pack}: {test.example.name}")
             if not test.passed:
-                self.say(*(f"      {line}".rstrip() for line in _failure_lines(test)))
+                found = difference_of_test(test, ruleset)
+                words = [difference_words(found), *difference_lines(found)] if found else []
+                self.say(*(f"      {line}".rstrip() for line in [*words, *_failure_lines(test)]))
         results = self._properties(name, runner)
         missed = [span for span in runner.lines if span not in runner.happened]
         for span in missed:
@@ -144,12 +148,18 @@ class _Session:
             f" on {runner.worlds_run:,} worlds in {monotonic() - start:.0f} s"
         )
         broken = sum(not result.holds for result in results)
-        failed = sum(not test.passed for test in tests)
+        failed = sum(test.failed for test in tests)
+        changed = sum(bool(test.added) for test in tests)
+        changed += sum(result.status == "differs" for result in results)
         declared = [result for result in results if result.prop.owner != "automatic"]
         parts = [counted(len(tests), "test")]
         parts += [counted(len(declared), "invariant")] if declared else []
         bad = [f"{number} {word}" for number, word in ((failed, "failed"), (broken, "broken")) if number]
-        self.say(f"{ruleset.name}: {', '.join(parts)}, {', '.join(bad) or 'all passed'}")
+        told = [f"{changed} come out differently with added packs"] if changed > 1 else []
+        told = ["1 comes out differently with added packs"] if changed == 1 else told
+        self.say(
+            f"{ruleset.name}: {', '.join([*parts, *(bad or told or ['all passed']), *(told if bad else [])])}"
+        )
         self.failed |= bool(bad)
         self.data[name] = _data(tests, results, runner.lines, missed)
 
@@ -172,19 +182,21 @@ class _Session:
         results = search.finish()
         for result in results:
             self._tell(result, runner.ruleset)
-            if result.counterexample is not None and self.keep:
+            if result.counterexample is not None and not result.holds and self.keep:
                 path = file_of(name, result.prop)
                 write_example(path, name, result.prop, result.counterexample)
                 self.say(f"      again: powderdsl test {name} --replay {path}")
         return results
 
     def _tell(self, result: Result, ruleset: Ruleset) -> None:
-        from powderdsl.properties.outcomes import counterexample_lines, picture, result_line
+        from powderdsl.properties.outcomes import counterexample_lines, difference_lines, picture, result_line
 
         if result.prop.owner == "automatic" and result.holds:
             return
         self.say(result_line(result))
         found = result.counterexample
+        if result.difference is not None:
+            self.say(*(f"      {line}" for line in difference_lines(result.difference)))
         if found is not None:
             self.say(*(f"      {line}" for line in counterexample_lines(found, ruleset)))
             if self.picture is not None:
@@ -200,7 +212,7 @@ class _Session:
         from powderdsl.properties.keep import read_example
         from powderdsl.properties.outcomes import Result, result_data
         from powderdsl.properties.running import Runner
-        from powderdsl.properties.search import as_it_is, find_property
+        from powderdsl.properties.search import as_it_is, find_property, told_apart
 
         text, sample, steps = read_example(path, ruleset)
         prop = find_property(ruleset, text)
@@ -210,8 +222,10 @@ class _Session:
         broken = bool(breaks(prop.claim, runner, sample, steps).first.any())
         found = as_it_is(prop.claim, runner, sample, steps) if broken else None
         result = Result(prop, "broken" if broken else "tested", 1, "", found)
+        if broken:
+            (result,) = told_apart([result], runner, self.plan)
         self._tell(result, ruleset)
-        self.failed |= broken
+        self.failed |= not result.holds
         self.data[name] = {"properties": [result_data(result)]}
 
 
@@ -227,6 +241,7 @@ def _data(
                 "pack": one.example.pack,
                 "place": place_of(one.example.span),
                 "passed": one.passed,
+                "added": list(one.added),
                 "problem": one.problem,
                 "seed": one.seed,
                 "steps": one.step,
@@ -236,6 +251,10 @@ def _data(
         "properties": [result_data(result) for result in results],
         "rules": {"all": len(lines), "never": [place_of(span) for span in missed]},
     }
+
+
+def _word(result: ExampleResult) -> str:
+    return "ok  " if result.passed else "FAIL" if result.failed else "differs"
 
 
 def _failure_lines(result: ExampleResult) -> Iterator[str]:

@@ -58,6 +58,7 @@ _ROWS = (
     ("PD311", "reserved-word", _ERROR),
     ("PD312", "name-qualified", _NOTE),
     ("PD313", "id-taken", _NOTE),
+    ("PD314", "ruleset-cycle", _ERROR),
     # PD4xx: kinds and ranges
     ("PD401", "wrong-kind", _ERROR),
     ("PD402", "value-out-of-range", _ERROR),
@@ -83,6 +84,7 @@ _ROWS = (
     ("PD512", "invariant-broken", _ERROR),
     ("PD513", "condition-decides-nothing", _WARNING),
     ("PD514", "rule-overruled", _WARNING),
+    ("PD515", "invariant-outgrown", _NOTE),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from powderdsl.diagnostics import Reporter, Span, suggest
@@ -32,9 +32,21 @@ from powderdsl.model.symbols import (
     read_kind,
     settled,
 )
-from powderdsl.model.types import CHANCE, FLAG, Element, Kind, Param, Property, Ruleset, Stream, Value
+from powderdsl.model.types import (
+    CHANCE,
+    FLAG,
+    Declared,
+    Element,
+    Kind,
+    Param,
+    Property,
+    Ruleset,
+    Stream,
+    Value,
+)
 from powderdsl.model.unused import report_unused
 from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.yaml_tree import Scalar
 
 
 def resolve_names(
@@ -110,6 +122,7 @@ def check(
         order=state_order(composition, symbols, passes),
         tests=examples,
         invariants=invariants,
+        declared=Declared(tuple(packs), ruleset),
     )
     report_undrawn(found, given, facts, reporter)
     return found
@@ -142,7 +155,7 @@ def _params(symbols: Symbols, typer: Typer) -> None:
         except Poisoned:
             continue
         symbols.params[qualified] = Param(qualified, kind, value, decl.about, decl.name.span)
-    for key, syntax in symbols.composition.ruleset.params if symbols.composition.ruleset else ():
+    for key, syntax in _ruleset_params(symbols.composition):
         param = symbols.params.get(key.text)
         if param is None:
             typer.reporter.error(
@@ -159,6 +172,17 @@ def _params(symbols: Symbols, typer: Typer) -> None:
             )
         except Poisoned:
             continue
+
+
+def _ruleset_params(composition: Composition) -> Iterator[tuple[Scalar, Syntax]]:
+    """The values that rulesets give to parameters, those of a base first; none for packs that are left out."""
+    loaded = {pack.name.text for pack in composition.packs}
+    for ruleset in composition.ruleset.lineage if composition.ruleset else ():
+        for key, syntax in ruleset.params:
+            pack = key.text.partition(".")[0]
+            inherited = any(pack in one.members for one in ruleset.lineage)
+            if pack in loaded or not inherited:
+                yield key, syntax
 
 
 def _kind_of_literal(decl: TypedDecl, typer: Typer) -> Kind:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Generic, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.model.claim_scopes import ClaimScopes, title_of
 from powderdsl.model.declarations import (
     ElementDecl,
     KernelDecl,
@@ -65,6 +67,17 @@ class Composition:
     reserved: tuple[int, ...]
     """Ids of elements of a ruleset's own packs that are left out."""
 
+    @cached_property
+    def scopes(self) -> ClaimScopes:
+        """What invariants and tests speak of."""
+        return ClaimScopes(self.packs, self.ruleset, self.names)
+
+    def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
+        """The glyphs of elements, by global name, as they are where only some packs are loaded."""
+        named = {id(one.decl): one for one in self.element_decls.values() if one.pack in packs}
+        ordered = [named[id(decl)] for pack in self.packs for decl in pack.elements if id(decl) in named]
+        return _glyphs(ordered)
+
     def element(self, word: str, pack: str) -> str | None:
         """The global name of the element that a pack means by a plain or qualified name."""
         name = self.names.of(pack, word)
@@ -84,7 +97,7 @@ def compose(
     `palette` has ids that were recorded earlier.
     """
     _check_needs(packs, reporter)
-    book = NameBook(packs, ruleset.rename if ruleset else (), reporter)
+    book = NameBook(packs, ruleset.renames if ruleset else (), reporter)
     chosen = _chosen_elements(packs, book, reporter)
     groups = _groups(packs, ruleset)
     claims = _claims(groups, ruleset is not None, chosen)
@@ -93,23 +106,25 @@ def compose(
     loaded = [claim for claim in claims if claim.name in chosen]
     report_ids(loaded, ids, reporter, recorded=palette is not None)
     elements = _elements(chosen, ids, reporter)
+    placing = ruleset.placing if ruleset else None
+    wanted = (placing.slots if placing else None) or 0
     slots = max(
         [
-            ruleset.slots or 0 if ruleset else 0,
+            wanted,
             *(number + 1 for number in ids.values()),
             len(palette or ()),
             1,
         ]
     )
-    # The ruleset's own packs must fit its slots; packs loaded on top of them add slots.
-    own = {scalar.text for scalar in ruleset.packs} if ruleset and ruleset.slots else set()
+    # The packs of the ruleset that says so must fit its slots; packs loaded on top of them add slots.
+    own = placing.members if placing and wanted else ()
     top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
-    if top and ruleset and ruleset.slots and palette is None and top.id >= ruleset.slots:
+    if top and placing and palette is None and top.id >= wanted:
         reporter.error(
             "PD402",
-            f"element `{top.name}` has id {top.id}, but the ruleset has {ruleset.slots} slots",
+            f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots",
             top.span,
-            helps=[f"say `slots: {top.id + 1}` in {ruleset.source.name}"],
+            helps=[f"say `slots: {top.id + 1}` in {placing.source.name}"],
         )
     tag_spans: dict[str, Span] = {}
     for pack in packs:
@@ -138,7 +153,7 @@ def compose(
             book.check_word(decl.name, "parameter")
     names = book.finish()
     _check_renamed(ruleset, book, reporter)
-    name = ruleset.name.text if ruleset else "+".join(pack.name.text for pack in packs)
+    name = title_of(packs, ruleset)
     about = ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else "")
     composition = Composition(
         name=name,
@@ -170,7 +185,7 @@ def _check_renamed(ruleset: RulesetDecl | None, book: NameBook, reporter: Report
     if ruleset is None:
         return
     waiting = {pack.name.text for pack in ruleset.left_out}
-    for old, _ in ruleset.rename:
+    for old, _ in ruleset.renames:
         if old.text not in book.renamed and old.text.partition(".")[0] not in waiting:
             reporter.error(
                 "PD310",
@@ -261,7 +276,7 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     A ruleset's own packs come first, those that are left out among them, for their places stay reserved. Then comes
     each further pack by itself, after those that it needs: the order in which packs are named decides little.
     """
-    own = {scalar.text for scalar in ruleset.packs} if ruleset else set()
+    own = ruleset.placing.members if ruleset else ()
     left_out = ruleset.left_out if ruleset else ()
     first = [pack for pack in (*packs, *left_out) if pack.name.text in own]
     others = _needed_first([pack for pack in packs if pack.name.text not in own])
@@ -327,27 +342,35 @@ def _elements(chosen: dict[str, _Chosen], ids: dict[str, int], reporter: Reporte
                 "PD302", f"elements `{first.decl.name.text}` and `{one.named.decl.name.text}` have the same glyph `{glyph}`",
                 one.named.decl.name.span, "this one", secondary=[Label(first.decl.name.span, "and this one")], helps=["give one of them another glyph"],
             )  # fmt: skip
-    glyphs = set(owners)
+    glyphs = _glyphs([one.named for name, one in chosen.items() if name in ids])
     elements: dict[str, Element] = {}
     for name, one in chosen.items():
         decl = one.named.decl
         if name not in ids:
             continue
-        glyph = decl.glyph if owners.get(decl.glyph) is one.named else ""
-        word = decl.name.text
-        glyph = glyph or next(
-            (
-                c
-                for c in [*word, *word.upper(), *"0123456789@$&*+=<>"]
-                if c.isalnum() | (c in "@$&*+=<>") and c not in glyphs
-            ),
-            "?",
-        )
-        glyphs.add(glyph)
         elements[name] = Element(
-            name, one.named.pack, ids[name], decl.color, glyph, decl.about, frozenset(), decl.name.span
+            name, one.named.pack, ids[name], decl.color, glyphs[name], decl.about, frozenset(), decl.name.span
         )
     return dict(sorted(elements.items(), key=lambda item: item[1].id))
+
+
+def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
+    """A glyph for each global name: what files say comes first, then free letters in the order of the elements."""
+    owners: dict[str, Named[ElementDecl]] = {}
+    for named in elements:
+        if named.decl.glyph:
+            owners.setdefault(named.decl.glyph, named)
+    taken = set(owners)
+    glyphs: dict[str, str] = {}
+    for named in elements:
+        word, glyph = named.decl.name.text, named.decl.glyph
+        if not glyph or owners[glyph] is not named:
+            letters = [*word, *word.upper(), *"0123456789@$&*+=<>"]
+            allowed = (c for c in letters if c.isalnum() or c in "@$&*+=<>")
+            glyph = next((c for c in allowed if c not in taken), "?")
+        taken.add(glyph)
+        glyphs[named.name] = glyph
+    return glyphs
 
 
 def _tags(composition: Composition, reporter: Reporter) -> dict[str, frozenset[int]]:

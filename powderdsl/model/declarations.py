@@ -120,7 +120,10 @@ class PackDecl:
 
 @dataclass(frozen=True)
 class RulesetDecl:
-    """One ruleset file: a list of packs with a name."""
+    """One ruleset file. `packs`, `slots`, `matrix`, `params` and `rename` are as written, without what it inherits.
+
+    `base` is the ruleset that it extends; `beside` are rulesets that were named before it, of which it is no part.
+    """
 
     name: Scalar
     source: Source
@@ -134,3 +137,42 @@ class RulesetDecl:
     """Qualified names, and the names by which these definitions are known here."""
     left_out: tuple[PackDecl, ...] = ()
     """Packs of its own that are not loaded: the ids of their elements stay reserved."""
+    extends: Scalar | None = None
+    without: tuple[Scalar, ...] = ()
+    base: RulesetDecl | None = None
+    beside: tuple[RulesetDecl, ...] = ()
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """Names of the packs that it is made of: those of its base that it keeps, then its own."""
+        gone = {scalar.text for scalar in self.without}
+        kept = [name for name in self.base.members if name not in gone] if self.base else []
+        return tuple(dict.fromkeys([*kept, *(scalar.text for scalar in self.packs)]))
+
+    def lister(self, pack: str) -> RulesetDecl | None:
+        """The ruleset in whose file one of its packs is listed: this one, or one that it extends."""
+        inherited = self.base is not None and pack in self.base.members
+        if inherited and pack not in {scalar.text for scalar in self.without}:
+            assert self.base is not None
+            return self.base.lister(pack)
+        return self if pack in {scalar.text for scalar in self.packs} else None
+
+    @property
+    def lineage(self) -> tuple[RulesetDecl, ...]:
+        """It, the rulesets that it extends and those beside it, each once: what inherits comes after what it extends."""
+        found: dict[str, RulesetDecl] = {}
+        for one in (*self.beside, self.base):
+            if one is not None:
+                found |= {inherited.source.name: inherited for inherited in one.lineage}
+        found.pop(self.source.name, None)
+        return (*found.values(), self)
+
+    @property
+    def placing(self) -> RulesetDecl:
+        """The ruleset whose packs come first in ids and channels: the last that says `slots` or `matrix`."""
+        return self if self.slots or self.matrix or self.base is None else self.base.placing
+
+    @property
+    def renames(self) -> tuple[tuple[Scalar, Scalar], ...]:
+        """Its own and those that it inherits; the last one for a name counts."""
+        return tuple(pair for one in self.lineage for pair in one.rename)

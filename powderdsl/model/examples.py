@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
 from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.model.claim_scopes import words_of
 from powderdsl.model.compose import Composition
 from powderdsl.model.constants import constant_of
 from powderdsl.model.declarations import TestDecl
@@ -34,6 +35,9 @@ def check_examples(composition: Composition, typer: Typer) -> tuple[Example, ...
 
 def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) -> Example:
     legend = {element.glyph: name for name, element in composition.elements.items()}
+    # Glyphs mean what they mean without packs that the author of the test does not know.
+    alone = composition.glyphs_alone(composition.scopes.of_pack(pack))
+    legend |= {glyph: name for name, glyph in alone.items()}
     # What the pack's own file says comes first, whatever other packs took before.
     own = {name: named.decl.glyph for name, named in composition.element_decls.items() if named.pack == pack}
     legend |= {glyph: name for name, glyph in own.items() if glyph}
@@ -80,6 +84,9 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         )
     scope = Scope(pack, {"world": _whole_world(len(given), len(given[0]))})
     always: list[Expr] = [typer.condition(syntax, scope) for syntax in decl.always]
+    drawn = {legend[char] for rows in (given, expect or ()) for row in rows for char in row if char in legend}
+    words = [*sorted(drawn), *(grid.name for grid in (*fields, *expect_fields))]
+    words += [word for syntax in decl.always for word in words_of(syntax)]
     return Example(
         decl.name,
         given,
@@ -93,6 +100,7 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         fields,
         expect_fields,
         tuple(_often(change, chance, scope, typer) for change, chance in decl.often),
+        composition.scopes.of_pack(pack, words),
     )
 
 

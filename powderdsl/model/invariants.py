@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from powderdsl.diagnostics import Span, suggest
+from powderdsl.model.claim_scopes import words_of
 from powderdsl.model.compose import Composition
+from powderdsl.model.declarations import RulesetDecl
 from powderdsl.model.expressions import Typer
 from powderdsl.model.literals import read_bounds
 from powderdsl.model.operands import (
@@ -45,19 +47,20 @@ TRENDS = {"rises": "never rises", "falls": "never falls", "changes": "constant"}
 
 def check_invariants(composition: Composition, typer: Typer) -> tuple[Invariant, ...]:
     """The invariants of all packs and of the ruleset. Those that need a pack which is not loaded are left out."""
-    written = [(pack.name.text, line) for pack in composition.packs for line in pack.invariants]
-    if composition.ruleset is not None:
-        written += [(composition.ruleset.name.text, line) for line in composition.ruleset.invariants]
+    written: list[tuple[str, Syntax, RulesetDecl | None]]
+    written = [(pack.name.text, line, None) for pack in composition.packs for line in pack.invariants]
+    for ruleset in composition.ruleset.lineage if composition.ruleset else ():
+        written += [(ruleset.name.text, line, ruleset) for line in ruleset.invariants]
     found = []
-    for pack, line in written:
+    for pack, line, author in written:
         typer.absent.clear()
         typer.start_rule(line.span)
-        scope = Scope(pack, {})
+        where = Scope(pack, {})
         try:
-            without = _without(typer, line.children[1], scope) if line.kind == "without" else frozenset()
+            without = _without(typer, line.children[1], where) if line.kind == "without" else frozenset()
             typer.absent.clear()
             said = line.children[0] if line.kind == "without" else line
-            claim = _CLAIMS[said.kind](typer, said, scope)
+            claim = _CLAIMS[said.kind](typer, said, where)
         except Poisoned:
             continue
         except Asleep as asleep:
@@ -66,7 +69,9 @@ def check_invariants(composition: Composition, typer: Typer) -> tuple[Invariant,
                 helps=[f"it wakes up with a pack that defines `{asleep.name}`"],
             )  # fmt: skip
             continue
-        found.append(Invariant(claim, without, pack, line.span))
+        words, scopes = words_of(line), composition.scopes
+        scope = scopes.of_ruleset(author, words) if author else scopes.of_pack(pack, words)
+        found.append(Invariant(claim, without, pack, line.span, scope))
     return tuple(found)
 
 

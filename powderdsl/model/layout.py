@@ -32,7 +32,7 @@ def matrix_channels(
     channels: list[MatrixChannel] = []
     size = own_slots(composition)
     first = [MatrixChannel(by_id[n].name if n in by_id else "", id=n) for n in range(size)]
-    written = composition.ruleset.matrix if composition.ruleset else ()
+    written = composition.ruleset.placing.matrix if composition.ruleset else ()
     if written:
         for scalar in written:
             name = scalar.text.removesuffix("?")
@@ -66,8 +66,8 @@ def matrix_channels(
 
 def own_slots(composition: Composition) -> int:
     """How many ids the first packs have room for."""
-    if composition.ruleset is not None and composition.ruleset.slots:
-        return composition.ruleset.slots
+    if composition.ruleset is not None and composition.ruleset.placing.slots:
+        return composition.ruleset.placing.slots
     own = composition.groups[0]
     kept = [element.id for element in composition.elements.values() if element.pack in own]
     return max([*kept, *composition.reserved], default=-1) + 1

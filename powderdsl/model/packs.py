@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from powderdsl.diagnostics import Label, Reporter, Source
+from powderdsl.diagnostics import Label, Reporter, Source, Span
 from powderdsl.model.declarations import (
     AlsoDecl,
     Block,
@@ -75,6 +75,10 @@ class _PackReader(Reader):
         node = entries.get("params", (None, None))[1]
         if isinstance(node, Mapping):
             params = [(key, line) for key, value in node.entries if (line := self.line(value))]
+        extends = self.scalar(entries, "extends")
+        without = self.words(entries.get("without", (None, None))[1])
+        if extends is None and "extends" not in entries:
+            self.needs_no_base(tree, entries, without)
         return RulesetDecl(
             name,
             self.source,
@@ -85,7 +89,25 @@ class _PackReader(Reader):
             tuple(params),
             self.statements(entries.get("invariants", (None, None))[1]),
             tuple(renamed),
+            extends=extends,
+            without=without,
         )
+
+    def needs_no_base(
+        self, tree: Mapping, entries: dict[str, tuple[Scalar, Node]], without: tuple[Scalar, ...]
+    ) -> None:
+        """Report what is missing in a ruleset that extends none, or has no sense there."""
+        if "packs" not in entries:
+            start = tree.span.start
+            self.reporter.error(
+                "PD109", "a ruleset lacks `packs`", Span(self.source, start, start + 1), "`packs` is missing",
+                helps=[f"`packs`: {KEYS['ruleset']['packs'].about}", f"`extends`: {KEYS['ruleset']['extends'].about}"],
+            )  # fmt: skip
+        if without:
+            self.reporter.error(
+                "PD304", f"`{without[0].text}` is left out of nothing", without[0].span, "this ruleset extends none",
+                helps=["remove `without`, or say which ruleset this one `extends`"],
+            )  # fmt: skip
 
     def pack(self, tree: Mapping) -> PackDecl | None:
         entries = self.mapping(tree, "pack", "a pack")

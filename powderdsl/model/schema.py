@@ -54,7 +54,9 @@ KEYS: dict[str, dict[str, Key]] = {
     "ruleset": {
         "ruleset": Key("word", "the ruleset's name", True),
         "about": Key("text", "what it is, in a sentence"),
-        "packs": Key("words", "the packs it is made of", True),
+        "extends": Key("word", "a ruleset that this one takes over, with all that it says"),
+        "packs": Key("words", "the packs it is made of, besides those of the ruleset that it extends"),
+        "without": Key("words", "packs of the ruleset that it extends, which are left out"),
         "slots": Key("number", "how many element ids there are, vacant ones included"),
         "matrix": Key("words", "the channels of `World.matrix()`"),
         "rename": Key("mapping", "other names for what packs define: `pack.word: name`"),

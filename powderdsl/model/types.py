@@ -10,10 +10,13 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.fingerprint import UNMEANING
+
+if TYPE_CHECKING:
+    from powderdsl.model.declarations import PackDecl, RulesetDecl
 
 Offset = tuple[int, int]
 """(rows down, columns right)."""
@@ -331,6 +334,8 @@ class Example:
     """Values that the start world has beside its elements."""
     expect_fields: tuple[FieldGrid, ...] = ()
     often: tuple[Often, ...] = ()
+    scope: tuple[str, ...] = field(default=(), compare=False)
+    """The packs that it speaks of. With other packs added it may come out differently."""
 
 
 @dataclass(frozen=True)
@@ -397,6 +402,16 @@ class Invariant:
     without: frozenset[int]
     pack: str
     span: Span = field(compare=False, repr=False)
+    scope: tuple[str, ...] = field(default=(), compare=False)
+    """The packs that it speaks of. With other packs added it may no longer hold."""
+
+
+@dataclass(frozen=True)
+class Declared:
+    """The files that a ruleset was checked from."""
+
+    packs: tuple[PackDecl, ...]
+    ruleset: RulesetDecl | None
 
 
 @dataclass(frozen=True)
@@ -414,7 +429,10 @@ class MatrixChannel:
 
 @dataclass(frozen=True)
 class Ruleset:
-    """A checked ruleset. `slots` is the number of ids, some of which may be vacant."""
+    """A checked ruleset. `slots` is the number of ids, some of which may be vacant.
+
+    `name` says what is loaded: a ruleset, what is left out of it, what is added to it.
+    """
 
     name: str = field(metadata=UNMEANING)
     about: str = field(metadata=UNMEANING)
@@ -431,6 +449,12 @@ class Ruleset:
     """What a cell holds besides its element, as `model/layout.py` orders it."""
     tests: tuple[Example, ...] = field(default=(), metadata=UNMEANING)
     invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
+    declared: Declared | None = field(default=None, compare=False, repr=False)
+    """What it was checked from."""
+
+    def added_to(self, scope: tuple[str, ...]) -> tuple[str, ...]:
+        """The loaded packs that lie outside a scope, in load order."""
+        return tuple(pack for pack in self.packs if pack not in scope)
 
     def element(self, name: str) -> Element | None:
         """The element of a plain or qualified name."""

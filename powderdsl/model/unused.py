@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from powderdsl.diagnostics import Reporter, Span
+from powderdsl.model.claim_scopes import words_of
 from powderdsl.model.compose import Composition
 from powderdsl.model.declarations import Block, PackDecl
 from powderdsl.model.expressions import Typer
-from powderdsl.syntax.ast import Syntax
 
 
 def report_unused(composition: Composition, typer: Typer, produced: frozenset[int]) -> None:
@@ -54,9 +54,9 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     """
     names = composition.names
     words = {names.of(pack.name.text, word) for pack in composition.packs for word in _pack_words(pack)}
-    if composition.ruleset is not None:
-        words |= {word for line in composition.ruleset.invariants for word in _words(line)}
-        words |= {scalar.text.removesuffix("?").partition(".")[0] for scalar in composition.ruleset.matrix}
+    for ruleset in composition.ruleset.lineage if composition.ruleset else ():
+        words |= {word for line in ruleset.invariants for word in words_of(line)}
+        words |= {scalar.text.removesuffix("?").partition(".")[0] for scalar in ruleset.matrix}
     for name, field in composition.fields.items():
         if name not in words and field.decl.name.text not in words:
             _unused("field", name, field.decl.name.span, reporter)
@@ -70,7 +70,7 @@ def _report_lets(block: Block, reporter: Reporter) -> None:
     for scalar, value in reversed(block.lets):
         if scalar.text not in later:
             _unused("value", scalar.text, scalar.span, reporter)
-        later |= set(_words(value))
+        later |= set(words_of(value))
     for inner in (*block.blocks, *block.then):
         _report_lets(inner, reporter)
 
@@ -86,22 +86,13 @@ def _pack_words(pack: PackDecl) -> Iterator[str]:
         [decl.of for decl in pack.fields if decl.of is not None],
     ):
         for line in lines:
-            yield from _words(line)
+            yield from words_of(line)
 
 
 def _block_words(block: Block, with_lets: bool = True) -> Iterator[str]:
     for syntax in (*block.rules, *([block.header] if block.header else [])):
-        yield from _words(syntax)
+        yield from words_of(syntax)
     for _, value in block.lets if with_lets else ():
-        yield from _words(value)
+        yield from words_of(value)
     for inner in (*block.blocks, *block.then):
         yield from _block_words(inner)
-
-
-def _words(syntax: Syntax) -> Iterator[str]:
-    waiting = [syntax]
-    while waiting:
-        one = waiting.pop()
-        if one.text:
-            yield one.text.removesuffix("?")
-        waiting += one.children

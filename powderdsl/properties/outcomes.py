@@ -10,12 +10,14 @@ import numpy as np
 
 from powderdsl.diagnostics import Span
 from powderdsl.draw import palette, rgb, scale, to_numpy
+from powderdsl.model.restrict import Difference
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Ruleset
 from powderdsl.properties.breaks import Tested
 from powderdsl.properties.samples import Array, Sample
 
-STATUSES = ("proven", "tested", "untested", "broken")
+STATUSES = ("proven", "tested", "untested", "differs", "broken")
+"""``differs``: a world breaks it because packs are loaded that it does not speak of."""
 
 MAX_DRAWN = 40
 """Rows and columns that are drawn in full."""
@@ -31,6 +33,8 @@ class Property:
     span: Span | None
     without: frozenset[int] = frozenset()
     """Elements that a world starts without."""
+    scope: tuple[str, ...] = ()
+    """The packs that it speaks of."""
 
     @property
     def place(self) -> str:
@@ -63,9 +67,11 @@ class Result:
     worlds: int
     reason: str
     counterexample: Counterexample | None = None
+    difference: Difference | None = None
 
     @property
     def holds(self) -> bool:
+        """Whether nothing was found against what it speaks of."""
         return self.status != "broken"
 
 
@@ -75,10 +81,23 @@ def result_line(result: Result) -> str:
         "proven": result.reason,
         "tested": f"{result.worlds:,} worlds{', ' + result.reason if result.reason else ''}",
         "untested": result.reason,
+        "differs": difference_words(result.difference) if result.difference else "",
         "broken": result.prop.place or "of every ruleset",
     }[result.status]
     status = result.status.upper() if result.status == "broken" else result.status
     return f"{status:<9} {result.prop.owner}: {result.prop.text} ({how})"
+
+
+def difference_words(found: Difference) -> str:
+    """``with `steam`: steam.yaml:17``: the packs, and where in their files the reason stands."""
+    places = dict.fromkeys(place_of(cause.span) for cause in found.causes)
+    return f"{found.with_packs}{': ' if places else ''}{', '.join(places)}"
+
+
+def difference_lines(found: Difference) -> Iterator[str]:
+    """What in the added packs makes the difference."""
+    for cause in found.causes:
+        yield f"{place_of(cause.span)}: {cause.does}"
 
 
 def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[str]:
@@ -131,6 +150,8 @@ def result_data(result: Result) -> dict[str, Any]:
         "worlds": result.worlds,
         "reason": result.reason,
     }
+    if result.difference is not None:
+        data["difference"] = difference_data(result.difference)
     found = result.counterexample
     if found is not None:
         data["counterexample"] = {
@@ -146,6 +167,14 @@ def result_data(result: Result) -> dict[str, Any]:
             "rules": [{"place": place_of(span), "text": one_line(span)} for span in found.culprits],
         }
     return data
+
+
+def difference_data(found: Difference) -> dict[str, Any]:
+    """Plain data for JSON."""
+    causes = [
+        {"pack": cause.pack, "place": place_of(cause.span), "text": cause.does} for cause in found.causes
+    ]
+    return {"packs": list(found.packs), "causes": causes}
 
 
 def _plain(arrays: Mapping[str, Array]) -> dict[str, Any]:

@@ -6,19 +6,22 @@ breaks an invariant refutes it. That none does says nothing; `powderdsl test` tr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
 from powderdsl.ledgers.book import Ledger
 from powderdsl.ledgers.changes import RuleLine
+from powderdsl.model.restrict import Cause, Difference
+from powderdsl.model.text import place_of
 from powderdsl.model.types import Ruleset
 from powderdsl.properties.blame import Oracle
 from powderdsl.properties.breaks import Alike
-from powderdsl.properties.outcomes import Counterexample, Property, counterexample_lines
+from powderdsl.properties.outcomes import Result, counterexample_lines
 from powderdsl.properties.samples import Sample, random_samples
-from powderdsl.properties.search import Plan, Search, counterexample
+from powderdsl.properties.search import Plan, Search, counterexample, sorted_out, trials_alone
 from powderdsl.properties.shrink import Work
 
 WORLDS = 256
@@ -36,51 +39,85 @@ WORK = 200_000_000
 """Work for making all the worlds that were found smaller: some seconds."""
 
 
-@dataclass(frozen=True)
-class Broken:
-    """An invariant that is false, and a world that shows it."""
-
-    prop: Property
-    found: Counterexample
-
-
 def refuted(ruleset: Ruleset, ledger: Ledger) -> tuple[Diagnostic, ...]:
-    """An error for each invariant that a world breaks. The same rules give the same worlds."""
+    """An error for each invariant that a world breaks, a note for each that only added packs break.
+
+    The same rules give the same worlds.
+    """
     reporter = Reporter()
     for one in broken_invariants(ruleset, ledger):
-        steps = "1 step" if one.found.steps == 1 else f"{one.found.steps} steps"
-        world = [line for line in counterexample_lines(one.found, ruleset) if not line.startswith("by ")]
+        assert one.counterexample is not None
+        world = [line for line in counterexample_lines(one.counterexample, ruleset) if line[:3] != "by "]
+        if one.difference is not None:
+            _report_difference(one, one.difference, world, reporter)
+            continue
+        steps = "1 step" if one.counterexample.steps == 1 else f"{one.counterexample.steps} steps"
         reporter.report(
             "PD512",
             f"this invariant is broken after {steps}",
             one.prop.span,
             "does not hold",
-            secondary=[Label(span, "breaks it") for span in one.found.culprits[:3]],
+            secondary=[Label(span, "breaks it") for span in one.counterexample.culprits[:3]],
             notes=world,
             helps=["mend the rule, or say less: `without SET` leaves worlds out"],
         )
     return reporter.diagnostics
 
 
-def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Broken]:
+def _report_difference(one: Result, found: Difference, world: Sequence[str], reporter: Reporter) -> None:
+    assert one.counterexample is not None
+    first, *others = found.causes
+    culprits = one.counterexample.culprits
+
+    def words(cause: Cause, breaks: str) -> str:
+        return breaks if cause.span in culprits else "takes part" if cause.is_rule else cause.does
+
+    rules = [span for span in culprits if span not in {cause.span for cause in found.causes}]
+    also = [Label(cause.span, words(cause, "and this")) for cause in others]
+    reporter.report(
+        "PD515",
+        f"{found.with_packs}, `{one.prop.text}` no longer holds: {place_of(first.span)}",
+        first.span,
+        words(first, "this breaks it"),
+        secondary=[
+            *also[:2],
+            *(Label(span, "did it") for span in rules[:2]),
+            Label(one.prop.span, f"`{one.prop.owner}` says so"),
+        ],
+        notes=["the packs that it speaks of keep it, as far as was tried", *world],
+    )
+
+
+def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
     """The invariants that a few worlds break, each with a world that was made small."""
     oracle = Oracle(ruleset, ruleset.passes)
-    search = Search.of(oracle, Plan(), declared_only=True, ledger=ledger)
-    for number, sample in enumerate(random_samples(ruleset, 0, WORLDS)):
+    search = _tried(Search.of(oracle, Plan(), declared_only=True, ledger=ledger))
+    broken = [trial for trial in search.trials if trial.sample is not None]
+    found = []
+    for trial in broken:
+        assert trial.sample is not None
+        work, gone = Work.of(ruleset, WORK // len(broken)), trial.prop.without
+        small = counterexample(trial.claim, oracle, trial.sample, trial.steps, work, gone)
+        found.append(Result(trial.prop, "broken", trial.worlds, "", small))
+
+    def false_alone(alone: Ruleset, results: Sequence[Result]) -> set[str]:
+        search = _tried(trials_alone(alone, ruleset, results, Plan(), oracle))
+        return {trial.prop.text for trial in search.trials if trial.sample is not None}
+
+    return sorted_out(found, ruleset, false_alone)
+
+
+def _tried(search: Search) -> Search:
+    """The search with what a few worlds broke."""
+    for number, sample in enumerate(random_samples(search.runner.ruleset, 0, WORLDS)):
         # Where mirrored numbers are used in another way only frequencies can tell: thousands of worlds.
         search.trials = [trial for trial in search.trials if not isinstance(trial.claim, Alike)]
+        if not search.trials:
+            break
         search.try_sample(sample, STEPS)
         if number < FOCUSED:
             _try_focused(search, sample)
-    broken = [trial for trial in search.trials if trial.sample is not None]
-    return [
-        Broken(
-            one.prop,
-            counterexample(one.claim, oracle, one.sample, one.steps, Work.of(ruleset, WORK // len(broken))),
-        )
-        for one in broken
-        if one.sample is not None
-    ]
+    return search
 
 
 def _try_focused(search: Search, sample: Sample) -> None:

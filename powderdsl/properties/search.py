@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from time import monotonic
 
@@ -12,9 +12,10 @@ from powderdsl.ledgers.book import Ledger, NotProven, Proven
 from powderdsl.ledgers.book import ledger as make_ledger
 from powderdsl.ledgers.changes import RuleLine
 from powderdsl.model.operands import ELEMENT_HERE, member
+from powderdsl.model.restrict import restricted
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
-from powderdsl.properties.blame import culprits
+from powderdsl.properties.blame import Oracle, culprits
 from powderdsl.properties.breaks import (
     Agreement,
     Alike,
@@ -27,8 +28,10 @@ from powderdsl.properties.breaks import (
     look,
     steps_for,
 )
+from powderdsl.properties.differences import difference, translated
 from powderdsl.properties.outcomes import Counterexample, Property, Result
 from powderdsl.properties.proofs import prove
+from powderdsl.properties.running import Runner
 from powderdsl.properties.samples import LARGE, Sample, random_samples
 from powderdsl.properties.shrink import Work, shrink
 
@@ -168,19 +171,83 @@ class Search:
                 note = trial.note if trial.worlds else "no random world starts as it demands"
                 self.results[trial.prop.text] = Result(trial.prop, status, trial.worlds, note)
             else:
-                example = counterexample(trial.claim, self.runner, trial.sample, trial.steps)
+                gone = trial.prop.without
+                example = counterexample(trial.claim, self.runner, trial.sample, trial.steps, without=gone)
                 self.results[trial.prop.text] = Result(
                     trial.prop, "broken", trial.worlds, trial.note, example
                 )
+        broken = [result for result in self.results.values() if result.status == "broken"]
+        for result in told_apart(broken, self.runner, self.plan):
+            self.results[result.prop.text] = result
         order = [one.text for one in properties_of(self.runner.ruleset, self.ledger)]
         return sorted(self.results.values(), key=lambda result: order.index(result.prop.text))
 
 
+def sorted_out(
+    broken: Sequence[Result], ruleset: Ruleset, false_alone: Callable[[Ruleset, Sequence[Result]], set[str]]
+) -> list[Result]:
+    """The same results; those that hold until packs are added say so.
+
+    Args:
+        false_alone: tries what is broken on the rules of its scope alone; the texts of what is broken there too.
+    """
+    scopes: dict[tuple[str, ...], list[Result]] = {}
+    for result in broken:
+        if result.prop.scope and ruleset.added_to(result.prop.scope):
+            scopes.setdefault(result.prop.scope, []).append(result)
+    differ: set[str] = set()
+    for scope, results in scopes.items():
+        alone = restricted(ruleset, scope)
+        if alone is not None:
+            differ |= {one.prop.text for one in results} - false_alone(alone, results)
+    return [
+        replace(one, status="differs", difference=difference(one.prop, ruleset, one.counterexample))
+        if one.prop.text in differ and one.counterexample is not None
+        else one
+        for one in broken
+    ]
+
+
+def told_apart(broken: Sequence[Result], runner: Runs, plan: Plan) -> list[Result]:
+    """What is broken, and what only added packs break: their scopes are tried alone, on as many worlds."""
+
+    def false_alone(alone: Ruleset, results: Sequence[Result]) -> set[str]:
+        search = trials_alone(alone, runner.ruleset, results, plan, runner)
+        if search.trials:
+            search.try_random()
+        return {trial.prop.text for trial in search.trials if trial.sample is not None}
+
+    return sorted_out(broken, runner.ruleset, false_alone)
+
+
+def trials_alone(
+    alone: Ruleset, ruleset: Ruleset, results: Sequence[Result], plan: Plan, runner: Runs
+) -> Search:
+    """A search for what breaks some invariants on the rules of their scope; the worlds that were found come first."""
+    search = Search.of(Oracle(alone, alone.passes), plan, declared_only=True)
+    texts = {result.prop.text for result in results}
+    trials = [trial for trial in search.trials if trial.prop.text in texts]
+    if trials and isinstance(runner, Runner):
+        search = replace(search, runner=Runner(alone, runner.backend))
+    search = replace(search, trials=trials)
+    for result in results if trials else ():
+        found = result.counterexample
+        sample = translated(found.sample, ruleset, alone) if found else None
+        if found is not None and sample is not None:
+            search.try_sample(sample, found.steps)
+    return search
+
+
 def counterexample(
-    claim: Tested, runner: Runs, sample: Sample, steps: int, work: Work | None = None
+    claim: Tested,
+    runner: Runs,
+    sample: Sample,
+    steps: int,
+    work: Work | None = None,
+    without: frozenset[int] = frozenset(),
 ) -> Counterexample:
-    """A world that breaks a claim, made as small as the work allows."""
-    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps, work))
+    """A world that breaks a claim, as small as the work allows. It starts without the elements `without`."""
+    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps, work, without))
 
 
 def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Counterexample:
@@ -199,13 +266,18 @@ def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Countere
 
 def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
     """The declared invariants, then what every ruleset must fulfil."""
-    found = [Property(i.claim, one_line(i.span), i.pack, i.span, i.without) for i in ruleset.invariants]
+    found = [
+        Property(i.claim, one_line(i.span), i.pack, i.span, i.without, i.scope) for i in ruleset.invariants
+    ]
     found += [
         Property(KnownIds(), "cells hold elements that the ruleset has", AUTOMATIC, None),
         Property(Agreement(), "the backend gives what the reference gives", AUTOMATIC, None),
     ]
     found += [Property(claim, text, AUTOMATIC, None) for claim, text in _ledger_claims(ruleset, ledger)]
-    unique = {one.text: one for one in reversed(found)}
+    unique: dict[str, Property] = {}
+    for one in found:  # of two that say the same, the one that says it of more packs
+        if one.text not in unique or len(one.scope) > len(unique[one.text].scope):
+            unique[one.text] = one
     return [one for one in found if unique[one.text] is one]
 
 

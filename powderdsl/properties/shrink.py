@@ -48,15 +48,21 @@ Judge = Callable[[Sample, int], Array]
 
 
 def shrink(
-    claim: Tested, runs: Runs, sample: Sample, steps: int, work: Work | None = None
+    claim: Tested,
+    runs: Runs,
+    sample: Sample,
+    steps: int,
+    work: Work | None = None,
+    without: frozenset[int] = frozenset(),
 ) -> tuple[Sample, int]:
     """The smallest world found that still breaks the claim, and after how many steps. `sample` is one world.
 
     It ends when no smaller world breaks the claim, or when the work is used up: a claim gives the same world each time.
+    Worlds start without the elements `without`.
     """
     work = Work.of(runs.ruleset) if work is None else work
     tries = 1 if isinstance(claim, Agreement | Alike) or not runs.ruleset.streams else SEEDS
-    sample, steps = _later(claim, runs, sample, steps)
+    sample, steps = _later(claim, runs, sample, steps, without)
     sample, steps = shrink_while(
         lambda some, most: breaks(claim, runs, some, most).first, sample, steps, tries, work
     )
@@ -86,13 +92,25 @@ def shrink_while(judge: Judge, sample: Sample, steps: int, tries: int, work: Wor
     return sample, steps
 
 
-def _later(claim: Tested, runs: Runs, sample: Sample, steps: int) -> tuple[Sample, int]:
+def _later(
+    claim: Tested, runs: Runs, sample: Sample, steps: int, without: frozenset[int]
+) -> tuple[Sample, int]:
     """The world as it was one step before it broke the claim, if it does so from there."""
     if is_paired(claim) or steps < 2 or steps_for(claim, steps) > steps:
         return sample, steps
     before = dict(runs.states(sample, steps - 1)[-1])
     late = replace(sample, ids=before.pop("element"), clock=sample.clock + steps - 1, fields=before)
+    if _holds(late, without, runs.ruleset):
+        return sample, steps
     return (late, 1) if breaks(claim, runs, late, 1).first.any() else (sample, steps)
+
+
+def _holds(sample: Sample, elements: frozenset[int], ruleset: Ruleset) -> bool:
+    """Whether some of these elements are there, in cells or in fields."""
+    other = sample.without(elements, ruleset)
+    same = [np.array_equal(sample.ids, other.ids)]
+    same += [np.array_equal(values, other.fields[name]) for name, values in sample.fields.items()]
+    return not all(same)
 
 
 def _first(

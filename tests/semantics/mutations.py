@@ -89,7 +89,8 @@ def try_mutation(mutation: Mutation, folder: Path) -> Caught:
         return Caught((), tuple(result.example.name for result in results if not result.passed))
     some = tuple(one for one in ruleset.invariants if not statement or one_line(one.span) == statement)
     broken = broken_invariants(replace(ruleset, invariants=some), ledger(ruleset))
-    sizes = [(*one.found.before.shape, one.found.steps) for one in broken]
+    worlds = [one.counterexample for one in broken if one.counterexample and not one.holds]
+    sizes = [(*world.before.shape, world.steps) for world in worlds]
     return Caught(("PD512",), (), sizes[0]) if sizes else Caught()
 
 

@@ -1,0 +1,79 @@
+"""Some of the packs of a ruleset alone: what invariants and tests speak of, without the packs that others added."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from powderdsl.diagnostics import CompileError, Reporter, Span
+from powderdsl.model.check import check
+from powderdsl.model.declarations import RulesetDecl
+from powderdsl.model.types import Ruleset
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Something in the file of an added pack: a rule with its text, or what it does to other packs in a few words."""
+
+    pack: str
+    span: Span
+    does: str
+    is_rule: bool = False
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Why an invariant or a test that holds in its scope does not hold with more packs.
+
+    `packs` are the added packs without which it would, in load order; `causes` is what in their files does it, as far
+    as that is known.
+    """
+
+    packs: tuple[str, ...]
+    causes: tuple[Cause, ...]
+
+    @property
+    def with_packs(self) -> str:
+        """``with `steam` and `salt` ``."""
+        names = [f"`{pack}`" for pack in self.packs]
+        return "with " + " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def restricted(ruleset: Ruleset, packs: Iterable[str]) -> Ruleset | None:
+    """The model of some of a ruleset's packs, with its parameters; None if they make no ruleset of their own."""
+    if ruleset.declared is None:
+        return None
+    wanted = set(packs)
+    kept = [pack for pack in ruleset.declared.packs if pack.name.text in wanted]
+    reporter = Reporter()
+    try:
+        found = check(kept, _bare(ruleset.declared.ruleset, set(ruleset.packs) - wanted), reporter)
+    except CompileError:
+        return None
+    there = {param.name for param in found.params}
+    return found.with_params({p.name: p.default for p in ruleset.params if p.name in there})
+
+
+def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
+    """The model without one pack and those that need it; None if the rest is no ruleset."""
+    assert ruleset.declared is not None
+    gone = {pack}
+    for _ in ruleset.declared.packs:
+        gone |= {
+            decl.name.text for decl in ruleset.declared.packs if any(need.text in gone for need in decl.needs)
+        }
+    return restricted(ruleset, [name for name in ruleset.packs if name not in gone])
+
+
+def _bare(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | None:
+    """A ruleset that names nothing of packs that are gone: no channels, and no invariants if some of them are its own."""
+    if decl is None:
+        return None
+    return replace(
+        decl,
+        matrix=(),
+        slots=None,
+        invariants=decl.invariants if gone.isdisjoint(decl.members) else (),
+        base=_bare(decl.base, gone),
+        beside=tuple(bare for one in decl.beside if (bare := _bare(one, gone))),
+    )
