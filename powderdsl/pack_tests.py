@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl import reference
+from powderdsl.diagnostics import Span
 from powderdsl.draw import to_numpy
 from powderdsl.model.restrict import restricted, without
 from powderdsl.model.text import one_line
@@ -91,25 +92,35 @@ def run_examples(
         batch = [_Running.of(ruleset.tests[number], sim) for number in numbers]
         found = _run(batch, sim, seen)
         results |= dict(zip(numbers, found, strict=True))
-    return [_judged(results[number], ruleset, sim) for number in range(len(ruleset.tests))]
+    return _judged([results[number] for number in range(len(ruleset.tests))], ruleset, sim)
 
 
-def _judged(result: ExampleResult, ruleset: Ruleset, sim: Simulator) -> ExampleResult:
-    """The result; one that is wrong only with packs that the test does not speak of names them."""
-    scope = result.example.scope
-    added = ruleset.added_to(scope) if scope and not result.passed else ()
+def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> list[ExampleResult]:
+    """The results; those that are wrong only with packs that the tests do not speak of name these packs."""
+    scopes: dict[tuple[str, ...], list[ExampleResult]] = {}
+    for result in results:
+        scope = result.example.scope
+        if not result.passed and scope and ruleset.added_to(scope):
+            scopes.setdefault(scope, []).append(result)
+    added: dict[Span, tuple[str, ...]] = {}
+    for scope, wrong in scopes.items():
+        places = {result.example.span for result in wrong}
+        others = ruleset.added_to(scope)
+        right = _passing(restricted(ruleset, scope), places, sim)
+        fewer = others[:MOST] if len(others) > 1 and right else ()
+        without_one = {pack: _passing(without(ruleset, pack), right, sim) for pack in fewer}
+        for place in right:
+            added[place] = tuple(pack for pack in fewer if place in without_one[pack]) or others
+    return [replace(one, added=added.get(one.example.span, ())) for one in results]
 
-    def passes(fewer: Ruleset | None) -> bool:
-        own = [one for one in fewer.tests if one.span == result.example.span] if fewer else []
-        if fewer is None or not own:
-            return False
-        some = replace(fewer, tests=(replace(own[0], scope=()),))
-        return run_examples(some, sim.backend, str(sim.device))[0].passed
 
-    if not added or not passes(restricted(ruleset, scope)):
-        return result
-    alone = [pack for pack in added[:MOST] if len(added) == 1 or passes(without(ruleset, pack))]
-    return replace(result, added=tuple(alone) or added)
+def _passing(ruleset: Ruleset | None, places: set[Span], sim: Simulator) -> set[Span]:
+    """Which of some tests pass with other rules, by where they stand."""
+    tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
+    if ruleset is None or not tests:
+        return set()
+    results = run_examples(replace(ruleset, tests=tests), sim.backend, str(sim.device))
+    return {result.example.span for result in results if result.passed}
 
 
 def start_of(example: Example, sim: Simulator, seed: int) -> World:

@@ -127,7 +127,7 @@ class _Session:
         """Tests, invariants, coverage of one ruleset."""
         from powderdsl.pack_tests import run_examples
         from powderdsl.properties.differences import difference_of_test
-        from powderdsl.properties.outcomes import difference_lines, difference_words
+        from powderdsl.properties.outcomes import difference_lines
         from powderdsl.properties.running import Runner
 
         start = monotonic()
@@ -136,8 +136,8 @@ class _Session:
         for test in tests:
             self.say(f"{_word(test)}  {test.example.pack}: {test.example.name}")
             if not test.passed:
-                found = difference_of_test(test, ruleset)
-                words = [difference_words(found), *difference_lines(found)] if found else []
+                found = difference_of_test(test, runner)
+                words = [found.with_packs, *difference_lines(found)] if found else []
                 self.say(*(f"      {line}".rstrip() for line in [*words, *_failure_lines(test)]))
         results = self._properties(name, runner)
         missed = [span for span in runner.lines if span not in runner.happened]

@@ -37,7 +37,7 @@ class ClaimScopes:
 
 
 def title_of(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
-    """What is loaded, in words: a ruleset, what is left out of it, what is added: ``powderworld-gas+moss``."""
+    """What is loaded, in words: a ruleset, what is left out of it, what is added: ``ruleset-pack+pack``."""
     loaded = [pack.name.text for pack in packs]
     if ruleset is None:
         return "+".join(loaded)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +13,14 @@ from powderdsl.model.restrict import Cause, Difference, without
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
-from powderdsl.pack_tests import ExampleResult, start_of
 from powderdsl.properties.blame import Oracle
 from powderdsl.properties.breaks import breaks, is_paired
 from powderdsl.properties.outcomes import Counterexample, Property
-from powderdsl.properties.running import MARK, marked, reference_states, rule_spans
+from powderdsl.properties.running import MARK, Runner, marked, reference_states, rule_spans
 from powderdsl.properties.samples import Array, Sample
+
+if TYPE_CHECKING:
+    from powderdsl.pack_tests import ExampleResult
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them matter."""
@@ -77,21 +80,22 @@ def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Diffe
     return Difference(packs, tuple(cause for pack in packs for cause in doings(pack, ruleset, near)[:3]))
 
 
-def difference_of_test(result: ExampleResult, ruleset: Ruleset) -> Difference | None:
+def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | None:
     """What the added packs that change a test do in it: their rules that happen, else what they do to other packs."""
     if not result.added:
         return None
-    from powderdsl.simulator import compile  # brings torch, which `powderdsl check` does without
+    from powderdsl.pack_tests import start_of  # brings torch, which `powderdsl check` does without
 
-    sim = compile(marked(ruleset), backend="reference")
-    world = sim.step(start_of(result.example, sim, result.seed), steps=max(result.step, 1))
+    ruleset, example, sim = runner.ruleset, result.example, runner.sim
+    world = sim.step(start_of(example, sim, result.seed), steps=max(result.step, 1))
     owners = pack_of_line(ruleset)
     causes = [
         Cause(owners[span], span, one_line(span), True)
         for number, span in enumerate(rule_spans(ruleset))
         if owners[span] in result.added and bool(world.state[f"{MARK}{number}"].any())
     ]
-    near = frozenset(name for _, name in result.example.legend)
+    drawn = {char for rows in (example.given, example.expect or (), result.after) for char in "".join(rows)}
+    near = frozenset(name for char, name in example.legend if char in drawn)
     for pack in result.added:
         if pack not in {cause.pack for cause in causes}:
             causes += doings(pack, ruleset, near)[:3]

@@ -1,0 +1,309 @@
+"""Packs that are added to a ruleset: what they change in others' invariants and tests is told and never fails."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import powderdsl as library
+from powderdsl.diagnostics import Severity
+from powderdsl.ledgers.book import ledger
+from powderdsl.model.restrict import restricted
+from powderdsl.model.text import place_of
+from powderdsl.pack_tests import run_examples
+from powderdsl.properties.refute import broken_invariants, refuted
+from powderdsl.properties.running import Runner
+from powderdsl.properties.samples import single
+from powderdsl.properties.search import Plan, Search
+from tests.cli.commands import ROOT, powderdsl
+
+KERNEL = ", ".join(
+    ['"1 1 1 1 1 1 1 1 1 1 1"'] * 5 + ['"1 1 1 1 1 0 1 1 1 1 1"'] + ['"1 1 1 1 1 1 1 1 1 1 1"'] * 5
+)
+
+
+@dataclass(frozen=True)
+class Added:
+    """A pack that somebody adds to `powderworld`, and what that changes: invariants, each with the line that does it."""
+
+    name: str
+    text: str
+    changes: tuple[tuple[str, int], ...]
+
+
+ADDED = (
+    Added(
+        "moss",
+        """pack: moss
+needs: [core, water, stone]
+elements:
+  moss: {id: 120, density: 5, color: "#6A994E", tags: fuel?}
+passes:
+  creep:
+    after: flow
+    do: stone -> moss if count(water) > 0 and above is not stone with chance 30%
+""",
+        (
+            ("count(lava?, stone?) is constant without (acid?, cloner?)", 8),
+            ("count(stone?) never falls without acid?", 8),
+        ),
+    ),
+    Added(
+        "bane",
+        """pack: bane
+needs: core
+elements:
+  bane: {id: 121, density: 3, gravity: yes, color: "#B7E4C7", glyph: "!", tags: fluid}
+passes:
+  corrode:
+    after: flow
+    do:
+      - any but (empty, bane) -> empty if above is bane with chance 40%
+      - bane -> empty if below is not (empty, bane) with chance 20%
+""",
+        (("wall never changes", 9), ("count(cloner) is constant", 9)),
+    ),
+    Added(
+        "quake",
+        """pack: quake
+needs: core
+params: {quakes: 10%}
+passes:
+  quake:
+    before: gravity
+    do: sand? swaps above if above is (wall, wood?) with chance quakes
+""",
+        (("wall never changes", 7),),
+    ),
+    Added(
+        "tinder",
+        """pack: tinder
+about: Walls burn.
+needs: core
+also:
+  wall: {tags: fuel?, burns?: 20%}
+""",
+        (("wall never changes", 5),),
+    ),
+    Added(
+        "rot",
+        """pack: rot
+about: Wood and ice come down.
+needs: core
+also:
+  wood?: {gravity: yes, density: 4}
+  ice?: {gravity: yes}
+""",
+        (("never (wood and gravity)", 5), ("never (ice and gravity)", 6)),
+    ),
+    Added(
+        "bug",
+        """pack: bug
+about: A creature that eats plants.
+needs: core
+fields:
+  hunger: {type: 0..9, at: element, of: bug}
+elements:
+  bug: {id: 122, density: 4, gravity: yes, color: "#264653"}
+passes:
+  walk:
+    after: flow
+    do:
+      - plant? -> bug if count(bug) > 0 with chance 30%
+      - hunger += 1 where bug
+    then: bug -> empty if hunger == 9
+""",
+        (("count(plant?) never falls without (fire?, lava?, acid?)", 12),),
+    ),
+    Added(
+        "kiln",
+        """pack: kiln
+about: Heat is a field; hot sand melts.
+needs: [core, sand]
+tags: {glowing: gives off heat}
+fields:
+  heat: {type: 0..100, at: place}
+elements:
+  glass: {id: 123, density: 5, color: "#BDE0FE"}
+also: {fire?: glowing, lava?: glowing}
+passes:
+  glow:
+    after: flow
+    do: heat += 20 where glowing
+    then: sand -> glass if heat > 80
+""",
+        (("count(sand?) is constant without (acid?, cloner?)", 14),),
+    ),
+    Added(
+        "blob",
+        f"""pack: blob
+about: An automaton that sees five cells far.
+needs: core
+kernels:
+  wide: [{KERNEL}]
+elements:
+  blob: {{id: 124, density: 5, color: "#80ED99"}}
+passes:
+  grow:
+    do:
+      - any but (wall, blob) -> blob if count(blob in wide) in 3..45
+      - blob -> empty if count(blob in wide) not in 33..57
+""",
+        (("count(lava?, stone?) is constant without (acid?, cloner?)", 11),),
+    ),
+)
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def write(name: str, text: str) -> str:
+    Path(f"{name}.yaml").write_text(text, encoding="utf-8")
+    return f"{name}.yaml"
+
+
+def changes_of(rules: str) -> dict[str, str]:
+    """What `powderdsl check` tells of added packs: invariants, and where the reason stands. Nothing may be worse."""
+    ruleset = library.load(rules)
+    found = refuted(ruleset, ledger(ruleset))
+    assert {one.code for one in found} <= {"PD515"}
+    assert all(one.severity is Severity.NOTE for one in found)
+    return {one.message.split("`")[-2]: one.message.rpartition(": ")[2] for one in found}
+
+
+@pytest.mark.parametrize("added", ADDED, ids=lambda added: added.name)
+def test_a_pack_that_changes_others_is_told_by_its_own_line(added: Added) -> None:
+    found = changes_of(f"powderworld+{write(added.name, added.text)}")
+    for invariant, line in added.changes:
+        assert found[invariant] == f"{added.name}.yaml:{line}"
+
+
+def test_check_of_an_added_pack_ends_well_and_says_what_changes() -> None:
+    result = powderdsl("check", f"powderworld+{ROOT / 'docs/examples/steam.yaml'}")
+    assert result.exit_code == 0
+    line = (
+        "with `steam`, `count(water?, ice?) is constant without (acid?, cloner?, plant?)` no longer holds: "
+    )
+    assert f"  {line}{ROOT / 'docs/examples/steam.yaml'}:17\n" in result.stdout
+    assert "powderworld+steam: 15 elements, 13 passes, no errors, 2 notes" in result.stdout
+    assert (
+        powderdsl(
+            "check", f"powderworld+{ROOT / 'docs/examples/steam.yaml'}", "--warnings-as-errors"
+        ).exit_code
+        == 0
+    )
+    data = json.loads(
+        powderdsl("check", "--format", "json", f"powderworld+{ROOT / 'docs/examples/steam.yaml'}").stdout
+    )
+    assert [one["code"] for one in data] == ["PD515", "PD515"]
+
+
+def test_what_the_scope_breaks_alone_stays_an_error() -> None:
+    shutil.copytree(ROOT / "rules", "rules")
+    acid = Path("rules/acid.yaml")
+    acid.write_text(acid.read_text("utf-8").replace("(acid_proof, acid)", "(acid, empty)"), encoding="utf-8")
+    moss = write("moss", ADDED[0].text)
+    ruleset = library.load(f"rules/powderworld.yaml+{moss}")
+    found = {one.code: one for one in refuted(ruleset, ledger(ruleset))}
+    assert set(found) == {"PD512", "PD515"}
+    assert found["PD512"].primary.span is not None
+    assert found["PD512"].primary.span.text == "wall never changes"
+
+
+def test_a_packs_own_claims_are_errors_where_it_breaks_them_itself() -> None:
+    text = ADDED[1].text + "invariants:\n  - count(bane) is constant\n"
+    ruleset = library.load(f"powderworld+{write('bane', text)}")
+    errors = [one for one in refuted(ruleset, ledger(ruleset)) if one.severity is Severity.ERROR]
+    assert [one.primary.span.text for one in errors if one.primary.span] == ["count(bane) is constant"]
+
+
+def test_a_packs_own_claims_may_be_broken_by_packs_that_it_does_not_know() -> None:
+    text = ADDED[2].text.replace(
+        "passes:", "elements: {pole: {id: 125, density: 5, color: '#112233'}}\npasses:"
+    )
+    found = changes_of(f"powderworld+{write('quake', text + 'invariants: [pole never changes]' + chr(10))}")
+    assert found["pole never changes"].startswith(str(ROOT / "rules/acid.yaml"))
+
+
+def test_a_claim_that_names_a_pack_speaks_of_it() -> None:
+    text = ADDED[2].text + "invariants: [count(sand?) is constant without acid?]\n"
+    (own,) = (
+        one for one in library.load(f"powderworld+{write('quake', text)}").invariants if one.pack == "quake"
+    )
+    assert own.scope == ("core", "sand", "acid", "quake")
+
+
+def test_of_two_added_packs_the_one_that_matters_is_named() -> None:
+    moss, rot = write("moss", ADDED[0].text), write("rot", ADDED[4].text)
+    ruleset = library.load(f"powderworld+{moss}+{rot}")
+    results = broken_invariants(ruleset, ledger(ruleset))
+    packs = {one.prop.text: one.difference.packs for one in results if one.difference}
+    assert packs["never (ice and gravity)"] == ("rot",)
+    assert packs["count(stone?) never falls without acid?"] == ("moss",)
+    assert all(one.status == "differs" and one.holds and one.counterexample for one in results)
+
+
+def test_a_world_never_starts_with_what_the_claim_excludes() -> None:
+    """Steam turns to water in the first step, and the plant grows in the second: both have to be shown."""
+    ruleset = library.load(f"powderworld+{ROOT / 'docs/examples/steam.yaml'}")
+    wall, steam, plant, water = (
+        one.id for name in ("wall", "steam", "plant", "water") if (one := ruleset.element(name))
+    )
+    search = Search.of(Runner(ruleset, "reference"), Plan(0), declared_only=True)
+    start = single([[wall, wall], [wall, steam], [wall, plant]]).repeated(512)
+    search.try_sample(replace(start, seeds=np.arange(512)), 3)
+    (result,) = (one for one in search.finish() if one.prop.text.startswith("count(plant?) never rises"))
+    found = result.counterexample
+    assert found is not None
+    assert found.steps > 1
+    assert not (found.before == water).any()
+    assert result.difference is not None
+    lines = [place_of(cause.span).rpartition("/")[2] for cause in result.difference.causes]
+    assert set(lines) <= {"steam.yaml:18", "steam.yaml:19"}
+    assert lines
+
+
+def test_tests_that_an_added_pack_changes_are_told_and_do_not_fail() -> None:
+    rules = f"core+sand+water+fire+wind+{write('quake', ADDED[2].text.replace('10%', '90%'))}"
+    results = {one.example.name: one for one in run_examples(library.load(rules))}
+    changed = results["an explosion throws sand away"]
+    assert (changed.passed, changed.failed, changed.added) == (False, False, ("quake",))
+    result = powderdsl("test", rules, "--examples", "64", "--drawn", "0", "--no-keep")
+    assert result.exit_code == 0, result.output
+    assert (
+        "differs  wind: an explosion throws sand away\n      with `quake`\n      quake.yaml:7: sand? swaps"
+        in result.output
+    )
+    assert "differs   core: wall never changes (with `quake`: quake.yaml:7)" in result.output
+    assert "come out differently with added packs" in result.output.splitlines()[-1]
+    data = json.loads(
+        powderdsl("test", rules, "--examples", "64", "--drawn", "0", "--no-keep", "--json").stdout
+    )[rules]
+    assert next(one for one in data["tests"] if one["test"] == changed.example.name)["added"] == ["quake"]
+    (wall,) = (one for one in data["properties"] if one["property"] == "wall never changes")
+    assert (wall["status"], wall["difference"]["packs"]) == ("differs", ["quake"])
+
+
+def test_a_test_that_fails_in_its_scope_fails_with_more_packs_too() -> None:
+    text = ADDED[0].text + "tests:\n  - nothing grows:\n      given: |\n        # # #\n        # o ~\n"
+    text += "      after: 30 steps\n      expect: |\n        # # #\n        # o ?\n"
+    result = powderdsl(
+        "test", f"core+water+stone+sand+{write('moss', text)}", "--examples", "0", "--drawn", "0", "--no-keep"
+    )
+    assert result.exit_code == 1
+    assert "FAIL  moss: nothing grows" in result.output
+
+
+def test_the_model_of_a_scope_keeps_parameters() -> None:
+    ruleset = library.load(f"powderworld+{write('moss', ADDED[0].text)}", params={"water.melt": 0.5})
+    alone = restricted(ruleset, ("core", "water"))
+    assert alone is not None
+    assert alone.packs == ("core", "water")
+    assert next(one for one in alone.params if one.name == "water.melt").default == 0.5
