@@ -86,7 +86,8 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
     always: list[Expr] = [typer.condition(syntax, scope) for syntax in decl.always]
     drawn = {legend[char] for rows in (given, expect or ()) for row in rows for char in row if char in legend}
     words = [*sorted(drawn), *(grid.name for grid in (*fields, *expect_fields))]
-    words += [word for syntax in decl.always for word in words_of(syntax)]
+    asked = [*decl.always, *(change for change, _ in decl.often)]
+    words += [word for syntax in asked for word in words_of(syntax)]
     return Example(
         decl.name,
         given,
