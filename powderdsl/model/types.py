@@ -431,8 +431,8 @@ class MatrixChannel:
 class Ruleset:
     """A checked ruleset. `slots` is the number of ids, some of which may be vacant.
 
-            `name` says what is loaded: a ruleset, what is left out of it, what is added to it.
-        """
+    `name` says what is loaded: a ruleset, what is left out of it, what is added to it.
+    """
 
     name: str = field(metadata=UNMEANING)
     about: str = field(metadata=UNMEANING)
