@@ -92,12 +92,7 @@ def _tell(
         click.echo(f"      {mutant.diff}")
         if outcome.size is None:
             click.echo(f"      no world was found on which it differs{_because(outcome)}")
-        elif outcome.test is None:
-            rows, columns, steps = outcome.size
-            click.echo(
-                f"      differs in `{outcome.slot}` alone, on {rows}×{columns} cells after {counted(steps, 'step')}"
-            )
-        else:
+        elif outcome.test is not None:
             click.echo("".join(f"        {line}\n" for line in outcome.test.text.splitlines()), nl=False)
     if interrupted:
         click.echo(f"interrupted after {len(found)} of {counted(planned, 'mutant')}")

@@ -13,7 +13,7 @@ import numpy as np
 from powderdsl.model.reactions import unchanging_ids
 from powderdsl.model.types import Ruleset
 from powderdsl.properties.running import run_sample
-from powderdsl.properties.samples import Array, Sample, State
+from powderdsl.properties.samples import Array, Sample, State, random_samples
 from powderdsl.properties.shrink import Work, shrink_while
 from powderdsl.simulator import Simulator
 
@@ -32,6 +32,9 @@ ROUNDS = (
 
 KINDS = (2, 3, 2, 4, 3, 6)
 """How many elements the worlds of a group are made of."""
+
+FIELDED = 768
+"""Worlds with fields that are not fresh."""
 
 GROUP = 8
 """Worlds that are made of the same elements."""
@@ -66,8 +69,8 @@ def distinguish(
         focus: ids of elements that are likely to matter: they are in most of the worlds.
         seed: other worlds for another seed, the same for the same.
     """
-    for names in _observed(first, second):
-        for sample, steps in fresh_samples(first.ruleset, focus, seed):
+    for names, samples in _searches(first, second, focus, seed):
+        for sample, steps in samples:
             when = differs_after(first, second, sample, steps, names)
             found = np.nonzero(when)[0]
             if len(found):
@@ -76,10 +79,24 @@ def distinguish(
     return None
 
 
-def _observed(first: Simulator, second: Simulator) -> list[tuple[str, ...]]:
-    """What is looked at: elements, and then everything that both hold."""
-    fields = [slot.name for slot in first.slots if slot.name in {other.name for other in second.slots}]
-    return [("element",), tuple(fields)] if len(fields) > 1 else [("element",)]
+def _searches(
+    first: Simulator, second: Simulator, focus: Sequence[int], seed: int
+) -> Iterator[tuple[tuple[str, ...], Iterator[tuple[Sample, int]]]]:
+    """What is looked at, and in which worlds: elements in fresh ones, then all that both hold, then in any worlds."""
+    yield ("element",), fresh_samples(first.ruleset, focus, seed)
+    shared = {slot.name: slot for slot in second.slots}
+    names = tuple(slot.name for slot in first.slots if slot.name in shared)
+    if len(names) == 1:
+        return
+    yield names, fresh_samples(first.ruleset, focus, seed)
+    if all(slot == shared.get(slot.name) for slot in first.slots):
+        yield names, _fielded_samples(first.ruleset, seed)
+
+
+def _fielded_samples(ruleset: Ruleset, seed: int) -> Iterator[tuple[Sample, int]]:
+    """Worlds whose fields hold anything that they can, at the first step, with the usual parameters."""
+    for sample in random_samples(ruleset, seed, FIELDED):
+        yield replace(sample, params={}, clock=np.zeros_like(sample.clock)), 2
 
 
 def _small(

@@ -104,7 +104,7 @@ def work(task: Task, tell: Callable[[Any], None]) -> Outcome:
     if found is None:
         return Outcome(task.number, verdict)
     rows, columns = found.sample.shape
-    test = written_test(mutant, found, original.sim, original.packs) if found.slot == "element" else None
+    test = written_test(mutant, found, original.sim, original.packs)
     return Outcome(task.number, verdict, (rows, columns, found.steps), found.slot, test)
 
 

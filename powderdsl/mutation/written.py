@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,10 @@ from powderdsl.model.types import Element, Ruleset
 from powderdsl.mutation.distinguishing import Distinction
 from powderdsl.mutation.mutants import Mutant
 from powderdsl.mutation.original import GENERATED
-from powderdsl.pack_tests import SEEDS
+from powderdsl.pack_test_fields import field_rows
+from powderdsl.pack_tests import ANYTHING, SEEDS
 from powderdsl.properties.running import run_sample
-from powderdsl.simulator import Simulator
+from powderdsl.simulator import Simulator, World
 from powderdsl.syntax.yaml_tree import Mapping, parse_yaml
 from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
 
@@ -43,10 +44,9 @@ def written_test(
     """
     ruleset = sim.ruleset
     seed: int | None = int(found.sample.seeds[0])
-    others = found.sample.repeated(len(SEEDS))
-    others = type(others)(others.ids, np.array(SEEDS, np.int64), others.clock)
-    after = run_sample(sim, others, found.steps)[0][-1]["element"]
-    if seed in SEEDS and (after == found.first["element"]).all():
+    others = replace(found.sample.repeated(len(SEEDS)), seeds=np.array(SEEDS, np.int64))
+    after = run_sample(sim, others, found.steps)[0][-1][found.slot]
+    if seed in SEEDS and (after == found.first[found.slot]).all():
         seed = None
     before, wanted = found.sample.ids[0], found.first["element"][0]
     there = [e for e in ruleset.elements if e.id in np.unique([*before.ravel(), *wanted.ravel()])]
@@ -57,11 +57,50 @@ def written_test(
         said = ", ".join(f"{_quoted(glyph)}: {element}" for glyph, element in legend)
         lines.append(f"    legend: {{{said}}}")
     lines += ["    given: |", *_drawn(before, glyphs)]
+    needed = _closure(packs, mutant.pack)
+    start = run_sample(sim, found.sample, 0)[1]
+    usual = sim.world(found.sample.ids)
+    for field in found.sample.fields:
+        words = _words(field, start, ~_unequal(start, usual, field), ".")
+        if words:
+            lines += ["    fields:"] if "    fields:" not in lines else []
+            lines += [f"      {_known(field, ruleset, needed)}: |", *words]
     lines.append(f"    after: {found.steps} step{'' if found.steps == 1 else 's'}")
-    lines += ["    expect: |", *_drawn(wanted, glyphs)]
+    if found.slot == "element":
+        lines += ["    expect: |", *_drawn(wanted, glyphs)]
+    else:
+        end = run_sample(sim, found.sample, found.steps)[1]
+        unequal = (found.first[found.slot] != found.second[found.slot])[0]
+        same = ~(unequal.any(0) if unequal.ndim == 3 else unequal)
+        name_ = _known(found.slot, ruleset, needed)
+        lines += ["    expect_fields:", f"      {name_}: |", *_words(found.slot, end, same, ANYTHING)]
     if seed is not None:
         lines.append(f"    seed: {seed}")
     return GeneratedTest(mutant.pack, name, "\n".join(lines) + "\n")
+
+
+def _unequal(first: World, second: World, field: str) -> np.ndarray:
+    """bool [H, W]: cells in which a field of two worlds differs."""
+    unequal: np.ndarray = (first.state[field] != second.state[field])[0].cpu().numpy()
+    return unequal.any(0) if unequal.ndim == 3 else unequal
+
+
+def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]:
+    """A drawing of a field, with a filler for cells that need not be told; none if that is all of them."""
+    if same.all():
+        return []
+    rows = [row.split() for row in field_rows(field, world, 0)]
+    told = [[filler if same[y, x] else word for x, word in enumerate(words)] for y, words in enumerate(rows)]
+    return ["        " + " ".join(words) for words in told]
+
+
+def _known(field: str, ruleset: Ruleset, needed: frozenset[str]) -> str:
+    """A field's name, with `?` if its pack may be absent."""
+    owners = {one.name: one.pack for one in ruleset.fields} | {
+        one.name: one.pack for one in ruleset.properties
+    }
+    owner = owners[field]
+    return field if owner in needed else f"{field}?"
 
 
 def _drawn(ids: np.ndarray, glyphs: dict[int, str]) -> list[str]:
