@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.lower_expressions import Pair, Planes, lower_expression
-from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Program, SlotType, Step, Type, whole
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, PassGraph, Program, SlotType, Step, Type, whole
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Assign, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
 
@@ -58,6 +58,56 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
         tuple((s.name, s.ident, s.bits) for s in ruleset.streams),
         tuple(passes),
     )
+
+
+def lower_pass(ruleset: Ruleset, pass_: Pass, graph: Graph) -> dict[str, Node]:
+    """What a pass leaves in the slots that it writes, as nodes of a graph that several passes may share."""
+    return dict(_pass_lowering(ruleset, graph).lower(pass_).outputs)
+
+
+def lower_moment(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> dict[str, Node]:
+    """What one moment of a pass leaves, as nodes that read the world as the moment finds it.
+
+    Scratch fields and values that `let` fixed in earlier moments are inputs too, the latter as ``let NAME``; values
+    that this moment fixes are among the results.
+    """
+    lowering = _pass_lowering(ruleset, graph)
+    build = lowering.build
+    lowering.slots = dict(lowering.table)
+    for item in pass_.scratch:
+        planes = 2 if item.kind.name == "vec2" else 1
+        slot = Slot(item.name, item.kind, item.default, False, True, None, "", planes)
+        lowering.slots[item.name] = slot
+        lowering.types |= dict.fromkeys(plane_names(slot), plane_type(item.kind, ruleset.slots))
+    lowering.state = {name: build.input(name, type) for name, type in lowering.types.items()}
+    lowering.lets = {}
+    for moment in pass_.moments[:number]:
+        for let in moment.lets:
+            type = REAL if let.value.kind.name == "chance" else plane_type(let.value.kind, ruleset.slots)
+            parts = tuple(build.input(f"let {name}", type) for name in _part_names(let.name, let.value.kind))
+            lowering.lets[let.name] = parts[0] if len(parts) == 1 else (parts[0], parts[1])
+    before = dict(lowering.state)
+    moment = pass_.moments[number]
+    lowering._moment(moment, pass_)
+    found = {name: node for name, node in lowering.state.items() if before[name] is not node}
+    for let in moment.lets:
+        names = _part_names(let.name, let.value.kind)
+        found |= {
+            f"let {name}": part for name, part in zip(names, _parts(lowering.lets[let.name]), strict=True)
+        }
+    return found
+
+
+def _part_names(name: str, kind: Kind) -> tuple[str, ...]:
+    return (f"{name}.row", f"{name}.column") if kind.name == "vec2" else (name,)
+
+
+def _pass_lowering(ruleset: Ruleset, graph: Graph) -> _PassLowering:
+    table = {slot.name: slot for slot in slots(ruleset)}
+    types = {
+        name: plane_type(slot.kind, ruleset.slots) for slot in table.values() for name in plane_names(slot)
+    }
+    return _PassLowering(ruleset, table, types, Builder(graph))
 
 
 @dataclass

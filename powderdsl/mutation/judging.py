@@ -10,6 +10,7 @@ import numpy as np
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
+from powderdsl.mutation.equivalence import proven_equal
 from powderdsl.mutation.mutants import Mutant
 from powderdsl.mutation.original import Batch, Invalid, Original, is_generated, lowered, meaning
 from powderdsl.pack_tests import run_examples
@@ -58,14 +59,15 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if lowered(ruleset) == original.lowered:
         return Verdict("equivalent", "the same program")
     sim = compile(ruleset, backend="planes")
-    broken = broken_invariant(original, sim)
+    broken, differs = broken_invariant(original, sim)
     if broken is not None:
         return Verdict("killed", "invariant", one_line(broken.span))
     failed = failed_test(original, sim, mutant.pack)
     if failed is not None:
-        return Verdict(
-            "killed", "generated" if is_generated(failed) else "test", f"{failed.pack}: {failed.name}"
-        )
+        by = "generated" if is_generated(failed) else "test"
+        return Verdict("killed", by, f"{failed.pack}: {failed.name}")
+    if not differs and proven_equal(original.ruleset, ruleset):
+        return Verdict("equivalent", "the same in every case")
     return Verdict("survived")
 
 
@@ -111,17 +113,26 @@ class _Mutated:
         return run_sample(self.sim, sample, steps, random)[0]
 
 
-def broken_invariant(original: Original, sim: Simulator) -> Invariant | None:
-    """An invariant of the mutant that some world breaks. Only worlds that end otherwise than before are looked at."""
+def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | None, bool]:
+    """An invariant of the mutant that some world breaks, and whether any world ended otherwise than before.
+
+    Only such worlds are asked about the invariants.
+    """
     ruleset = sim.ruleset
     if len(ruleset.invariants) != len(original.ruleset.invariants):
-        return None
+        return None, False
     single = [one for one in ruleset.invariants if not is_paired(one.claim)]
-    if single and same_state(original.ruleset, ruleset):
+    any_differs = False
+    if same_state(original.ruleset, ruleset):
         for batch in original.batches():
-            found = _broken_in(batch, original, sim, single)
+            states, _ = run_sample(sim, batch.sample, batch.steps)
+            differs = differing(batch.states, states)
+            any_differs |= bool(differs.any())
+            found = _broken_in(batch, original, sim, single, states, differs)
             if found is not None:
-                return found
+                return found, True
+            if any_differs and not single:
+                break
     runs = _Mutated(sim)
     for one in ruleset.invariants:
         if is_paired(one.claim) and not _is_local(one, ruleset):
@@ -131,8 +142,8 @@ def broken_invariant(original: Original, sim: Simulator) -> Invariant | None:
                 if wrong and isinstance(one.claim, Symmetric) and ruleset.streams:
                     break  # the same draws may be used in another way
                 if wrong:
-                    return one
-    return None
+                    return one, True
+    return None, any_differs
 
 
 def _is_local(invariant: Invariant, ruleset: Ruleset) -> bool:
@@ -140,10 +151,13 @@ def _is_local(invariant: Invariant, ruleset: Ruleset) -> bool:
 
 
 def _broken_in(
-    batch: Batch, original: Original, sim: Simulator, invariants: list[Invariant]
+    batch: Batch,
+    original: Original,
+    sim: Simulator,
+    invariants: list[Invariant],
+    states: list[State],
+    differs: Array,
 ) -> Invariant | None:
-    states, _ = run_sample(sim, batch.sample, batch.steps)
-    differs = differing(batch.states, states)
     for number, without in enumerate(original.withouts):
         worlds = np.nonzero(differs & (batch.group == number))[0]
         if not len(worlds):

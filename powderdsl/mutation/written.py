@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from powderdsl.diagnostics import Reporter, Source
+from powderdsl.draw import to_numpy
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.types import Element, Ruleset
 from powderdsl.mutation.distinguishing import Distinction
@@ -81,8 +82,8 @@ def written_test(
 
 def _unequal(first: World, second: World, field: str) -> np.ndarray:
     """bool [H, W]: cells in which a field of two worlds differs."""
-    unequal: np.ndarray = (first.state[field] != second.state[field])[0].cpu().numpy()
-    return unequal.any(0) if unequal.ndim == 3 else unequal
+    unequal = to_numpy(first.state[field][0]) != to_numpy(second.state[field][0])
+    return np.asarray(unequal.any(0) if unequal.ndim == 3 else unequal)
 
 
 def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]:
