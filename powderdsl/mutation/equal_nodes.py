@@ -170,7 +170,7 @@ class _Cases:
         inputs: dict[Variable, Node] = {}
         thresholds: dict[str, set[int]] = {}
         moduli: dict[str, int] = {}
-        stack = [(root, (0, 0), "value") for root in roots]
+        stack: list[tuple[Node, Offset, Hashable]] = [(root, (0, 0), "value") for root in roots]
         while stack:
             node, at, use = stack.pop()
             if node.op == "input" and node.type != REAL:

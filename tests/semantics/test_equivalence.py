@@ -1,0 +1,131 @@
+"""Mutants that are proven to mean the same: what is provable, and that nothing is proven that a world refutes."""
+
+from __future__ import annotations
+
+import pytest
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.mutation.equivalence import proven_equal
+from powderdsl.mutation.judging import differing
+from powderdsl.mutation.original import Invalid, Original, meaning
+from powderdsl.properties.running import run_sample
+from powderdsl.simulator import compile
+from powderdsl.testing.cases import load_text
+
+HEAD = """\
+pack: two
+elements:
+  soil: {id: 0, color: "#101010", weight: 1}
+  moss: {id: 1, color: "#202020", weight: 2, tags: green}
+  rock: {id: 2, color: "#303030", weight: 3}
+tags: {green: grows}
+properties: {weight: 0..7}
+streams: [luck]
+fields:
+  damp: {type: 0..9, at: place}
+  age: {type: 0..3, at: element, of: moss}
+  heat: {type: real(0..9), at: place}
+passes:
+  one:
+"""
+
+
+def body(text: str) -> str:
+    return HEAD + "".join(f"    {line}\n" for line in text.splitlines())
+
+
+SAME = {
+    "rules that exclude each other": (
+        "do:\n  - soil -> moss if above is moss\n  - moss -> rock",
+        "do:\n  - moss -> rock\n  - soil -> moss if above is moss",
+    ),
+    "the cell itself is not what is counted": (
+        "do: soil -> moss if count(moss in ring) == 2",
+        "do: soil -> moss if count(moss) == 2",
+    ),
+    "a comparison with a range": ("do: damp := 3 where damp > 8", "do: damp := 3 where damp == 9"),
+    "a condition that another one contains": (
+        "do: soil -> rock if weight < 2 and above is moss",
+        "do: soil -> rock if above is moss",
+    ),
+    "coordinates": (
+        "do: soil -> moss if (row + step) mod 2 == 0",
+        "do: soil -> moss if (row - step) mod 2 == 0",
+    ),
+    "a draw between the same thresholds": (
+        "do: soil -> moss if luck < 20% or luck < 50%",
+        "do: soil -> moss if luck < 50%",
+    ),
+    "fields that only some have": ("do: soil -> rock if age == 0", "do: soil -> rock"),
+    "a value that is fixed in the same moment": (
+        "let: {wet: damp > 2}\ndo: soil -> moss if wet",
+        "let: {wet: damp > 2}\ndo: soil -> moss if damp > 2 or wet",
+    ),
+    "swaps under weights": (
+        "do: swap below if weight > below.weight and weight == 2",
+        "do: swap below if weight == 2 > below.weight",
+    ),
+}
+
+OTHER = {
+    "the cell itself is counted": (
+        "do: moss -> soil if count(moss in ring) == 2",
+        "do: moss -> soil if count(moss) == 2",
+    ),
+    "one moment or two": ("do: soil -> moss\nthen: moss -> rock", "do:\n  - soil -> moss\n  - moss -> rock"),
+    "edges": ("do: soil -> moss if left is rock", "do: soil -> moss if left is rock and inside(left)"),
+    "a range": ("do: damp := 3 where damp > 8", "do: damp := 3 where damp > 7"),
+    "a draw": ("do: soil -> moss if luck < 20%", "do: soil -> moss if luck < 21%"),
+    "real numbers": ("do: heat := heat * 0.5", "do: heat := heat * 0.25"),
+    "a neighbor": ("do: soil -> moss if below is moss", "do: soil -> moss if right is moss"),
+    "an effect": (
+        "do: moss swaps below if below is soil, then below.damp += 1",
+        "do: moss swaps below if below is soil, then damp += 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_what_means_the_same_is_proven(name):
+    first, second = (load_text(body(text)) for text in SAME[name])
+    assert meaning(first) != meaning(second)
+    assert proven_equal(first, second)
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_what_does_not_is_not(name):
+    first, second = (load_text(body(text)) for text in OTHER[name])
+    assert not proven_equal(first, second)
+    assert not proven_equal(second, first)
+
+
+def claimed(rules: str, most: int):
+    """Proofs that mutants of some rules are equal, and whether a world says otherwise."""
+    original = Original.of(rules)
+    for mutant in original.mutants()[::-1][:most]:
+        try:
+            ruleset, _ = original.mutated(mutant)
+        except (Invalid, CompileError):
+            continue
+        if meaning(ruleset) != original.meaning and proven_equal(original.ruleset, ruleset):
+            sim = compile(ruleset, backend="planes")
+            wrong = any(
+                differing(batch.states, run_sample(sim, batch.sample, batch.steps)[0]).any()
+                for batch in original.batches()
+            )
+            yield mutant, wrong
+
+
+@pytest.mark.parametrize("rules", ["life", "wireworld", "brians_brain"])
+def test_no_world_refutes_a_proof(rules):
+    found = list(claimed(rules, 1000))
+    assert found
+    assert not [mutant.key for mutant, wrong in found if wrong]
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(
+    "rules", ["cyclic", "forest_fire", "langtons_ant", "margolus", "core+water+sand", "core+fire+lava"]
+)
+def test_no_world_refutes_a_proof_of_larger_rules(rules):
+    assert not [mutant.key for mutant, wrong in claimed(rules, 1000) if wrong]
