@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import WholeType, check_writable, set_option
+from powderdsl.cli.options import ManyWords, WholeType, check_writable, packs_option, set_option
 from powderdsl.cli.plain_table import table
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import BACKENDS
@@ -25,7 +25,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
     return [one.strip() for one in value.split(",") if one.strip()]
 
 
-@click.command("evaluate")
+@click.command("evaluate", cls=ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option(
     "--splits", callback=_names, metavar="A,B", help="Which worlds.  [default: all splits of the task]"
@@ -50,6 +50,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 )
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
 @set_option
+@packs_option
 @click.option(
     "--backend", type=click.Choice(list(BACKENDS)), help="What runs the rules.  [default: the run's]"
 )
@@ -74,6 +75,7 @@ def command(
     seed: int,
     knobs: tuple[str, ...],
     settings: dict[str, str],
+    packs: tuple[str, ...],
     backend: str | None,
     device: str | None,
     layout: str,
@@ -87,7 +89,7 @@ def command(
     if is_task(run):
         from powderdsl.tasks.shipped_tasks import load_task
 
-        task = load_task(run, knobs=knob_values(knobs), params=settings)
+        task = load_task(run, knobs=knob_values(knobs), params=settings, packs=packs)
     elif knobs or settings:
         raise BadInput("--knob and --set go with a task: a run has its own")
     if out is not None:
@@ -106,6 +108,7 @@ def command(
             seed=seed,
             backend=backend,
             device=device,
+            packs=packs if task is None else (),
         )
     if out is not None:
         write_json(out, found.as_json(), follow=True)

@@ -85,6 +85,40 @@ def set_option(function: Decorated) -> Decorated:
     )(function)
 
 
+class ManyWords(click.Command):
+    """Its options for packs take all words up to the next option: ``--packs ONE ANOTHER``."""
+
+    MANY = ("--packs", "--held-out", "--only")
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        found: list[str] = []
+        option, first = "", False
+        for word in args:
+            if word.startswith("-"):
+                option, first = word if word in self.MANY else "", True
+                found.append(word)
+            else:
+                found += [word] if first or not option else [option, word]
+                first = False
+        return super().parse_args(ctx, found)
+
+
+def packs_option(function: Decorated) -> Decorated:
+    """Of a command whose class is `ManyWords`: packs that are added to the rules of its task."""
+    return click.option(
+        "--packs",
+        multiple=True,
+        metavar="PACK…",
+        callback=lambda ctx, param, words: tuple(_place_of(word) for word in words),
+        help="Packs, by name or file, that are added to the task's rules.",
+    )(function)
+
+
+def _place_of(word: str) -> str:
+    """A pack as runs keep it: files by their whole path."""
+    return str(Path(word).absolute()) if word.endswith((".yaml", ".yml")) else word
+
+
 def backend_option(default: str, about: str = "What runs the rules.") -> Callable[[Decorated], Decorated]:
     return click.option(
         "--backend",

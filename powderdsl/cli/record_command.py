@@ -19,7 +19,7 @@ from powderdsl.cli.exits import (
     user_values,
     write_diagnostics,
 )
-from powderdsl.cli.options import WholeType, backend_option, set_option
+from powderdsl.cli.options import ManyWords, WholeType, backend_option, packs_option, set_option
 from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
@@ -30,7 +30,7 @@ from powderdsl.tasks.task import Task
 SCRIPTED = ("random", "nothing")
 
 
-@click.command("record")
+@click.command("record", cls=ManyWords)
 @click.argument("task", required=False)
 @click.option("--out", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the dataset goes.")
 @click.option("--episodes", type=WholeType(1, 1 << 32), help="How many are recorded.")
@@ -65,6 +65,7 @@ SCRIPTED = ("random", "nothing")
 )
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another value for a knob.")
 @set_option
+@packs_option
 @click.option("--shard", type=WholeType(1, 1 << 32), help="Episodes a file.  [default: 256, or 256 MiB]")
 @click.option("--compress", is_flag=True, help="Smaller files, slower to read.")
 @click.option(
@@ -89,6 +90,7 @@ def command(
     worlds: int,
     knobs: tuple[str, ...],
     settings: dict[str, str],
+    packs: tuple[str, ...],
     shard: int | None,
     compress: bool,
     envs: int,
@@ -109,7 +111,7 @@ def command(
         if task is not None or out is not None or episodes is not None:
             raise BadInput("--verify takes a folder, and no TASK, --out or --episodes")
         return _verify(verify)
-    found = _checked(task, out, episodes, split, policy, knobs, settings)
+    found = _checked(task, out, episodes, split, policy, knobs, settings, packs)
     if found is None:
         return BAD_INPUT
     assert out is not None
@@ -158,6 +160,7 @@ def _checked(
     policy: str,
     knobs: tuple[str, ...],
     settings: dict[str, str],
+    packs: tuple[str, ...],
 ) -> Task | None:
     """The task, or None after saying everything that is wrong, before anything is imported that takes long."""
     missing = [
@@ -177,19 +180,21 @@ def _checked(
             check_place(out)
     except CompileError as error:
         diagnostics.extend(error.diagnostics)
-    try:
-        if task is not None:
-            found = load_task(task, knobs=values, params=settings)
-            check_split(found, split)
-    except CompileError as error:
-        diagnostics.extend(error.diagnostics)
+    palette = None
     if policy not in SCRIPTED:
+        from powderdsl.rl.policies import recorded_palette
         from powderdsl.runs import find_run
 
         try:
-            find_run(policy, "ppo")
+            palette = recorded_palette(find_run(policy, "ppo"))
         except CompileError as error:
             diagnostics.extend(error.diagnostics)
+    try:
+        if task is not None:
+            found = load_task(task, knobs=values, params=settings, packs=packs, palette=palette)
+            check_split(found, split)
+    except CompileError as error:
+        diagnostics.extend(error.diagnostics)
     if found is not None and policy == "nothing":
         _require_gymnasium()
         from powderdsl.datasets.scripted import still_action

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import WholeType, backend_option, set_option
+from powderdsl.cli.options import ManyWords, WholeType, backend_option, packs_option, set_option
 from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.rl.ppo_config import NETWORKS, OBSERVATIONS, PRESETS, TrainConfig, from_json, preset
@@ -37,7 +37,7 @@ class CountType(click.ParamType):
         return int(number)
 
 
-@click.command("train")
+@click.command("train", cls=ManyWords)
 @click.argument("task", metavar="TASK", required=False)
 @click.option(
     "--run", "folder", type=click.Path(path_type=Path), metavar="DIR", help="[default: runs/TASK-seedN]"
@@ -73,6 +73,8 @@ class CountType(click.ParamType):
     help="Short for --knob complexity=N: N of each, where the paper's tasks are.",
 )
 @set_option
+@packs_option
+@click.option("--slots", type=CountType(), help="Room for this many elements, for packs that come later.")
 @click.option("--observation", type=click.Choice(KINDS), help="What the network sees.")
 @click.option("--network", type=click.Choice(NETWORKS), help="The paper's, or a small one.")
 @click.option("--features", type=CountType(), help="Width of its fully connected layers.")
@@ -103,6 +105,7 @@ def command(
     resume: Path | None,
     preset_name: str,
     settings: dict[str, str],
+    packs: tuple[str, ...],
     knobs: tuple[str, ...],
     n_lines: int | None,
     n_disks: int | None,
@@ -119,7 +122,7 @@ def command(
         if task is not None or folder is not None:
             raise BadInput("--resume goes without TASK and --run: the run knows its task")
         config, folder = (
-            _config_of(resume, asked, settings or knobs or n_lines or n_disks or complexity),
+            _config_of(resume, asked, settings or packs or knobs or n_lines or n_disks or complexity),
             resume,
         )
     else:
@@ -128,7 +131,7 @@ def command(
         short = {"lines": n_lines, "disks": n_disks, "complexity": complexity}
         chosen = {**knob_values(knobs), **{name: one for name, one in short.items() if one is not None}}
         name = str(Path(task).absolute()) if Path(task).suffix else task
-        config = preset(preset_name, name, **asked, knobs=chosen, params=settings)
+        config = preset(preset_name, name, **asked, knobs=chosen, params=settings, packs=packs)
         folder = folder or Path("runs") / f"{Path(task).stem}-seed{config.seed}"
     from powderdsl.rl.ppo_training import train
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import WholeType, check_writable, set_option
+from powderdsl.cli.options import ManyWords, WholeType, check_writable, packs_option, set_option
 from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import BACKENDS
@@ -16,7 +16,7 @@ from powderdsl.tasks.task_names import is_task
 SUFFIXES = (".gif", ".mp4")
 
 
-@click.command("watch")
+@click.command("watch", cls=ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option("--split", help="Which worlds.  [default: test where the task has it, else train]")
 @click.option("--worlds", type=WholeType(1, 64), default=4, show_default=True, help="How many, side by side.")
@@ -36,6 +36,7 @@ SUFFIXES = (".gif", ".mp4")
 )
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
 @set_option
+@packs_option
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -57,6 +58,7 @@ def command(
     seed: int,
     knobs: tuple[str, ...],
     settings: dict[str, str],
+    packs: tuple[str, ...],
     out: Path | None,
     fps: int,
     scale: int,
@@ -74,16 +76,16 @@ def command(
     found = None
     if is_task(run):
         config = TrainConfig(run)
-        task = load_task(run, knobs=knob_values(knobs), params=settings)
+        task = load_task(run, knobs=knob_values(knobs), params=settings, packs=packs)
     else:
         if knobs or settings:
             raise BadInput("--knob and --set go with a task: a run has its own")
-        from powderdsl.rl.policies import config_of
+        from powderdsl.rl.policies import config_of, task_of
         from powderdsl.runs import find_run
 
         found = find_run(run, "ppo")
         config = config_of(found)
-        task = load_task(config.task, knobs=dict(config.knobs), params=dict(config.params))
+        task = task_of(found, packs)
     policy = policy or ("random" if found is None else "trained")
     if policy == "trained" and found is None:
         raise BadInput("a task has no trained policy: name a run, or choose --policy random")

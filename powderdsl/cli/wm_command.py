@@ -12,30 +12,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import Decorated, WholeType, backend_option, check_writable, set_option
+from powderdsl.cli.options import Decorated, ManyWords, WholeType, backend_option, check_writable, set_option
 from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.scores import Tested
     from powderdsl.worldmodel.training import Machine, Moment, TrainConfig
-
-
-class ManyWords(click.Command):
-    """Its options for packs take all words up to the next option: ``--packs ONE ANOTHER``."""
-
-    MANY = ("--packs", "--held-out", "--only")
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        found: list[str] = []
-        option, first = "", False
-        for word in args:
-            if word.startswith("-"):
-                option, first = word if word in self.MANY else "", True
-                found.append(word)
-            else:
-                found += [word] if first or not option else [option, word]
-                first = False
-        return super().parse_args(ctx, found)
 
 
 def _words(name: str, about: str) -> Callable[[Decorated], Decorated]:

@@ -10,6 +10,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from powderdsl.diagnostics import suggest
+from powderdsl.observe import Observer
 from powderdsl.simulator import Simulator, World
 from powderdsl.worlds.raster import Size
 
@@ -49,25 +50,34 @@ class Observation:
 _DTYPES = {"uint8": torch.uint8, "float32": torch.float32}
 
 
+def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
+    """What the channels of a kind of observation are. Raises ValueError for a kind that there is not."""
+    known = {
+        "ids": ("element",),
+        "compact": observer.compact_names,
+        "matrix": observer.matrix_names,
+        "rgb": ("red", "green", "blue"),
+    }
+    if kind not in known:
+        helps = suggest(str(kind), KINDS, "kinds") or ("kinds: " + ", ".join(KINDS),)
+        raise ValueError(f"no observation {kind!r}; {'; '.join(helps)}")
+    return known[kind]
+
+
 def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
     """The observation of a kind. Raises ValueError for one that there is not."""
     observer = simulator.observer
-    if kind == "ids":
-        return Observation(kind, _bytes((1, *size)), ("element",))
-    if kind == "compact":
-        names = observer.compact_names
-        return Observation(kind, _bytes((len(names), *size)), names)
+    channels = channels_of(kind, observer)
+    if kind in ("ids", "compact"):
+        return Observation(kind, _bytes((len(channels), *size)), channels)
     if kind == "rgb":
-        return Observation(kind, _bytes((*size, 3)), ("red", "green", "blue"))
-    if kind != "matrix":
-        helps = suggest(str(kind), KINDS, "kinds") or ("kinds: " + ", ".join(KINDS),)
-        raise ValueError(f"no observation {kind!r}; {'; '.join(helps)}")
+        return Observation(kind, _bytes((*size, 3)), channels)
     ruleset = simulator.ruleset
     bounds = [abs(one) for slot in observer.slots.values() for one in (slot.kind.lo, slot.kind.hi)]
     bounds += [float(observer.table(prop.name).abs().max()) for prop in ruleset.properties]
     limit = max(ruleset.slots, *bounds)
-    box = Box(-limit, limit, (len(observer.matrix_names), *size), np.float32)
-    return Observation(kind, box, observer.matrix_names)
+    box = Box(-limit, limit, (len(channels), *size), np.float32)
+    return Observation(kind, box, channels)
 
 
 def _bytes(shape: tuple[int, ...]) -> Box:

@@ -279,6 +279,7 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     own = ruleset.placing.members if ruleset else ()
     left_out = ruleset.left_out if ruleset else ()
     first = [pack for pack in (*packs, *left_out) if pack.name.text in own]
+    first.sort(key=lambda pack: own.index(pack.name.text))
     others = _needed_first([pack for pack in packs if pack.name.text not in own])
     return [*([first] if first else []), *([pack] for pack in others)]
 
@@ -349,7 +350,15 @@ def _elements(chosen: dict[str, _Chosen], ids: dict[str, int], reporter: Reporte
         if name not in ids:
             continue
         elements[name] = Element(
-            name, one.named.pack, ids[name], decl.color, glyphs[name], decl.about, frozenset(), decl.name.span
+            name,
+            one.named.pack,
+            ids[name],
+            decl.color,
+            glyphs[name],
+            decl.about,
+            frozenset(),
+            decl.name.span,
+            "" if name == decl.name.text else decl.name.text,
         )
     return dict(sorted(elements.items(), key=lambda item: item[1].id))
 

@@ -130,11 +130,13 @@ class Element:
     about: str = field(metadata=UNMEANING)
     tags: frozenset[str] = field(metadata=UNMEANING)
     span: Span = field(compare=False, repr=False)
+    word: str = field(default="", repr=False)
+    """Its name in its own file, where that is another."""
 
     @property
     def qualified(self) -> str:
         """The name that it has whatever else is loaded."""
-        return f"{self.pack}.{self.name.rpartition('.')[2]}"
+        return f"{self.pack}.{self.word or self.name}"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,17 @@ from torch import Tensor
 from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.model.palette import MAX_ELEMENTS
 from powderdsl.rl.patch_network import small_policy
 from powderdsl.rl.ppo_config import TrainConfig, from_json
 from powderdsl.runs import RunFolder, does_not_fit, find_run
+from powderdsl.tasks.episodes import compile_task
+from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.tasks.task import Task
+from powderdsl.worlds.files import failure
+
+BESIDES = ("task_fingerprint", "palette", "channels")
+"""What a run keeps besides its settings."""
 
 
 def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
@@ -36,6 +45,8 @@ class TrainedPolicy:
     network: ActorCriticCnnPolicy
     observation: str
     """The kind of observation it takes."""
+    channels: int
+    """How many of its channels, from the first."""
     step: int
     """The interactions that it has learned from."""
     deterministic: bool = False
@@ -43,7 +54,7 @@ class TrainedPolicy:
     def __call__(self, observed: Tensor, keys: Tensor) -> Tensor:
         with torch.no_grad():
             choices: Any = self.network.get_distribution(
-                observed
+                observed[:, : self.channels]
             ).distribution  # one of each number of an action
         if self.deterministic:
             return torch.stack([one.probs.argmax(1) for one in choices], 1)
@@ -58,6 +69,8 @@ class TrainedPolicy:
 def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: bool = False) -> TrainedPolicy:
     """The policy of a run's newest checkpoint, for the observations and actions of `env`, on its device.
 
+    The rules of `env` may have packs that the run did not know: see `task_of`.
+
     Raises:
         CompileError: PD620 if there is no such run or checkpoint; PD623 if the environment does not fit the run.
     """
@@ -66,11 +79,12 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     if env.observation.kind != config.observation:
         why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"
         raise does_not_fit(found.path, why)
+    own = _own_env(found, config, env)
     network = ActorCriticCnnPolicy(
-        env.observation.space,
-        MultiDiscrete(np.array(env.action_nvec)),
+        own.observation.space,
+        MultiDiscrete(np.array(own.action_nvec)),
         lambda _: config.learning_rate,
-        **policy_kwargs(config, env),
+        **policy_kwargs(config, own),
     )
     checkpoint = found.checkpoint()
     try:
@@ -79,9 +93,67 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         why = " ".join(str(error).split())[:300]
         raise does_not_fit(found.path, f"its network is another: {why}") from None
     network.to(env.device).set_training_mode(False)
-    return TrainedPolicy(network, config.observation, checkpoint.step, deterministic)
+    channels = len(own.observation.channels)
+    return TrainedPolicy(network, config.observation, channels, checkpoint.step, deterministic)
+
+
+def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
+    """The environment that the run's network was made for: `env`, or one without the packs that came later.
+
+    Raises CompileError (PD623) if `env` has elements for which the network has no slots.
+    """
+    palette = recorded_palette(run)
+    if palette is None:
+        return env
+    lacking = [one for one in env.task.ruleset.elements if one.id >= len(palette)]
+    if lacking:
+        raise failure(
+            "PD623",
+            f"{run.path} does not fit",
+            notes=tuple(
+                f"there is no free slot for `{one.qualified}`: it has {len(palette)}" for one in lacking
+            ),
+            helps=(
+                f"train with `--slots {len(palette) + len(lacking)}` to leave room for packs that come later",
+            ),
+        )
+    other = [
+        f"id {one.id} is `{palette[one.id]}` there, `{one.qualified}` here"
+        for one in env.task.ruleset.elements
+        if palette[one.id] not in (None, one.qualified)
+    ]
+    if other:
+        raise does_not_fit(run.path, *other)
+    if tuple(run.config.get("channels", ())) == tuple(env.observation.channels):
+        return env
+    program = compile_task(task_of(run), split=config.split, backend="dense", device=str(env.device))
+    return TensorEnv(program, 1, observation=config.observation)
+
+
+def recorded_palette(run: RunFolder) -> tuple[str | None, ...] | None:
+    """The qualified name of the element of each of a run's slots; None of a run that began before these were kept."""
+    found = run.config.get("palette")
+    if not isinstance(found, list) or len(found) > MAX_ELEMENTS:
+        return None
+    return tuple(None if one is None else str(one) for one in found)
+
+
+def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:
+    """The task of a run, with the ids that its network knows. `packs` are added to its rules.
+
+    Raises:
+        CompileError: PD640 if its settings are damaged; what `load_task` raises.
+    """
+    config = config_of(run)
+    return load_task(
+        config.task,
+        knobs=dict(config.knobs),
+        params=dict(config.params),
+        packs=(*config.packs, *packs),
+        palette=recorded_palette(run),
+    )
 
 
 def config_of(run: RunFolder) -> TrainConfig:
     """The settings that a run was begun with. Raises CompileError (PD640) if they are damaged."""
-    return from_json({name: value for name, value in run.config.items() if name != "task_fingerprint"})
+    return from_json({name: value for name, value in run.config.items() if name not in BESIDES})

@@ -14,12 +14,12 @@ from torch import Tensor
 from powderdsl.envs.acting import Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.rl.policies import config_of, load_policy
+from powderdsl.rl.policies import config_of, load_policy, task_of
 from powderdsl.rl.ppo_config import TrainConfig
 from powderdsl.runs import RunFolder, find_run
 from powderdsl.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
-from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.tasks.shipped_tasks import check_split
 from powderdsl.tasks.task import Task
 
 POLICIES = ("trained", "random", "nothing")
@@ -139,6 +139,7 @@ def evaluate(
     backend: str | None = None,
     device: str | None = None,
     said: Callable[[Score], None] | None = None,
+    packs: Sequence[str] = (),
 ) -> Evaluation:
     """Play policies on splits; for a run, write ``evaluation.json`` into its folder.
 
@@ -150,6 +151,7 @@ def evaluate(
         splits: all of the task's unless given. policies: some of POLICIES; all that there are unless given.
         deterministic: the trained policy takes the likeliest action, instead of drawing one.
         backend, device: those of the run unless given. said: called with each score as it is known.
+        packs: names or files of packs that are added to the rules of a run's task.
 
     Raises:
         CompileError: PD620 for a run that is not there, PD801 for a split. ValueError: another argument is wrong.
@@ -159,7 +161,7 @@ def evaluate(
     else:
         run = run_or_task if isinstance(run_or_task, RunFolder) else find_run(run_or_task, "ppo")
         config = config_of(run)
-        task = load_task(config.task, knobs=dict(config.knobs), params=dict(config.params))
+        task = task_of(run, packs)
     names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
     for name in names:
         check_split(task, name)

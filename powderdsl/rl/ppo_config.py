@@ -31,6 +31,10 @@ class TrainConfig:
     knobs: Mapping[str, int] = field(default_factory=dict)
     params: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the rules: numbers, or text such as ``5%``."""
+    packs: tuple[str, ...] = ()
+    """Packs, by name or file, that are added to the task's rules."""
+    slots: int = 0
+    """Room for this many elements at least: packs that come later take free slots."""
     worlds: int = 1_000_000
     """How many worlds there are to draw from: "N start states"."""
     observation: str = "compact"
@@ -85,6 +89,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType({"paper": MappingPro
 _WHOLE: Mapping[str, tuple[int, int]] = MappingProxyType(
     {
         "worlds": (1, 2**62),
+        "slots": (0, 256),
         "features": (1, 1 << 16),
         "envs": (1, 1 << 20),
         "rollout": (1, 1 << 20),
@@ -121,6 +126,7 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
     # The usual observation hangs on the network.
     if "network" in changes and "observation" not in changes and changes["network"] in OBSERVATIONS:
         given["observation"] = OBSERVATIONS[changes["network"]][0]
+    given["packs"] = tuple(given.get("packs", ()))
     config = TrainConfig(**given)
     wrong += _mistakes(config)
     if wrong:
@@ -162,6 +168,8 @@ def _mistakes(config: TrainConfig) -> list[Diagnostic]:
     takes = OBSERVATIONS.get(str(config.network), ("ids", "compact", "matrix"))
     if config.observation not in takes:
         found.append(_no_choice("observation", config.observation, takes))
+    if not all(isinstance(one, str) for one in config.packs) or "" in config.packs:
+        found.append(_wrong(f"`packs` is {config.packs!r}: it takes names or files of packs"))
     for name in ("knobs", "params"):
         value = getattr(config, name)
         if not isinstance(value, Mapping) or not all(isinstance(one, str) for one in value):

@@ -22,13 +22,17 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
+from powderdsl.compiler import whole_palette
+from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.rl.policies import policy_kwargs
+from powderdsl.observe import Observer
+from powderdsl.rl.policies import policy_kwargs, recorded_palette
 from powderdsl.rl.ppo_config import TrainConfig, check_config
-from powderdsl.runs import Metrics, RunFolder, open_run
+from powderdsl.runs import Metrics, RunFolder, open_run, read_run
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.tasks.task import Task
 
 KIND = "ppo"
 ASKED = "asked.json"
@@ -50,9 +54,15 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         KeyboardInterrupt: after the state before the rollout that was going on has been saved.
     """
     check_config(config)
-    task = load_task(config.task, knobs=dict(config.knobs), params=dict(config.params))
+    task, palette = _task_and_palette(config, Path(folder))
     check_split(task, config.split)
-    run = open_run(folder, KIND, {**config.identity, "task_fingerprint": fingerprint(task)})
+    plain = {
+        **config.identity,
+        "task_fingerprint": fingerprint(task),
+        "palette": palette,
+        "channels": channels_of(config.observation, Observer(task.ruleset, torch.device("cpu"))),
+    }
+    run = open_run(folder, KIND, plain)
     with run.locked(), _own_random_numbers(config.threads):
         run.write_json(ASKED, config.as_json())
         found = run.latest_checkpoint()
@@ -76,6 +86,25 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
                 raise
             run.save_checkpoint(model.num_timesteps, _state(model, env))
     return run
+
+
+def _task_and_palette(config: TrainConfig, folder: Path) -> tuple[Task, tuple[str | None, ...] | None]:
+    """The task, with the ids of the network's slots: those that its rules need, and free ones as asked for.
+
+    A run that began before palettes were kept has the ids that the rules give.
+    """
+    how: dict[str, Any] = {
+        "knobs": dict(config.knobs),
+        "params": dict(config.params),
+        "packs": config.packs,
+    }
+    if (folder / "run.json").exists():
+        recorded = recorded_palette(read_run(folder))
+        if recorded is None:
+            return load_task(config.task, **how), None
+    found = list(whole_palette(*load_task(config.task, **how).rules))
+    palette = (*found, *[None] * (config.slots - len(found)))
+    return load_task(config.task, **how, palette=palette), palette
 
 
 def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:

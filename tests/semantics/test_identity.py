@@ -1,0 +1,244 @@
+"""Packs by people who do not know each other: names, ids, glyphs and channels when they are loaded together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import powderdsl
+from powderdsl.compiler import load_with_diagnostics, whole_palette
+from powderdsl.diagnostics import CompileError
+from powderdsl.pack_tests import run_examples
+from powderdsl.worlds.store import load_world, save
+
+SLIME = """
+pack: NAME
+needs: core
+tags: {sticky: slime holds on to it}
+fields: {wet: {type: 0..9, at: element}}
+params: {pace: 50%}
+elements:
+  slime: {id: 14, density: 3, gravity: yes, color: "#60C040", glyph: m, tags: sticky}
+passes:
+  creep:
+    after: flow
+    do:
+      - empty -> slime if count(sticky) > 2 with chance pace
+      - wet += 1 where slime
+tests:
+  - slime gets wet, and this pack means its own:
+      given: m
+      after: 3 steps
+      expect: m
+      always: [slime, wet > 0]
+"""
+
+HUNTER = """
+pack: hunter
+needs: two
+elements:
+  hunter: {color: "#402060"}
+passes:
+  hunt:
+    do: slime -> hunter if above is hunter and wet > 1
+    then: one.slime -> hunter if left is hunter and right.two.wet == 0
+"""
+
+
+@pytest.fixture(autouse=True)
+def _packs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("one", "two"):
+        Path(f"{name}.yaml").write_text(SLIME.replace("NAME", name))
+    Path("hunter.yaml").write_text(HUNTER)
+
+
+def pack(name: str, elements: str, more: str = "") -> str:
+    """A small pack's file."""
+    Path(f"{name}.yaml").write_text(f"pack: {name}\nneeds: core\nelements:\n{elements}\n{more}")
+    return f"{name}.yaml"
+
+
+def test_the_first_pack_keeps_its_names_and_the_second_is_qualified() -> None:
+    alone = powderdsl.load("core", "one.yaml")
+    rules, notes = load_with_diagnostics("core", "one.yaml", "two.yaml")
+    assert [element.qualified for element in rules.elements] == [
+        "core.empty",
+        "core.wall",
+        "one.slime",
+        "two.slime",
+    ]
+    assert rules.element("slime") == rules.element("one.slime")
+    assert alone.element("slime") == rules.element("slime")  # nothing changed for what was there
+    assert [field.name for field in rules.fields][-2:] == ["wet", "two.wet"]
+    assert [one.name for one in rules.passes][-2:] == ["creep", "two.creep"]
+    assert rules.element("two.slime").glyph != rules.element("one.slime").glyph
+    assert {note.code for note in notes} >= {"PD312", "PD313"}
+
+
+def test_each_pack_means_its_own_and_draws_what_it_drew_alone() -> None:
+    """Slime of both packs grows in separate chambers as it would grow if only its own pack were loaded."""
+    both = powderdsl.compile(powderdsl.load("core", "one.yaml", "two.yaml"), "reference")
+    number = both.ruleset.element("two.slime").id
+    alone = powderdsl.compile(powderdsl.load("core", "two.yaml"), "reference")
+    ids = np.zeros((2, 9, 9), np.uint8)
+    ids[:, 4:, 2:7] = alone.ruleset.element("slime").id
+    wanted = alone.step(alone.world(ids, seed=3), steps=4)
+    ids[ids != 0] = number
+    found = both.step(both.world(ids, seed=3), steps=4)
+    assert (wanted.ids > 1).sum() > (ids > 1).sum()
+    assert ((found.ids == number) == (wanted.ids == alone.ruleset.element("slime").id)).all()
+    assert (found["two.wet"] == wanted["wet"]).all()
+    assert not found["wet"].any()
+
+
+def test_their_own_tests_pass_together() -> None:
+    rules = powderdsl.load("core", "one.yaml", "two.yaml")
+    results = [one for one in run_examples(rules) if one.example.pack in ("one", "two")]
+    assert [(one.example.pack, one.problem) for one in results] == [("one", ""), ("two", "")]
+
+
+def test_a_pack_means_what_it_needs_and_names_others_by_their_pack() -> None:
+    rules = powderdsl.load("core", "one.yaml", "two.yaml", "hunter.yaml")
+    sim = powderdsl.compile(rules, "reference")
+    one, two, hunter = (rules.element(name).id for name in ("one.slime", "two.slime", "hunter"))
+    start = sim.world(np.array([[[hunter, one, 0, 1], [two, 1, 0, 1]]], np.uint8))
+    later = sim.step(start, steps=3)
+    assert later.ids[0, 1, 0] == hunter  # `slime` is that of `two`, which `hunter` needs
+    assert later.ids[0, 0, 1] == hunter  # `one.slime`
+
+
+def test_a_ruleset_renames_without_editing_anyones_file() -> None:
+    Path("garden.yaml").write_text(
+        "ruleset: garden\npacks: [core, one, two]\nrename: {two.slime: ooze, two.wet: damp, two.creep: crawl}\n"
+    )
+    rules, notes = load_with_diagnostics("garden.yaml")
+    assert rules.element("ooze").qualified == "two.slime"
+    assert "damp" in [field.name for field in rules.fields]
+    assert "crawl" in [one.name for one in rules.passes]
+    assert {note.message for note in notes if note.code == "PD312"} == {
+        "the tag `sticky` of `two` is known as `two.sticky` here"
+    }
+    Path("garden.yaml").write_text("ruleset: garden\npacks: [core, one]\nrename: {one.slim: ooze}\n")
+    with pytest.raises(CompileError) as error:
+        powderdsl.load("garden.yaml")
+    assert [one.code for one in error.value.diagnostics] == ["PD310"]
+
+
+def test_packs_that_know_each_other_may_not_redefine() -> None:
+    name = pack("mine", '  wall: {color: "#000000"}')
+    with pytest.raises(CompileError) as error:
+        powderdsl.load("core", name)
+    assert [one.code for one in error.value.diagnostics] == ["PD302"]
+
+
+def test_ids_are_optional_and_adding_packs_moves_none() -> None:
+    first = pack("aa", '  moss: {color: "#306030"}\n  fern: {id: 50, color: "#306030"}')
+    second = pack("bb", '  crab: {id: 14, color: "#306030"}\n  fish: {color: "#306030"}')
+    alone = powderdsl.load("powderworld", first)
+    both = powderdsl.load("powderworld", first, second)
+    assert (alone.element("moss").id, alone.element("fern").id) == (14, 50)
+    for element in alone.elements:
+        assert both.element(element.qualified).id == element.id
+    assert [both.element(name).id for name in ("crab", "fish")] == [15, 16]
+    assert powderdsl.load("powderworld-gas", first).element("moss").id == 14
+    assert powderdsl.load(first, "powderworld").element("moss").id == 14  # the order of names decides nothing
+
+
+def test_ids_of_packs_that_a_ruleset_leaves_out_stay_reserved() -> None:
+    pack("aa", '  moss: {color: "#306030"}')
+    pack("bb", '  crab: {color: "#306030"}')
+    Path("shore.yaml").write_text("ruleset: shore\npacks: [core, aa, bb]\n")
+    whole, less = powderdsl.load("shore.yaml"), powderdsl.load("shore.yaml+core-aa")
+    assert whole.element("crab").id == less.element("crab").id == 3
+    assert [channel.name for channel in less.matrix[:4]] == ["empty", "wall", "", "crab"]
+
+
+def test_a_full_palette_is_refused() -> None:
+    name = pack("many", "\n".join(f'  e{n}: {{color: "#306030"}}' for n in range(255)))
+    with pytest.raises(CompileError) as error:
+        powderdsl.load("core", name)
+    assert [one.code for one in error.value.diagnostics] == ["PD508"]
+
+
+def test_channels_of_a_ruleset_stay_in_place() -> None:
+    paper = powderdsl.load("powderworld")
+    names = [channel.name for channel in paper.matrix]
+    assert len(names) == 20
+    far = pack("far", '  glow: {id: 50, color: "#FFFFFF"}', "fields: {heat: {type: real(0..9), at: place}}\n"
+               "passes: {warm: {do: heat += 1 where glow}}\n")  # fmt: skip
+    more = pack("more", '  mist: {color: "#FFFFFF"}',
+                "passes: {lift: {do: gravity := no where mist and above is empty}}\n")  # fmt: skip
+    one, two = powderdsl.load("powderworld", far), powderdsl.load("powderworld", far, more)
+    assert [channel.name for channel in one.matrix] == [*names, "glow", "heat"]
+    assert [channel.name for channel in two.matrix] == [*names, "glow", "heat", "mist"]
+    compact = [powderdsl.compile(rules, "dense").observer.compact_names for rules in (paper, one, two)]
+    assert compact[1][: len(compact[0])] == compact[0]
+    assert compact[2][: len(compact[1])] == compact[1]
+
+
+def test_channels_of_packs_without_a_ruleset_stay_in_place_too() -> None:
+    names = ["core", "water", "stone", "wind"]
+    for count in range(1, len(names)):
+        few, more = (powderdsl.load(*names[:n]) for n in (count, count + 1))
+        here, there = ([channel.name for channel in rules.matrix] for rules in (few, more))
+        assert there[: len(here)] == here
+        old, new = (powderdsl.compile(rules, "dense").observer.compact_names for rules in (few, more))
+        assert new[: len(old)] == old
+
+
+def test_worlds_carry_their_palette_to_other_ids() -> None:
+    here = powderdsl.compile(powderdsl.load("core", "one.yaml", "two.yaml"), "dense")
+    there = powderdsl.compile(powderdsl.load("core", "two.yaml", "one.yaml"), "dense")
+    ids = np.array(
+        [[[here.ruleset.element(name).id for name in ("one.slime", "two.slime", "wall")]]], np.uint8
+    )
+    save(here.world(ids), "world.npz")
+    found = load_world("world.npz", there).ids[0, 0].tolist()
+    assert found == [there.ruleset.element(name).id for name in ("one.slime", "two.slime", "wall")]
+    assert found != ids[0, 0].tolist()
+
+
+def test_a_recorded_palette_decides_ids_but_not_what_happens() -> None:
+    """Loops over elements keep their order: the same world under two palettes has the same future."""
+    names = ("core", "sand", "water", "wind", "one.yaml")
+    plain = powderdsl.load(*names)
+    order = [element.qualified for element in plain.elements]
+    turned = [order[0], None, *reversed(order[1:]), None]
+    other = powderdsl.load(*names, palette=turned)
+    assert other.palette == tuple(turned)
+    to = np.zeros(256, np.uint8)
+    for element in plain.elements:
+        to[element.id] = other.element(element.qualified).id
+    ids = (
+        np.random.default_rng(0)
+        .choice([element.id for element in plain.elements], (2, 20, 20))
+        .astype(np.uint8)
+    )
+    one, two = powderdsl.compile(plain, "reference"), powderdsl.compile(other, "planes")
+    first, second = one.step(one.world(ids), steps=8), two.step(two.world(to[ids]), steps=8)
+    assert (to[first.ids.numpy()] == second.ids.numpy()).all()
+    assert (first["velocity"] == second["velocity"]).all()
+
+
+def test_the_palette_of_a_model_has_no_gaps_for_packs_that_are_added() -> None:
+    far = pack("far", '  glow: {id: 50, color: "#FFFFFF"}')
+    palette = whole_palette("powderworld-gas", far)
+    assert len(palette) == 15
+    assert palette[4] == "gas.gas"
+    assert palette[14] == "far.glow"
+
+
+def test_names_of_strangers_hide_nothing() -> None:
+    """A parameter, a loop variable and a value under `let` of one pack, all of which another pack defines."""
+    mine = pack("mine", '  reed: {color: "#306030"}', "params: {pace: 10%}\n"
+                "passes:\n  grow:\n    let: {wet: count(reed) > 1}\n    for damp in 1..2:\n"
+                "      - empty -> reed if wet and count(reed) == damp with chance pace\n")  # fmt: skip
+    theirs = pack(
+        "theirs", '  pace: {color: "#306030"}\n  damp: {color: "#306030"}\n  wet: {color: "#306030"}'
+    )
+    rules = powderdsl.load("core", mine, theirs)
+    assert [element.name for element in rules.elements] == ["empty", "wall", "reed", "pace", "damp", "wet"]
+    assert powderdsl.load("core", theirs, mine).element("reed")
