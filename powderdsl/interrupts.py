@@ -143,8 +143,25 @@ def _handle(number: int, frame: FrameType | None) -> None:
         return
     if _state.held and not _state.pending:
         _state.pending = number
-        return
-    raise _exception(number)
+    elif _importing(frame):
+        _send_again(number)  # modules in C++, such as torch's, abort the process when an import raises
+    else:
+        raise _exception(number)
+
+
+def _importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _send_again(number: int) -> None:
+    _state.last, _state.when = 0, -1e9
+    again = threading.Timer(0.02, os.kill, (os.getpid(), number))
+    again.daemon = True
+    again.start()
 
 
 def _exception(number: int) -> KeyboardInterrupt:
@@ -158,10 +175,6 @@ def _redeliver(usual: Callable[[Any], Any]) -> Callable[[Any], None]:
         if not isinstance(found.exc_value, KeyboardInterrupt):
             usual(found)
             return
-        number = found.exc_value.number if isinstance(found.exc_value, Terminated) else signal.SIGINT
-        _state.when = -1e9
-        again = threading.Timer(0.05, os.kill, (os.getpid(), number))
-        again.daemon = True
-        again.start()
+        _send_again(found.exc_value.number if isinstance(found.exc_value, Terminated) else signal.SIGINT)
 
     return hook

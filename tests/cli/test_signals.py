@@ -93,7 +93,7 @@ def test_two_studies_do_not_share_a_folder(tmp_path: Path) -> None:
 
 
 CAUGHT = """
-import os, signal, sys, time
+import os, signal, sys, tempfile, time
 from powderdsl.interrupts import Terminated, held_back, interruptible
 
 class Unlucky:
@@ -121,9 +121,21 @@ def held_in_a_failure():
     except OSError:
         print("lost")
 
+def imported():
+    with tempfile.TemporaryDirectory() as folder:
+        with open(os.path.join(folder, "slow_module.py"), "w") as file:
+            file.write("import os, signal, time\\nos.kill(os.getpid(), signal.SIGTERM)\\ntime.sleep(0.1)\\n")
+        sys.path.append(folder)
+        try:
+            import slow_module
+        except KeyboardInterrupt:
+            print("the import was torn")
+        print("imported", flush=True)
+        time.sleep(10)
+
 with interruptible():
     try:
-        {"swallowed": swallowed, "twice": twice, "held": held_in_a_failure}[sys.argv[1]]()
+        {"imported": imported, "swallowed": swallowed, "twice": twice, "held": held_in_a_failure}[sys.argv[1]]()
     except Terminated as error:
         print(error)
 """
@@ -133,6 +145,7 @@ with interruptible():
     ("case", "said"),
     [
         ("swallowed", ["terminated by SIGTERM"]),
+        ("imported", ["imported", "terminated by SIGTERM"]),
         ("twice", ["asked", "terminated by SIGTERM"]),
         ("held", ["terminated by SIGTERM"]),
     ],
