@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Mapping
 from importlib import import_module
@@ -14,10 +15,11 @@ from powderdsl.cli.commands import COMMANDS
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.options import WholeType
 from powderdsl.cli.progress import progress
+from powderdsl.cli.study_checks import check_study
 from powderdsl.diagnostics.printable import printable
 from powderdsl.studies.study import SIZES, Point, Study
 from powderdsl.studies.study_file import load_study, shipped_studies
-from powderdsl.studies.study_paths import FILE, RULES, RUN, RUN_OR_TASK, TASK, TEXT
+from powderdsl.studies.study_paths import FILE, FLAG, RULES, RUN, RUN_OR_TASK, TASK, TEXT
 from powderdsl.studies.study_run import Outcome, StudyRun
 
 CALLED: tuple[tuple[str, ...], ...] = (
@@ -49,19 +51,26 @@ def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
     """
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for words in CALLED:
-        command: click.Command = import_module(f"powderdsl.cli.{COMMANDS[words[0]][0]}").command
-        for word in words[1:]:
-            assert isinstance(command, click.Group)
-            command = command.commands[word]
         found[words] = {}
-        for one in command.params:
+        for one in called(words).params:
             if isinstance(one, click.Argument):
                 found[words]["on"] = MEANS[one.metavar or ""]
                 continue
-            means = MEANS.get(one.metavar or "", TEXT)
+            means = (
+                FLAG if isinstance(one, click.Option) and one.is_flag else MEANS.get(one.metavar or "", TEXT)
+            )
             if isinstance(one.type, click.Path) and means != FILE and "--run" not in one.opts:
                 continue
             found[words] |= {name[2:]: means for name in one.opts if name.startswith("--")}
+    return found
+
+
+def called(words: tuple[str, ...]) -> click.Command:
+    """The command of some words."""
+    found: click.Command = import_module(f"powderdsl.cli.{COMMANDS[words[0]][0]}").command
+    for word in words[1:]:
+        assert isinstance(found, click.Group)
+        found = found.commands[word]
     return found
 
 
@@ -104,7 +113,7 @@ def command(
         for name in shipped_studies():
             click.echo(f"{name:24} {load_study(name, known).about}")
         return OK
-    found = load_study(study, known)
+    found = load_study(study, known, lambda read, reporter: check_study(read, reporter, called))
     points = [point for point in found.points(size, seeds) if _chosen(found, point, only)]
     if not points:
         raise BadInput(f"no combination has {' and '.join(only)}")
@@ -113,7 +122,7 @@ def command(
     if dry_run:
         for point in points:
             for step in found.steps:
-                click.echo(" ".join(["powderdsl", *run.command(step, point, folder / "runs" / point.name)]))
+                click.echo(shlex.join(["powderdsl", *run.command(step, point, folder / "runs" / point.name)]))
         return OK
     run.prepare()
     try:

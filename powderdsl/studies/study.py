@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from string import Template
 
+from powderdsl.diagnostics import Span
+
 SIZES = ("small", "paper")
 EXPECTED = ("rises", "falls")
 SCALES = ("linear", "log")
@@ -75,7 +77,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Study:
-    """A checked study. `text` is what its file says, `folder` is where the file lies."""
+    """A checked study. `text` is what its file says, `folder` is where the file lies, `places` where its parts stand."""
 
     name: str
     about: str
@@ -85,6 +87,7 @@ class Study:
     measures: tuple[Measure, ...]
     text: str
     folder: Path = Path()
+    places: Mapping[tuple[str, ...], Span] = field(default_factory=dict, repr=False, compare=False)
 
     def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
         """All combinations, each with every seed; the seeds outside, so that early ends leave whole sets."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from powderdsl.bounded_files import inside, is_path
 from powderdsl.compiler import shipped, shipped_rules
 
-TEXT, FILE, TASK, RUN, RUN_OR_TASK, RULES = "text", "file", "task", "run", "run|task", "rules"
-"""What an argument or option of a command is: no path, a file to write, a task, a run, either, or rules."""
+TEXT, FLAG, FILE, TASK, RUN, RUN_OR_TASK, RULES = "text", "flag", "file", "task", "run", "run|task", "rules"
+"""What an argument or option of a command is: text, a flag, a file to write, a task, a run, either, or rules."""
 
 
 def confined(means: str, text: str, folder: Path, results: Path) -> str:
@@ -55,6 +55,7 @@ def _pack(text: str, folder: Path) -> str:
 
 _WORDS: dict[str, Callable[[str, Path, Path], str]] = {
     TEXT: lambda text, folder, results: text,
+    FLAG: lambda text, folder, results: text,
     FILE: _file,
     TASK: _task,
     RUN: lambda text, folder, results: str(inside(folder, text)),

@@ -21,7 +21,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.interrupts import GRACE, LIFELINE
 from powderdsl.runs.folder import ABOUT, check_folder, held, new_folder, write_json
 from powderdsl.studies.study import Measure, Point, Step, Study, filled
-from powderdsl.studies.study_paths import TEXT, confined
+from powderdsl.studies.study_paths import FLAG, TEXT, confined
 from powderdsl.worlds.files import failure
 
 EVALUATION = "evaluation.json"
@@ -65,7 +65,7 @@ class StudyRun:
             "study": self.study.name,
             "size": self.size,
             "varied": [axis.name for axis in self.study.axes],
-            "steps": [asdict(step) for step in self.study.steps],
+            "steps": [_decides(step) for step in self.study.steps],
         }
         decides = json.loads(json.dumps(decides))  # as it will be read
         if self.folder.is_dir():
@@ -163,7 +163,11 @@ class StudyRun:
             )
         for name, values in step.options:
             for value in values:
-                words += [f"--{name}", self._word(step, name, value, point)]
+                word = self._word(step, name, value, point)
+                if step.means.get(name) != FLAG:
+                    words += [f"--{name}", word]
+                elif word == "yes":
+                    words.append(f"--{name}")
         return [*words, "--run", str(place / step.name)] if step.makes_run else words
 
     def _word(self, step: Step, name: str, text: str, point: Point) -> str:
@@ -225,6 +229,11 @@ class StudyRun:
                     return
             except CompileError:
                 continue
+
+
+def _decides(step: Step) -> dict[str, Any]:
+    """What decides what a step does: not what its words mean, which follows from the command."""
+    return {name: value for name, value in asdict(step).items() if name != "means"}
 
 
 def value_of(measure: Measure, run: Path, point: Point, size: str) -> float:

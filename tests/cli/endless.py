@@ -30,7 +30,7 @@ about: Two runs that are ended.
 seeds: 2
 vary: {batch: [12]}
 steps:
-  trained: {command: train, on: FOLDER/dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: dense, steps: 900000000, seed: $seed, checkpoint-every: 0}
+  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: dense, steps: 900000000, seed: $seed, checkpoint-every: 0}
 measures:
   reward: {of: trained, value: splits/test/trained/mean}
 """
@@ -70,6 +70,7 @@ COMMANDS = {
     "record": Endless(
         ("record", "dig.yaml", "--out", "data", "--episodes", "900000", "--shard", "3", "--backend", "dense"),
         "data/shard-*",
+        ("run", "life", *SMALL, "--steps", "3", "--out", "data/x.npz"),
     ),
     "train": Endless(
         ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "900000000", "--checkpoint-every", "0"),
@@ -113,7 +114,7 @@ class Place:
         for name in ("cache", "tmp"):
             (folder / name).mkdir()
         (folder / "dig.yaml").write_text(TASK, encoding="utf-8")
-        (folder / "study.yaml").write_text(STUDY.replace("FOLDER", str(folder)), encoding="utf-8")
+        (folder / "study.yaml").write_text(STUDY, encoding="utf-8")
         self.compiler = folder / "compiler"
         self.compiler.write_text(COMPILER.replace("FOLDER", str(folder)), encoding="utf-8")
         self.compiler.chmod(0o755)

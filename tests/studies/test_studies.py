@@ -34,7 +34,7 @@ steps:
   trained: {command: train, on: sand-pushing, steps: $steps, knob: [lines=2, squares=$squares], seed: $seed}
   tested: {command: evaluate, on: trained, episodes: 4}
 measures:
-  reward: {of: trained, value: test/trained/mean, about: mean reward, expect: rises}
+  reward: {of: trained, value: splits/test/trained/mean, about: mean reward, expect: rises}
 """
 
 

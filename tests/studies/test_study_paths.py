@@ -22,7 +22,7 @@ steps:
   trained: {command: train, on: sand-pushing, steps: $steps}
   tested: {command: evaluate, on: trained, out: scores.json}
 measures:
-  reward: {of: trained, value: test/trained/mean}
+  reward: {of: trained, value: splits/test/trained/mean}
 """
 
 ELSEWHERE = (

@@ -1,0 +1,290 @@
+"""Studies are refused before anything runs, with all that is wrong and where; `--dry-run` prints what a shell takes."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from powderdsl.cli.study_checks import check_study
+from powderdsl.cli.study_command import called, commands
+from powderdsl.cli.study_measures import LEADS_TO, values_of_agent, values_of_world_model
+from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
+from powderdsl.studies.study import Study
+from powderdsl.studies.study_file import load_study, read_study, shipped_studies
+from tests.cli.commands import powderdsl
+
+AGENTS = """
+study: patience
+about: Longer training, more reward.
+seeds: 3
+vary:
+  steps: {about: interactions, small: [100, 200], paper: [1000, 2000]}
+  task: [sand-pushing, destroying]
+  few: {small: [some], paper: [some], sets: {some: {lines: 2}}}
+steps:
+  trained: {command: train, on: $task, preset: $size, steps: $steps, knob: lines=$lines, seed: $seed}
+  tested: {command: evaluate, on: trained, episodes: 4, splits: "test,train", policies: "trained,random"}
+measures:
+  reward: {of: trained, value: splits/test/trained/above/random/mean, expect: rises}
+"""
+
+MODELS = """
+study: transfer
+seeds: 2
+vary: {elements: [1, 4]}
+steps:
+  trained: {command: wm train, held-out: [gas, acid], elements: $elements, seed: $seed}
+  tuned: {command: wm finetune, on: trained, packs: [gas, acid], iterations: 5, seed: $seed}
+  tested: {command: wm eval, on: tuned, split: held_out}
+measures:
+  loss: {of: tuned, value: mean/model/loss, scale: log}
+"""
+
+
+def read(text: str, name: str = "study.yaml") -> Study:
+    return read_study(
+        Source(name, text),
+        Reporter(),
+        commands(),
+        lambda study, reporter: check_study(study, reporter, called),
+    )
+
+
+def refused(text: str) -> list[tuple[str, str]]:
+    """The code and the text under the caret of everything that is said of a study."""
+    with pytest.raises(CompileError) as caught:
+        read(text)
+    return [(one.code, under(one)) for one in caught.value.diagnostics]
+
+
+def under(one: Diagnostic) -> str:
+    assert one.primary.span is not None, one
+    assert one.primary.span.source.name == "study.yaml", one
+    return one.primary.span.text
+
+
+def test_good_studies_pass() -> None:
+    assert read(AGENTS).name == "patience"
+    assert read(MODELS).name == "transfer"
+
+
+@pytest.mark.parametrize("name", shipped_studies())
+def test_shipped_studies_pass(name: str) -> None:
+    load_study(name, commands(), lambda study, reporter: check_study(study, reporter, called))
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "code", "caret"),
+    [
+        # what a step works on
+        (AGENTS, "on: trained", "on: trianed", "PD806", "trianed"),
+        (AGENTS, "on: trained, ", "", "PD806", "tested"),
+        (AGENTS, "destroying]", "destorying]", "PD801", "destorying"),
+        (AGENTS, "command: evaluate, on: trained, episodes: 4, splits: \"test,train\", policies: \"trained,random\"",
+         "command: wm eval, on: trained", "PD806", "trained"),
+        (AGENTS, "command: evaluate, on: trained", "command: evaluate, on: tested", "PD806", "tested"),
+        (MODELS, "command: wm train", "command: wm train, on: powderworld", "PD806", "powderworld"),
+        (MODELS, "on: tuned", "on: later", "PD806", "later"),
+        (MODELS, "command: wm eval, on: tuned, split: held_out", "command: evaluate, on: tuned", "PD806", "tuned"),
+        # values of options
+        (AGENTS, "[100, 200]", "[100, lots]", "PD806", "lots"),
+        (AGENTS, "[1000, 2000]", "[1000, 0]", "PD640", "0"),
+        (AGENTS, "episodes: 4", "episodes: 4.5", "PD806", "4.5"),
+        (AGENTS, "episodes: 4", "episodes: [4, 5]", "PD806", "5"),
+        (AGENTS, "episodes: 4", "episodes: []", "PD806", "episodes"),
+        (AGENTS, "episodes: 4", "deterministic: maybe", "PD806", "maybe"),
+        (AGENTS, "preset: $size", "preset: smal", "PD806", "smal"),
+        (AGENTS, "preset: $size", "gamma: 7", "PD640", "7"),
+        (AGENTS, "preset: $size", "network: tiny", "PD806", "tiny"),
+        (AGENTS, "preset: $size", "envs: 1, rollout: 1", "PD640", "trained"),
+        (AGENTS, "seed: $seed", "seed: $seed, batch: 100$", "PD806", "100$"),
+        (MODELS, "iterations: 5", "iterations: 0", "PD806", "0"),
+        (MODELS, "elements: $elements", "elements: $elements, chances: 3", "PD806", "3"),
+        (MODELS, "elements: $elements", "elements: $elements, rulesets: 2, chances: 0.5", "PD806", "0.5"),
+        (MODELS, "elements: $elements", "elements: $elements, chance: 3", "PD806", "chance"),
+        # names in tasks and rules
+        (AGENTS, "lines: 2", "lines: 999", "PD803", "999"),
+        (AGENTS, "knob: lines=$lines", "knob: lnies=$lines", "PD803", "2"),
+        (AGENTS, "knob: lines=$lines", "knob: [lines=$lines, circles=1]", "PD803", "circles=1"),
+        (AGENTS, "knob: lines=$lines", "knob: lines=$lines, set: water.melt=500%", "PD402", "water.melt=500%"),
+        (AGENTS, "preset: $size", "split: tran", "PD801", "tran"),
+        (AGENTS, "test,train", "test,tran", "PD801", '"test,tran"'),
+        (AGENTS, "trained,random", "trained,rnadom", "PD806", '"trained,rnadom"'),
+        (MODELS, "[1, 4]", "[1, 99]", "PD803", "99"),
+        (MODELS, "held-out: [gas, acid]", "held-out: [gsa, acid]", "PD304", "gsa"),
+        (MODELS, "packs: [gas, acid]", "packs: [gas, acdi]", "PD304", "acdi"),
+        (MODELS, "packs: [gas, acid], ", "", "PD806", "tuned"),
+        (MODELS, "split: held_out", "split: held_in", "PD801", "held_in"),
+        (MODELS, "split: held_out", "rules: powderwolrd", "PD304", "powderwolrd"),
+        (MODELS, "held-out: [gas, acid]", "task: world-modle", "PD801", "world-modle"),
+        # measures
+        (AGENTS, "value: splits/test", "value: test", "PD806", "test/trained/above/random/mean"),
+        (AGENTS, "value: splits/test", "value: splits/tset", "PD806", "splits/tset/trained/above/random/mean"),
+        (AGENTS, "above/random", "above/nothing", "PD806", "splits/test/trained/above/nothing/mean"),
+        (AGENTS, "/above/random/mean", "", "PD806", "splits/test/trained"),
+        (AGENTS, "random/mean", "random/mean/x", "PD806", "splits/test/trained/above/random/mean/x"),
+        (MODELS, "mean/model/loss", "mean/modle/loss", "PD806", "mean/modle/loss"),
+        (MODELS, "mean/model/loss", "tests/held_out/model/los", "PD806", "tests/held_out/model/los"),
+        (MODELS, "of: tuned", "of: trained", "PD806", "trained"),
+        # what makes no difference
+        (AGENTS, ", steps: $steps", "", "PD806", "steps"),
+        (AGENTS, "{lines: 2}", "{lines: 2, disks: 3}", "PD806", "3"),
+        (AGENTS, ", seed: $seed", "", "PD806", "3"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_found_before_anything_runs(
+    text: str, old: str, new: str, code: str, caret: str
+) -> None:
+    assert text.count(old) >= 1
+    assert set(refused(text.replace(old, new, 1))) == {(code, caret)}
+
+
+def test_consequences_are_told_too_where_they_are_mistakes_of_their_own() -> None:
+    assert refused(AGENTS.replace("on: $task, ", "")) == [("PD806", "task"), ("PD806", "trained")]
+    again = AGENTS.replace("measures:", "  again: {command: train, on: trained}\nmeasures:")
+    assert refused(again) == [("PD806", "trained")]
+
+
+def test_a_value_is_shown_where_it_is_written_and_used() -> None:
+    with pytest.raises(CompileError) as caught:
+        read(AGENTS.replace("[100, 200]", "[100, lots]"))
+    (one,) = caught.value.diagnostics
+    (used,) = one.secondary
+    assert used.span is not None
+    assert (used.span.text, used.text) == ("$steps", "as `lots`")
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    text = AGENTS
+    for old, new in (
+        ("[100, 200]", "[100, lots]"),
+        ("destroying]", "destorying]"),
+        ("lines: 2", "lines: 999"),
+        ("on: trained", "on: trianed"),
+        ("preset: $size", "split: tran, gamma: 7, gammma: 7"),
+        ("expect: rises", "expect: grows"),
+    ):
+        text = text.replace(old, new)
+    found = refused(text)
+    assert {caret for _, caret in found} >= {
+        "lots",
+        "destorying",
+        "999",
+        "trianed",
+        "tran",
+        "7",
+        "gammma",
+        "grows",
+    }
+
+
+def test_mistakes_in_a_task_file_are_shown_there(tmp_path: Path) -> None:
+    (tmp_path / "dig.yaml").write_text(
+        "task: dig\nrules: core+sadn\nsize: [8, 8]\nfill: empty\n", encoding="utf-8"
+    )
+    text = AGENTS.replace("[sand-pushing, destroying]", "[dig.yaml]")
+    with pytest.raises(CompileError) as caught:
+        read(text, str(tmp_path / "study.yaml"))
+    places = {Path(one.primary.span.source.name).name for one in caught.value.diagnostics if one.primary.span}
+    assert "dig.yaml" in places
+
+
+def test_files_elsewhere_are_not_even_read(tmp_path: Path) -> None:
+    (tmp_path / "dig.yaml").write_text("secret: words\n", encoding="utf-8")
+    inner = tmp_path / "studies"
+    inner.mkdir()
+    text = AGENTS.replace("[sand-pushing, destroying]", "[sand-pushing]").replace(
+        "on: $task", "on: ../dig.yaml"
+    )
+    with pytest.raises(CompileError) as caught:
+        read(text.replace("  task: [sand-pushing]\n", ""), str(inner / "study.yaml"))
+    assert [one.code for one in caught.value.diagnostics] == ["PD112"]
+    assert "secret" not in str(caught.value)
+
+
+def numbers(tree: Any, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The keys of all numbers in what JSON gave back."""
+    if isinstance(tree, Mapping):
+        for key, value in tree.items():
+            yield from numbers(value, (*keys, key))
+    elif isinstance(tree, int | float) and not isinstance(tree, bool):
+        yield keys
+
+
+def any_name(keys: tuple[str, ...]) -> tuple[str, ...]:
+    """Keys with those that are drawn replaced."""
+    return (keys[0], LEADS_TO, *keys[2:]) if keys[0] in ("tests", "elements") else keys
+
+
+@pytest.mark.slow
+def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    few = (
+        "--preset",
+        "small",
+        "--envs",
+        4,
+        "--rollout",
+        3,
+        "--batch",
+        12,
+        "--backend",
+        "dense",
+        "--steps",
+        12,
+    )
+    assert powderdsl("train", "sand-pushing", "--run", "agent", *few).exit_code == 0
+    assert powderdsl("evaluate", "agent", "--episodes", 2).exit_code == 0
+    found = json.loads(Path("agent/evaluation.json").read_text())
+    splits = list(found["splits"])
+    real = set(numbers(found))
+    known = set(numbers(values_of_agent(splits, ("trained", "random", "nothing"))))
+    assert {keys for keys in known if keys[-1] != "success"} <= real <= known
+
+    quick = ("--width", 4, "--batch", 4, "--buffer", 8, "--refresh", 2, "--states", 8, "--iterations", 1)
+    trained = powderdsl("wm", "train", "--run", "model", *quick, "--backend", "dense")
+    assert trained.exit_code == 0, trained.output
+    tested = powderdsl("wm", "eval", "model", "--split", "held_out", "--worlds", 1, "--backend", "dense")
+    assert tested.exit_code == 0, tested.output
+    real = {any_name(keys) for keys in numbers(json.loads(Path("model/evaluation.json").read_text()))}
+    assert real == set(numbers(values_of_world_model()))
+
+
+def test_a_dry_run_prints_what_a_shell_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = AGENTS.replace("episodes: 4", "episodes: 4, deterministic: yes").replace(
+        'splits: "test,train"', 'splits: "test, train"'
+    )
+    Path("my study.yaml").write_text(text, encoding="utf-8")
+    result = powderdsl("study", "my study.yaml", "--dry-run", "--seeds", 1, "--out", "it's here")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert len(lines) == 2 * 2 * 2
+    words = shlex.split(lines[1])
+    assert words[:2] == ["powderdsl", "evaluate"]
+    assert words[2].startswith("it's here/runs/")
+    assert words[3:] == [
+        "--episodes",
+        "4",
+        "--deterministic",
+        "--splits",
+        "test, train",
+        "--policies",
+        "trained,random",
+    ]
+
+
+def test_nothing_is_written_for_a_study_that_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("study.yaml").write_text(AGENTS.replace("splits/test", "splits/tset"), encoding="utf-8")
+    result = powderdsl("study", "study.yaml")
+    assert result.exit_code == 2
+    assert "study.yaml:13:" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["study.yaml"]
