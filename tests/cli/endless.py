@@ -31,6 +31,7 @@ seeds: 2
 vary: {batch: [12]}
 steps:
   trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: dense, steps: 900000000, seed: $seed, checkpoint-every: 0}
+  tested: {command: evaluate, on: trained}
 measures:
   reward: {of: trained, value: splits/test/trained/mean}
 """
