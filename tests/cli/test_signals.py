@@ -31,7 +31,8 @@ def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
         running.send_signal(signal.SIGTERM)
         running.wait(timeout=120)
         assert running.returncode == 143, place.said()
-        assert place.survivors() == []
+        # Guards of compilers, and what Python itself starts, end when a pipe closes.
+        assert waited(lambda: not place.survivors(), 5)
     assert place.said().endswith("terminated by SIGTERM\n")
     assert "Traceback" not in place.said()
     assert place.scratch() == []
