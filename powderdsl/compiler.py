@@ -19,6 +19,7 @@ from powderdsl.model.check import check
 from powderdsl.model.compose import compose
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.layout import own_slots
+from powderdsl.model.outgrown import with_outgrown
 from powderdsl.model.packs import read_file
 from powderdsl.model.palette import Palette
 from powderdsl.model.types import Param, Ruleset, Value
@@ -105,7 +106,8 @@ def load_with_diagnostics(
     if params:
         model = set_params(model, params, reporter)
     reporter.raise_if_errors()
-    return model, tuple(d for d in reporter.diagnostics if d.severity is not Severity.ERROR)
+    remarks = tuple(d for d in reporter.diagnostics if d.severity is not Severity.ERROR)
+    return model, with_outgrown(model, remarks)
 
 
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
@@ -175,12 +177,18 @@ def split_names(name: str | Path) -> tuple[list[str], list[str]]:
     parts = text.split("+")
     while parts:
         spans = range(min(len(parts), MAX_PLUSES + 1), 0, -1)
-        count = next((n for n in spans if _is_there(_without("+".join(parts[:n]))[0])), 1)
+        count = next((n for n in spans if _names_a_file("+".join(parts[:n]))), 1)
         head, rest = _without("+".join(parts[:count]))
         parts = parts[count:]
         plus.append(head)
         minus.extend(rest)
     return plus, minus
+
+
+def _names_a_file(part: str) -> bool:
+    """Whether a word is a path of a file, perhaps with packs left out; names of packs have no ``+``."""
+    head, rest = _without(part)
+    return _is_there(head) and not any("+" in word for word in rest)
 
 
 def _without(part: str) -> tuple[str, list[str]]:

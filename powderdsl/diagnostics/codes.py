@@ -84,7 +84,7 @@ _ROWS = (
     ("PD512", "invariant-broken", _ERROR),
     ("PD513", "condition-decides-nothing", _WARNING),
     ("PD514", "rule-overruled", _WARNING),
-    ("PD515", "invariant-outgrown", _NOTE),
+    ("PD515", "scope-outgrown", _NOTE),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),

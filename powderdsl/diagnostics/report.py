@@ -54,9 +54,12 @@ class Reporter:
         """
         if span is not None and span.end <= span.start:
             span = Span(span.source, span.start, span.start + 1)  # something to underline
-        diagnostic = Diagnostic(
-            code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps)
-        )
+        self.add(Diagnostic(code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps)))
+
+    error = report
+
+    def add(self, diagnostic: Diagnostic) -> None:
+        """Add what another reporter has found. Raises CompileError as `report` does."""
         if diagnostic in self._found:
             return
         if diagnostic.severity is Severity.ERROR:
@@ -66,8 +69,6 @@ class Reporter:
         self._found[diagnostic] = None
         if self._errors >= MAX_ERRORS:
             self.raise_if_errors()
-
-    error = report
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
-from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.compose import Composition, compose
 from powderdsl.model.constants import constant_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
@@ -88,7 +89,7 @@ def check(
     symbols, composition = typer.symbols, typer.symbols.composition
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
-    invariants = check_invariants(composition, typer)
+    invariants = check_invariants(composition, typer, partial(_typer_of, packs))
     typer.unknown.report()
     reporter.raise_if_errors()
 
@@ -126,6 +127,14 @@ def check(
     )
     report_undrawn(found, given, facts, reporter)
     return found
+
+
+def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None:
+    """What checks expressions where only some of these packs are loaded."""
+    try:
+        return resolve_names([pack for pack in packs if pack.name.text in names], None, Reporter())[0]
+    except CompileError:
+        return None
 
 
 def _facts(symbols: Symbols) -> Facts:

@@ -74,9 +74,13 @@ class Composition:
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
         """The glyphs of elements, by global name, as they are where only some packs are loaded."""
-        named = {id(one.decl): one for one in self.element_decls.values() if one.pack in packs}
-        ordered = [named[id(decl)] for pack in self.packs for decl in pack.elements if id(decl) in named]
-        return _glyphs(ordered)
+        found: dict[str, Named[ElementDecl]] = {}
+        for pack in self.packs:
+            for decl in pack.elements if pack.name.text in packs else ():
+                name = self.names.of(pack.name.text, decl.name.text)
+                if name in self.elements:  # what overrides it elsewhere has no say here
+                    found[name] = Named(pack.name.text, decl, name)
+        return _glyphs(list(found.values()))
 
     def element(self, word: str, pack: str) -> str | None:
         """The global name of the element that a pack means by a plain or qualified name."""
@@ -117,7 +121,7 @@ def compose(
         ]
     )
     # The packs of the ruleset that says so must fit its slots; packs loaded on top of them add slots.
-    own = placing.members if placing and wanted else ()
+    own = ruleset.placed if ruleset and wanted else ()
     top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
     if top and placing and palette is None and top.id >= wanted:
         reporter.error(
@@ -276,7 +280,7 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     A ruleset's own packs come first, those that are left out among them, for their places stay reserved. Then comes
     each further pack by itself, after those that it needs: the order in which packs are named decides little.
     """
-    own = ruleset.placing.members if ruleset else ()
+    own = ruleset.placed if ruleset else ()
     left_out = ruleset.left_out if ruleset else ()
     first = [pack for pack in (*packs, *left_out) if pack.name.text in own]
     first.sort(key=lambda pack: own.index(pack.name.text))

@@ -173,6 +173,13 @@ class RulesetDecl:
         return self if self.slots or self.matrix or self.base is None else self.base.placing
 
     @property
+    def placed(self) -> tuple[str, ...]:
+        """The packs of that ruleset; not those in whose place others of the same name are listed."""
+        sources = {one.source.name for one in self.placing.lineage}
+        listers = {name: self.lister(name) for name in self.placing.members}
+        return tuple(name for name, one in listers.items() if one is None or one.source.name in sources)
+
+    @property
     def renames(self) -> tuple[tuple[Scalar, Scalar], ...]:
         """Its own and those that it inherits; the last one for a name counts."""
         return tuple(pair for one in self.lineage for pair in one.rename)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from powderdsl.diagnostics import Span, suggest
+from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.claim_scopes import words_of
 from powderdsl.model.compose import Composition
 from powderdsl.model.declarations import RulesetDecl
@@ -23,6 +23,7 @@ from powderdsl.model.operands import (
     member,
 )
 from powderdsl.model.scope import Scope
+from powderdsl.model.text import one_line
 from powderdsl.model.types import (
     Bounded,
     Claim,
@@ -45,34 +46,65 @@ MAX_RADIUS = 1000
 TRENDS = {"rises": "never rises", "falls": "never falls", "changes": "constant"}
 
 
-def check_invariants(composition: Composition, typer: Typer) -> tuple[Invariant, ...]:
-    """The invariants of all packs and of the ruleset. Those that need a pack which is not loaded are left out."""
+def check_invariants(
+    composition: Composition, typer: Typer, typer_of: Callable[[tuple[str, ...]], Typer | None]
+) -> tuple[Invariant, ...]:
+    """The invariants of all packs and of the ruleset. Those that need a pack which is not loaded are left out.
+
+    Args:
+        typer_of: what checks expressions against the names of some packs alone; None if they make no ruleset.
+    """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(pack.name.text, line, None) for pack in composition.packs for line in pack.invariants]
     for ruleset in composition.ruleset.lineage if composition.ruleset else ():
         written += [(ruleset.name.text, line, ruleset) for line in ruleset.invariants]
     found = []
+    reporter = typer.reporter
     for pack, line, author in written:
-        typer.absent.clear()
-        typer.start_rule(line.span)
-        where = Scope(pack, {})
+        words, scopes = words_of(line), composition.scopes
+        scope = scopes.of_ruleset(author, words) if author else scopes.of_pack(pack, words)
+        typer.reporter = Reporter()
         try:
-            without = _without(typer, line.children[1], where) if line.kind == "without" else frozenset()
-            typer.absent.clear()
-            said = line.children[0] if line.kind == "without" else line
-            claim = _CLAIMS[said.kind](typer, said, where)
+            claim, without = _claim(typer, line, pack)
+            found.append(Invariant(claim, without, pack, line.span, scope))
         except Poisoned:
-            continue
+            pass
         except Asleep as asleep:
             typer.reporter.report(
                 "PD506", f"this invariant is asleep: `{asleep.name}` is not loaded", line.span, "left out",
                 helps=[f"it wakes up with a pack that defines `{asleep.name}`"],
             )  # fmt: skip
-            continue
-        words, scopes = words_of(line), composition.scopes
-        scope = scopes.of_ruleset(author, words) if author else scopes.of_pack(pack, words)
-        found.append(Invariant(claim, without, pack, line.span, scope))
+        added = [one.name.text for one in composition.packs if one.name.text not in scope]
+        for remark in typer.reporter.diagnostics:
+            if remark.code == "PD511" and added and _can_hold(typer_of(scope), line, pack):
+                names = ", ".join(f"`{name}`" for name in added)
+                words_there = f"with {names}, `{one_line(line.span)}` can no longer hold"
+                reporter.report("PD515", words_there, remark.primary.span, remark.primary.text)
+            else:
+                reporter.add(remark)
+    typer.reporter = reporter
     return tuple(found)
+
+
+def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]]:
+    """What a line says, and the elements without which worlds start. Raises Poisoned after reporting, or Asleep."""
+    typer.absent.clear()
+    typer.start_rule(line.span)
+    where = Scope(pack, {})
+    without = _without(typer, line.children[1], where) if line.kind == "without" else frozenset()
+    typer.absent.clear()
+    said = line.children[0] if line.kind == "without" else line
+    return _CLAIMS[said.kind](typer, said, where), without
+
+
+def _can_hold(typer: Typer | None, line: Syntax, pack: str) -> bool:
+    """Whether nothing is wrong with an invariant where only the packs of its scope are loaded."""
+    try:
+        return typer is not None and bool(_claim(typer, line, pack))
+    except Poisoned:
+        return False
+    except Asleep:
+        return True
 
 
 def _without(typer: Typer, what: Syntax, scope: Scope) -> frozenset[int]:

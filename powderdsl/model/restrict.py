@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from powderdsl.diagnostics import CompileError, Reporter, Span
+from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Span
 from powderdsl.model.check import check
 from powderdsl.model.declarations import RulesetDecl
 from powderdsl.model.types import Ruleset
@@ -41,17 +41,28 @@ class Difference:
 
 def restricted(ruleset: Ruleset, packs: Iterable[str]) -> Ruleset | None:
     """The model of some of a ruleset's packs, with its parameters; None if they make no ruleset of their own."""
+    found = _checked(ruleset, packs, Reporter())
+    if found is None:
+        return None
+    there = {param.name for param in found.params}
+    return found.with_params({p.name: p.default for p in ruleset.params if p.name in there})
+
+
+def remarks_alone(ruleset: Ruleset, packs: Iterable[str]) -> tuple[Diagnostic, ...] | None:
+    """What checking some packs alone remarks; None if they make no ruleset of their own."""
+    reporter = Reporter()
+    return None if _checked(ruleset, packs, reporter) is None else reporter.diagnostics
+
+
+def _checked(ruleset: Ruleset, packs: Iterable[str], reporter: Reporter) -> Ruleset | None:
     if ruleset.declared is None:
         return None
     wanted = set(packs)
     kept = [pack for pack in ruleset.declared.packs if pack.name.text in wanted]
-    reporter = Reporter()
     try:
-        found = check(kept, _bare(ruleset.declared.ruleset, set(ruleset.packs) - wanted), reporter)
+        return check(kept, _bare(ruleset.declared.ruleset, set(ruleset.packs) - wanted), reporter)
     except CompileError:
         return None
-    there = {param.name for param in found.params}
-    return found.with_params({p.name: p.default for p in ruleset.params if p.name in there})
 
 
 def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
