@@ -253,6 +253,7 @@ _OPS: dict[str, Any] = {
     "sub": lambda e, at, a, b: a - b,
     "mul": _multiply,
     "div": _divide,
+    "quotient": lambda e, at, a, b: np.where(b == 0, 0, a // np.where(b == 0, 1, b)),
     "neg": lambda e, at, a: -a,
     "abs": lambda e, at, a: np.abs(a),
     "min": lambda e, at, a, b: np.minimum(a, b),

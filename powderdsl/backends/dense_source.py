@@ -92,6 +92,8 @@ class _Writer:
                 return f"{self.constant(attr)}[{args[0]}.long()]"
             case "div":
                 return f"k.divide({args[0]}, {args[1]})"
+            case "quotient":
+                return f"k.quotient({args[0]}, {args[1]})"
             case "neg":
                 return f"-{args[0]}"
             case "abs":

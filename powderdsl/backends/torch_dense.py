@@ -151,6 +151,15 @@ class Kernels:
         return torch.where(b == 0, torch.zeros((), dtype=a.dtype, device=a.device), a / b)
 
     @staticmethod
+    def quotient(a: Any, b: Any) -> Tensor:
+        """Whole division, rounded down; 0 where b is 0. One of them may be a constant."""
+        if isinstance(b, int):
+            return torch.div(a, b, rounding_mode="floor")  # no rule divides by the constant 0
+        numerator = torch.full_like(b, a) if isinstance(a, int) else a
+        found = torch.div(numerator, torch.where(b == 0, torch.ones_like(b), b), rounding_mode="floor")
+        return torch.where(b == 0, torch.zeros_like(found), found)
+
+    @staticmethod
     def settle(x: Tensor, low: float, high: float) -> Tensor:
         """No NaN, within bounds, nothing smaller than SNAP."""
         zero = torch.zeros((), dtype=x.dtype, device=x.device)

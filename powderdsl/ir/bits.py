@@ -349,6 +349,8 @@ class _PassBits:
                 return gates.select(gates.lt(args[0], args[1]), args[1], args[0], lo, hi)
             case "mul":
                 return self._multiply(args[0], args[1], lo, hi)
+            case "quotient":
+                return self._quotient(node, args[0], args[1])
             case "mod":
                 return self._mod(node, args[0])
         raise NotBits(f"{node.op} of whole numbers")
@@ -367,6 +369,33 @@ class _PassBits:
                 result = gates.add(result, term, -bound, bound - 1)
         return gates.fit(result, lo, hi)
 
+    def _quotient(self, node: Node, value: Bits, divisor: Bits) -> Bits:
+        gates = self.gates
+        lo, hi = node.type.lo, node.type.hi
+        inner, by = node.args[0].type, node.args[1].type
+        if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
+            return gates.fit(
+                Bits(value.planes[by.lo.bit_length() - 1 :] or (gates.no,), value.signed), lo, hi
+            )
+        if by.lo == by.hi and by.lo and len(value.planes) <= MAX_TABLE_BITS // 2:
+            count, signed = width(lo, hi)
+            planes = (
+                self._function(value, inner.lo, inner.hi, lambda v, i=i: v // by.lo >> i & 1)
+                for i in range(count)
+            )
+            return Bits(tuple(planes), signed)
+        most = max(abs(by.lo), abs(by.hi))
+        if divisor.signed:  # a div -b = -a div b
+            negative = divisor.planes[-1]
+            reach = max(abs(inner.lo), abs(inner.hi))
+            minus = gates.sub(gates.constant(0), value, -inner.hi, -inner.lo)
+            value = gates.select(negative, minus, value, -reach, reach)
+            opposite = gates.sub(gates.constant(0), divisor, -by.hi, -by.lo)
+            divisor = gates.select(negative, opposite, divisor, 0, most)
+        quotient, _ = gates.divide(value, divisor, most)
+        none = gates.eq(divisor, gates.constant(0))
+        return gates.select(none, gates.constant(0), quotient, lo, hi)
+
     def _mod(self, node: Node, value: Bits) -> Bits:
         modulus = node.attr
         assert isinstance(modulus, int)
@@ -381,26 +410,13 @@ class _PassBits:
             )
         inner = node.args[0].type
         if len(value.planes) > MAX_TABLE_BITS // 2:
-            return self.gates.fit(self._remainder(value, modulus), 0, modulus - 1)
+            _, rest = self.gates.divide(value, self.gates.constant(modulus), modulus)
+            return self.gates.fit(rest, 0, modulus - 1)
         planes = tuple(
             self._function(value, inner.lo, inner.hi, lambda v, i=i: v % modulus >> i & 1)
             for i in range(count)
         )
         return Bits(planes, signed)
-
-    def _remainder(self, value: Bits, modulus: int) -> Bits:
-        """Long division: bit by bit from the highest, twice the remainder so far plus the bit, less the modulus if it fits."""
-        gates = self.gates
-        bits = list(reversed(value.planes))
-        rest = gates.constant(0)
-        if value.signed:  # the sign bit counts as minus one
-            rest = gates.select(bits.pop(0), gates.constant(modulus - 1), rest, 0, modulus - 1)
-        for bit in bits:
-            doubled = Bits((bit, *rest.planes))
-            smaller = gates.lt(doubled, gates.constant(modulus))
-            reduced = gates.sub(doubled, gates.constant(modulus), -modulus, modulus - 1)
-            rest = gates.select(smaller, doubled, reduced, 0, modulus - 1)
-        return rest
 
     def _to_real(self, argument: Node) -> Node:
         """A number from its planes: exact, since whole numbers stay below 2^24."""

@@ -88,6 +88,13 @@ class Builder:
         low = 0 if a.type.lo <= 0 <= a.type.hi else min(abs(a.type.lo), abs(a.type.hi))
         return self.make("abs", whole(low, max(abs(a.type.lo), abs(a.type.hi))), a)
 
+    def quotient(self, a: Node, b: Node) -> Node:
+        """Whole division, rounded down; 0 where b is 0."""
+        (al, ah), (bl, bh) = (a.type.lo, a.type.hi), (b.type.lo, b.type.hi)
+        divisors = [d for d in (bl, min(bh, -1), max(bl, 1), bh) if d and bl <= d <= bh]
+        corners = [x // d for x in (al, ah) for d in divisors] + [0] * (bl <= 0 <= bh)
+        return self.make("quotient", whole(min(corners), max(corners)), a, b)
+
     def mod(self, a: Node, modulus: int) -> Node:
         return self.make("mod", whole(0, modulus - 1), a, attr=modulus)
 

@@ -176,6 +176,25 @@ class Gates:
         pairs = zip(yes.planes, no.planes, strict=True)
         return Bits(tuple(self.mux(condition, a, b) for a, b in pairs), yes.signed)
 
+    def divide(self, a: Bits, b: Bits, most: int) -> tuple[Bits, Bits]:
+        """a / b rounded down, and the remainder, where 0 < b ≤ most; where b is 0 they mean nothing.
+
+        Long division from the highest bit: twice the remainder so far plus the bit, less b if it fits.
+        """
+        bits = list(reversed(a.planes))
+        rest, quotient = self.constant(0), []
+        if a.signed:  # the sign bit counts as minus one: minus one time b, and b - 1 left
+            quotient.append(bits[0])
+            less = self.sub(b, self.constant(1), -1, most - 1)
+            rest = self.select(bits.pop(0), less, rest, 0, most - 1)
+        for bit in bits:
+            doubled = Bits((bit, *rest.planes))
+            smaller = self.lt(doubled, b)
+            reduced = self.sub(doubled, b, -most, 2 * most - 1)
+            rest = self.select(smaller, doubled, reduced, 0, most - 1)
+            quotient.append(self.not_(smaller))
+        return Bits(tuple(reversed(quotient)), a.signed), rest
+
     def total(self, columns: list[list[Node]], count: int) -> tuple[Node, ...]:
         """The sum of bits given by weight (columns[i] have weight 2^i), as `count` planes: a carry-save tree."""
         planes = []

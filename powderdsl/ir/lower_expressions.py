@@ -397,6 +397,7 @@ _LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
     "min": _arithmetic,
     "max": _arithmetic,
     "div": _divide,
+    "quotient": lambda e, at: at.build.quotient(node(e.args[0], at), node(e.args[1], at)),
     "neg": lambda e, at: _each(at.build.neg, lower_expression(e.args[0], at)),
     "abs": lambda e, at: at.build.abs(node(e.args[0], at)),
     "mod": lambda e, at: at.build.mod(node(e.args[0], at), e.value),

@@ -111,6 +111,7 @@ OPS: dict[str, Op] = {
         Op("sub", ("=", "="), "="),
         Op("mul", ("=", "="), "="),
         Op("div", ("real", "real"), "real", about="x / 0 is 0"),
+        Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0"),
         Op("neg", ("?",), "="),
         Op("abs", ("?",), "="),
         Op("min", ("=", "="), "="),

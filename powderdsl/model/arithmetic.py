@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Value = Expr | Number
 
+MAX_MODULUS = 64
+
 _FLIP = {"<": ">", ">": "<", "<=": ">=", ">=": "<=", "==": "==", "!=": "!="}
 
 
@@ -251,12 +253,48 @@ def negate(typer: Typer, value: Value, span: Span) -> Operand:
     return Expr("neg", REAL, (typer.real(value, span),), span=span)
 
 
+def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
+    """`a div b`: whole numbers, rounded down; 0 where b is 0."""
+    left, right = (typer.value(typer.evaluate(child, scope), child.span) for child in syntax.children)
+    a, b = (
+        _whole_part(typer, value, child.span)
+        for value, child in zip((left, right), syntax.children, strict=True)
+    )
+    if b.op == "const" and b.value == 0:
+        raise typer.fail("PD402", "division by zero", syntax.children[1].span, "this is 0")
+    if a.op == b.op == "const":
+        return Number(Fraction(int(a.value) // int(b.value)))
+    return Expr("quotient", _quotient_bounds(a.kind, b.kind), (a, b), span=syntax.span)
+
+
+def _whole_part(typer: Typer, value: Value, span: Span) -> Expr:
+    """An operand of `div`."""
+    if isinstance(value, Expr) and value.kind.name == "real":
+        raise typer.wrong(
+            value, "a whole number", span, "`div` divides whole numbers; for real numbers say `/`"
+        )
+    return typer.whole(value, span)
+
+
+def _quotient_bounds(a: Kind, b: Kind) -> Kind:
+    """The range of a div b: for divisors of one sign, the extremes lie at the ends of both ranges."""
+    divisors = [d for d in (b.lo, min(b.hi, -1), max(b.lo, 1), b.hi) if d and b.lo <= d <= b.hi]
+    corners = [x // d for x in (a.lo, a.hi) for d in divisors]
+    if b.lo <= 0 <= b.hi:
+        corners.append(0)
+    return integer(min(corners), max(corners))
+
+
 def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     """`x mod n` for a whole constant n; coordinates (and their sums) may only appear here."""
     left, right = syntax.children
     divisor = typer.value(typer.evaluate(right, scope), right.span)
-    if not isinstance(divisor, Number) or divisor.value.denominator != 1 or not 1 <= divisor.value <= 64:
-        raise typer.fail("PD405", "`mod` takes a whole constant", right.span, "expected 1 to 64")
+    if (
+        not isinstance(divisor, Number)
+        or divisor.value.denominator != 1
+        or not 1 <= divisor.value <= MAX_MODULUS
+    ):
+        raise typer.fail("PD405", "`mod` takes a whole constant", right.span, f"expected 1 to {MAX_MODULUS}")
     modulus = int(divisor.value)
     value = _coordinate_sum(typer, left, modulus, scope)
     if isinstance(value, Number):
@@ -275,8 +313,32 @@ def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) ->
         result = binary(typer, syntax.kind, left, right, syntax)
         assert isinstance(result, (Expr, Number))
         return result
+    if syntax.kind == "quotient" and _names_coordinate(syntax.children[0]):
+        return _coordinate_quotient(typer, syntax, modulus, scope)
     value = typer.value(typer.evaluate(syntax, scope), syntax.span)
     return value if isinstance(value, Number) else typer.whole(value, syntax.span)
+
+
+def _names_coordinate(syntax: Syntax) -> bool:
+    """Whether a sum has a coordinate among its terms."""
+    if syntax.kind in ("add", "subtract"):
+        return any(_names_coordinate(child) for child in syntax.children)
+    return syntax.kind == "name" and syntax.text in COORDINATES
+
+
+def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Expr:
+    """`row div n` under `mod m`: what `row mod (n · m)` says, divided by n."""
+    left, right = syntax.children
+    divisor = typer.value(typer.evaluate(right, scope), right.span)
+    most = MAX_MODULUS // modulus
+    if not isinstance(divisor, Number) or divisor.value.denominator != 1 or not 1 <= divisor.value <= most:
+        label = f"expected 1 to {most}: times {modulus} it is at most {MAX_MODULUS}"
+        raise typer.fail("PD405", "a coordinate is divided by a whole constant", right.span, label)
+    number = int(divisor.value)
+    inner = typer.whole(_coordinate_sum(typer, left, modulus * number, scope), left.span)
+    known = Expr("mod", integer(0, modulus * number - 1), (inner,), modulus * number, left.span)
+    by = constant(Number(Fraction(number)), right.span)
+    return Expr("quotient", integer(0, modulus - 1), (known, by), span=syntax.span)
 
 
 def part(vector: Expr, name: str, span: Span) -> Expr:

@@ -452,6 +452,9 @@ class Typer(Coercer):
         value = self.value(self.evaluate(syntax.children[0], scope), syntax.children[0].span)
         return arithmetic.negate(self, value, syntax.span)
 
+    def quotient(self, syntax: Syntax, scope: Scope) -> Operand:
+        return arithmetic.quotient(self, syntax, scope)
+
     def mod(self, syntax: Syntax, scope: Scope) -> Operand:
         return arithmetic.modulo(self, syntax, scope)
 
@@ -494,6 +497,7 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "multiply": Typer.binary,
     "divide": Typer.binary,
     "negate": Typer.negate,
+    "quotient": Typer.quotient,
     "mod": Typer.mod,
 }
 """One handler for every kind of syntax node that can stand in an expression."""

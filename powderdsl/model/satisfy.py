@@ -381,6 +381,7 @@ _EVALUATE: dict[str, Callable] = {
     "add": lambda node, a, b: a + b,
     "sub": lambda node, a, b: a - b,
     "mul": lambda node, a, b: a * b,
+    "quotient": lambda node, a, b: a // b if b else 0,
     "neg": lambda node, a: -a,
     "abs": lambda node, a: abs(a),
     "min": lambda node, a, b: min(a, b),

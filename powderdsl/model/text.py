@@ -36,6 +36,7 @@ _INFIX: dict[str, tuple[str, int, int]] = {
     "sub": ("-", 5, 6),
     "mul": ("*", 6, 7),
     "div": ("/", 6, 7),
+    "quotient": ("div", 6, 7),
 }
 _COMPARISONS = ("eq", "lt", "le")
 _ATOM = 9

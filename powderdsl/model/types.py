@@ -97,6 +97,7 @@ OPS: dict[str, str] = {
     "sub": "",
     "mul": "",
     "div": "real division; x / 0 is 0",
+    "quotient": "whole division, rounded down; x div 0 is 0",
     "neg": "",
     "abs": "",
     "min": "",

@@ -32,7 +32,13 @@ COMPARISONS = {
 
 UPDATES = {":=": ("+=", "-="), "+=": ("-=", ":="), "-=": ("+=", ":=")}
 
-SIGNS = {"add": ("+", "-"), "subtract": ("-", "+"), "multiply": ("*", "/"), "divide": ("/", "*")}
+SIGNS = {
+    "add": ("+", "-"),
+    "subtract": ("-", "+"),
+    "multiply": ("*", "/"),
+    "divide": ("/", "*"),
+    "quotient": ("div", "*"),
+}
 
 CALLS = {"min": "max", "max": "min", "count": "", "sum": ""}
 
@@ -150,7 +156,7 @@ def _own(node: Syntax, parent: Syntax | None, names: Names) -> Iterator[Change]:
             )
         case "not_":
             yield _only("negation", node, children[0])
-        case "add" | "subtract" | "multiply" | "divide":
+        case "add" | "subtract" | "multiply" | "divide" | "quotient":
             yield _between(node, children[0], children[1], *SIGNS[node.kind], "arithmetic")
         case "negate":
             yield _only("constant", node, children[0])

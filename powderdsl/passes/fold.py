@@ -94,13 +94,24 @@ def _compare(node: Node, build: Builder) -> Node | None:
 
 def _whole_constants(node: Node, build: Builder) -> Node | None:
     """Whole-number arithmetic on constants, and neutral elements."""
-    if node.type.name != "int" or node.op not in ("add", "sub", "mul", "min", "max", "neg", "abs", "mod"):
+    if node.type.name != "int" or node.op not in (
+        "add",
+        "sub",
+        "mul",
+        "min",
+        "max",
+        "neg",
+        "abs",
+        "mod",
+        "quotient",
+    ):
         return None
     if all(arg.op == "const" for arg in node.args):
         values = [int(arg.attr) for arg in node.args]
         evaluate: dict[str, Callable[..., int]] = {
             "add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "min": min, "max": max,
             "neg": lambda a: -a, "abs": abs, "mod": lambda a: a % node.attr,
+            "quotient": lambda a, b: a // b if b else 0,
         }  # fmt: skip
         return build.whole(evaluate[node.op](*values))
     if node.op in ("add", "sub"):
@@ -109,6 +120,8 @@ def _whole_constants(node: Node, build: Builder) -> Node | None:
             return a
         if node.op == "add" and a.op == "const" and a.attr == 0:
             return b
+    if node.op == "quotient" and node.args[1].op == "const" and node.args[1].attr == 1:  # x div 1 = x
+        return node.args[0]
     if node.op == "mod":  # x mod n = x where 0 ≤ x < n
         (a,) = node.args
         if a.type.lo >= 0 and a.type.hi < node.attr:

@@ -74,7 +74,7 @@ _CHARACTERS = {
     "“": "names stand without quotes",
     ":": "assign with `:=`",
     ";": "one line is one rule: put the next one on a line of its own",
-    "%": "a percentage is a number and `%`, without a blank; the rest of a division is `mod`",
+    "%": "a percentage is a number and `%`, without a blank; the remainder of a division is `mod`",
     "^": "powers are written out: `x * x`",
     "#": "a comment needs a blank before its `#`",
 }
@@ -158,7 +158,7 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
     if token == "if" and "__ANON_0" in accepted:
         return "say what happens before the `if`: `SET -> ELEMENT if …`"
     if token == "/" and before.endswith("/"):
-        return "write one `/`"
+        return "whole division, rounded down, is `div`: `a div b`"
     if token == "->" and "->" in before:
         return "one line is one rule: put the next one on a line of its own"
     if token.endswith("%") and ("CHANCE" in accepted or before.rstrip().endswith("chance")):

@@ -35,7 +35,14 @@ FUNCTIONS = {**MEASURES, **MEMORIES, **ARITHMETIC}
 ACTION_WORDS = ("taken", "left", "painted", "placed", "blown")
 """Numbers of the action that was just taken, and of how many there were and will be."""
 
-_BINARY = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "mod": "mod"}
+_BINARY = {
+    "add": "add",
+    "subtract": "sub",
+    "multiply": "mul",
+    "divide": "div",
+    "quotient": "quotient",
+    "mod": "mod",
+}
 _COMPARE = {"<": "lt", "<=": "le", "==": "eq"}
 REGION_LET = "in "
 """How the names of regions begin among the values that cell conditions read."""

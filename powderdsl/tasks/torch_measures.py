@@ -226,6 +226,8 @@ def scalar_value(scalar: Scalar, facts: Facts) -> Tensor:
             return a * b
         case "div":
             return torch.where(b == 0, torch.zeros_like(a), a / b)
+        case "quotient":
+            return torch.where(b == 0, torch.zeros_like(a), torch.floor(a / b))
         case "mod":
             return torch.where(b == 0, torch.zeros_like(a), torch.remainder(a, b))
         case "neg":

@@ -53,7 +53,7 @@ OF_INVARIANTS = frozenset(
 ON_CELLS = ("passes", "on cells")
 """Noted for a ruleset with passes that planes cannot carry."""
 
-ON_NUMBERS = frozenset({"below", "in_set", "table", "count", "mod", "to_real"})
+ON_NUMBERS = frozenset({"below", "in_set", "table", "count", "mod", "quotient", "to_real"})
 """IR operations that take or make whole numbers only: none is left on bit planes."""
 
 KINDS = ("flag", "int", "element", "direction", "real", "vec2")

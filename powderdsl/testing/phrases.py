@@ -340,7 +340,7 @@ class Phrases:
         leaves = [(3, self._small), (6, self._whole_name), (2, self._whole_param), (2, self._loop_number)]
         trees = [
             (4, self._count), (2, self._sum), (3, self._add), (2, self._multiply), (1, self._negate), (1, self._abs),
-            (2, self._extreme), (2, self._modulo), (2, self._choose_whole), (1, self._clamp),
+            (2, self._extreme), (2, self._modulo), (2, self._quotient), (2, self._choose_whole), (1, self._clamp),
         ]  # fmt: skip
         return self._one(leaves + (trees if depth > 0 else []), depth)
 
@@ -434,6 +434,25 @@ class Phrases:
                     else f"({value.text} {choices.pick('+-')} {choices.pick([step, column])})"
                 )
         return Phrase(f"({inner} mod {modulus})", 0, modulus - 1)
+
+    def _quotient(self, depth: int) -> Phrase | None:
+        """A whole division, by constants of both signs or by what may be 0."""
+        choices = self.choices
+        if self.manner.borders and choices.maybe(15):
+            inner = choices.pick(["row", "(column + step)", "(row - 1)"])
+            return Phrase(f"({inner} div {choices.pick([1, 2, 3, 5])} mod {choices.pick([2, 3])})", 0, 2)
+        value = self.whole(depth - 1)
+        if value.fixed:
+            return None
+        if choices.maybe(60):
+            by = choices.pick([2, 3, -2, 8, 1, -1, 7, -5, 64, 100, -64])
+            ends = [value.lo // by, value.hi // by]
+            return Phrase(f"({value.text} div {by})", min(ends), max(ends))
+        divisor = self.whole(depth - 1)
+        if divisor.fixed:
+            return None
+        reach = max(abs(value.lo), abs(value.hi))
+        return Phrase(f"({value.text} div {divisor.text})", -reach, reach)
 
     def _choose_whole(self, depth: int) -> Phrase:
         a, b = self.whole(depth - 1), self.whole(depth - 1)

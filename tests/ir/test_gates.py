@@ -74,6 +74,18 @@ def test_arithmetic(first: tuple[int, int], second: tuple[int, int]) -> None:
         assert value_of(same, inputs) == (x == y)
 
 
+@pytest.mark.parametrize("first", RANGES)
+@pytest.mark.parametrize("most", [1, 2, 3, 5, 8])
+def test_division(first: tuple[int, int], most: int) -> None:
+    build = Builder()
+    gates = Gates(build)
+    a, b = variable("a", *first, build), variable("b", 0, most, build)
+    quotient, rest = gates.divide(a, b, most)
+    for x, y in product(range(first[0], first[1] + 1), range(1, most + 1)):
+        inputs = assignment("a", x, a) | assignment("b", y, b)
+        assert (number_of(quotient, inputs), number_of(rest, inputs)) == divmod(x, y)
+
+
 @pytest.mark.parametrize("bounds", RANGES)
 def test_truth_tables(bounds: tuple[int, int]) -> None:
     lo, hi = bounds
