@@ -22,11 +22,14 @@ from powderdsl.model.builtins import (
     DIRECTION_SETS,
     DIRECTIONS,
     FUNCTIONS,
+    KERNEL_SHAPES,
     KERNELS,
     KIND_WORDS,
     MAX_MAGNITUDE,
     MAX_OFFSET,
+    MAX_RADIUS,
     RESERVED,
+    shaped_kernel,
 )
 from powderdsl.model.compose import MAX_PASSES
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
@@ -111,6 +114,14 @@ def kernels() -> str:
     return table(("kernel", "rows"), [(f"`{name}`", drawn(kernel)) for name, kernel in KERNELS.items()])
 
 
+def kernel_shapes() -> str:
+    def sizes(shape: str) -> str:
+        return ", ".join(str(len(shaped_kernel(shape, radius).weights)) for radius in (1, 2, 3, 5))
+
+    rows = [(f"`{name}(R)`", shape.about, sizes(name)) for name, shape in KERNEL_SHAPES.items()]
+    return table(("kernel", "cells", "how many for R = 1, 2, 3, 5"), rows)
+
+
 def functions() -> str:
     return table(("function", "value"), [(f"`{f.signature}`", f.about) for f in FUNCTIONS.values()])
 
@@ -137,6 +148,8 @@ def limits() -> str:
         ("characters in a name", MAX_NAME),
         ("elements of a ruleset", 256),
         ("distance of a neighbour, in cells", MAX_OFFSET),
+        ("radius of a kernel, in cells", MAX_RADIUS),
+        ("rows of a kernel, and weights of a row", 2 * MAX_RADIUS + 1),
         ("size of a number", MAX_MAGNITUDE),
         ("modulus of `mod`", 64),
         ("rounds of `repeat`, or of one variable's range", 64),
@@ -218,6 +231,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "directions": directions,
     "direction sets": direction_sets,
     "kernels": kernels,
+    "kernel shapes": kernel_shapes,
     "functions": functions,
     "kinds": kinds,
     "words": words,

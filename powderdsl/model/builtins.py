@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 from powderdsl.model.types import Kernel, Offset
 
@@ -40,6 +42,53 @@ KERNELS: dict[str, Kernel] = {
     "plus": grid_kernel("plus", ((0, 1, 0), (1, 0, 1), (0, 1, 0))),
 }
 """Neighbourhoods for `count` and `sum`. Cells outside the grid count as nothing."""
+
+
+@dataclass(frozen=True)
+class KernelShape:
+    """A neighbourhood of any radius: which of the cells (rows, columns) away belong to it."""
+
+    name: str
+    about: str
+    covers: Callable[[int, int, int], bool]
+    """Of rows, columns, radius."""
+
+
+KERNEL_SHAPES: dict[str, KernelShape] = {
+    row.name: row
+    for row in (
+        KernelShape(
+            "box",
+            "all cells at most R rows and R columns away",
+            lambda dy, dx, r: max(abs(dy), abs(dx)) <= r,
+        ),
+        KernelShape(
+            "ring", "the border of that box: exactly R away", lambda dy, dx, r: max(abs(dy), abs(dx)) == r
+        ),
+        KernelShape(
+            "disc",
+            "the cells nearer than R + ½, as a circle",
+            lambda dy, dx, r: dy * dy + dx * dx <= r * r + r,
+        ),
+        KernelShape(
+            "diamond", "the cells at most R steps to the sides away", lambda dy, dx, r: abs(dy) + abs(dx) <= r
+        ),
+        KernelShape("cross", "row and column of the cell, R to each side", lambda dy, dx, r: 0 in (dy, dx)),
+        KernelShape("plus", "the same without the cell", lambda dy, dx, r: (dy == 0) != (dx == 0)),
+    )
+}
+"""Kernels that take a radius: `box(5)`. With radius 1 they are those of KERNELS; a disc is a box then, a diamond a cross."""
+
+MAX_RADIUS = 15
+"""The largest radius of a kernel: 31 rows of 31 weights."""
+
+
+@lru_cache(maxsize=256)
+def shaped_kernel(shape: str, radius: int, name: str = "", wrap: bool = False) -> Kernel:
+    """The kernel of a shape and radius. Its name is as it is written, `box(5)`, unless it has one of its own."""
+    covers, reach = KERNEL_SHAPES[shape].covers, range(-radius, radius + 1)
+    weights = tuple((dy, dx, 1) for dy in reach for dx in reach if covers(dy, dx, radius))
+    return Kernel(name or f"{shape}({radius})", weights, wrap)
 
 
 @dataclass(frozen=True)
@@ -100,6 +149,7 @@ RESERVED = (
     frozenset(DIRECTIONS)
     | frozenset(DIRECTION_SETS)
     | frozenset(KERNELS)
+    | frozenset(KERNEL_SHAPES)
     | frozenset(FUNCTIONS)
     | frozenset(COORDINATES)
 )

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from powderdsl.diagnostics import Span, suggest
 from powderdsl.model import arithmetic
-from powderdsl.model.builtins import KERNELS
+from powderdsl.model.builtins import FUNCTIONS, KERNEL_SHAPES, KERNELS, MAX_RADIUS, shaped_kernel
 from powderdsl.model.operands import Number, Operand, Place, disjunction
 from powderdsl.model.types import DIRECTION, FLAG, REAL, VEC2, Expr, Kernel, integer
 from powderdsl.syntax.ast import Syntax
@@ -20,14 +21,63 @@ def _split_kernel(typer: Typer, syntax: Syntax, scope: Scope) -> tuple[list[Synt
     """The arguments, and the kernel of a last argument `… in KERNEL`."""
     arguments = list(syntax.children)
     last = arguments[-1]
-    if last.kind == "in_" and last.children[1].kind == "name":
-        found = typer.find(last.children[1].text, last.children[1].span, scope)
-        if isinstance(found, Kernel):
+    if last.kind == "in_":
+        found = _kernel(typer, last.children[1], scope)
+        if found is not None:
             arguments[-1] = last.children[0]
             return arguments, found
     default = typer.turn(KERNELS["box"], scope)
     assert isinstance(default, Kernel)
     return arguments, default
+
+
+def _kernel(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel | None:
+    """The kernel that stands after `in`, if it is one."""
+    if syntax.kind == "name" and (syntax.text not in KERNEL_SHAPES or syntax.text in KERNELS):
+        found = typer.find(syntax.text, syntax.span, scope)
+    elif syntax.kind in ("name", "call") and syntax.text in KERNEL_SHAPES:
+        found = typer.evaluate(syntax, scope)
+    else:
+        return None
+    return found if isinstance(found, Kernel) else None
+
+
+def read_radius(typer: Typer, syntax: Syntax, scope: Scope) -> int:
+    """The radius of a kernel: a whole constant."""
+    value = typer.evaluate(syntax, scope)
+    if not isinstance(value, Number) or value.value.denominator != 1:
+        raise typer.fail("PD405", "a radius is a whole constant", syntax.span, f"expected 1 to {MAX_RADIUS}")
+    radius = int(value.value)
+    if not 1 <= radius <= MAX_RADIUS:
+        label = f"a radius lies in 1..{MAX_RADIUS}"
+        raise typer.fail("PD402", f"a kernel of radius {radius}", syntax.span, label)
+    return radius
+
+
+def _shaped(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
+    return shaped_kernel(syntax.text, read_radius(typer, syntax.children[0], scope))
+
+
+def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
+    """The value of a function, or a kernel of a radius."""
+    name = syntax.text
+    name_span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(name))
+    function = FUNCTIONS.get(name)
+    if function is None and name not in KERNEL_SHAPES:
+        helps = suggest(name, [*FUNCTIONS, *KERNEL_SHAPES], "functions")
+        raise typer.fail("PD301", f"unknown function `{name}`", name_span, "not a function", helps)
+    (lo, hi), usage = (function.arity, function.signature) if function else ((1, 1), f"{name}(RADIUS)")
+    count = len(syntax.children)
+    if not lo <= count <= hi:
+        wanted = "1 value" if lo == hi == 1 else f"{lo} values" if lo == hi else f"{lo} to {hi} values"
+        raise typer.fail(
+            "PD406",
+            f"`{name}` takes {wanted}, found {count}",
+            syntax.span,
+            "too few" if count < lo else "too many",
+            helps=(f"write `{usage}`",),
+        )
+    return CALLS[name](typer, syntax, scope) if function else _shaped(typer, syntax, scope)
 
 
 def _count(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:

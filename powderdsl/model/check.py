@@ -38,6 +38,7 @@ from powderdsl.model.types import (
     FLAG,
     Declared,
     Element,
+    Kernel,
     Kind,
     Param,
     Property,
@@ -66,6 +67,7 @@ def resolve_names(
     typer = Typer(symbols, reporter)
     typer.set_definitions = {name: (named.pack, named.decl[1]) for name, named in composition.sets.items()}
     check_param_names(symbols, reporter)
+    _shaped_kernels(symbols, typer)
     _params(symbols, typer)
     _properties(symbols, typer)
     _fields(symbols, typer)
@@ -142,6 +144,22 @@ def _facts(symbols: Symbols) -> Facts:
     defaults: dict[str, object] = {name: symbols.fields[name].default for name in limited}
     names = {element.id: name for name, element in symbols.composition.elements.items()}
     return Facts(symbols.ids, symbols.properties, limited, defaults, names)
+
+
+def _shaped_kernels(symbols: Symbols, typer: Typer) -> None:
+    """Kernels that are declared by a shape and its radius."""
+    for name, named in symbols.composition.kernels.items():
+        shape = named.decl.shape
+        if shape is None:
+            continue
+        try:
+            found = typer.evaluate(shape, Scope(named.pack, {}))
+            if not isinstance(found, Kernel):
+                cure = "such as `box(5)`, or rows of weights"
+                raise typer.wrong(found, "a shape with its radius", shape.span, cure)
+            symbols.constants[name] = replace(found, name=name, wrap=named.decl.wrap)
+        except (Poisoned, Asleep):
+            symbols.constants.setdefault(name, Broken())
 
 
 def _params(symbols: Symbols, typer: Typer) -> None:

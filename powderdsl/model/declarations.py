@@ -48,6 +48,8 @@ class KernelDecl:
     name: Scalar
     rows: tuple[tuple[int, ...], ...]
     wrap: bool
+    shape: Syntax | None = None
+    """`box(5)`, instead of rows."""
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from fractions import Fraction
 from itertools import product
 from math import prod
 
-from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model import arithmetic
-from powderdsl.model.builtins import COORDINATES, FUNCTIONS
-from powderdsl.model.calls import CALLS
+from powderdsl.model.builtins import COORDINATES, FUNCTIONS, KERNEL_SHAPES, KERNELS
+from powderdsl.model.calls import call
 from powderdsl.model.literals import read_bounds, read_number
 from powderdsl.model.membership import holds
 from powderdsl.model.needless import report_repeated
@@ -194,6 +194,9 @@ class Typer(Coercer):
                 "endless by itself",
                 (f"write `{syntax.text} mod 2`",),
             )
+        if syntax.text in KERNEL_SHAPES and syntax.text not in KERNELS:
+            label, cure = "its radius is missing", (f"write `{syntax.text}(3)`",)
+            raise self.fail("PD406", f"`{syntax.text}` needs a radius", syntax.span, label, cure)
         if syntax.text in FUNCTIONS:
             raise self.fail(
                 "PD406",
@@ -422,28 +425,6 @@ class Typer(Coercer):
             operand, "a range, a set or a list", syntax.span, "such as `0..4`, a tag, or `(left, right)`"
         )
 
-    def call(self, syntax: Syntax, scope: Scope) -> Operand:
-        function = FUNCTIONS.get(syntax.text)
-        name_span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(syntax.text))
-        if function is None:
-            raise self.fail(
-                "PD301",
-                f"unknown function `{syntax.text}`",
-                name_span,
-                "not a function",
-                suggest(syntax.text, FUNCTIONS, "functions"),
-            )
-        lo, hi = function.arity
-        if not lo <= len(syntax.children) <= hi:
-            raise self.fail(
-                "PD406",
-                f"`{syntax.text}` takes {'1 value' if lo == hi == 1 else f'{lo} values' if lo == hi else f'{lo} to {hi} values'}, found {len(syntax.children)}",
-                syntax.span,
-                "too few" if len(syntax.children) < lo else "too many",
-                helps=(f"write `{function.signature}`",),
-            )
-        return CALLS[syntax.text](self, syntax, scope)
-
     def binary(self, syntax: Syntax, scope: Scope) -> Operand:
         left, right = (self.value(self.evaluate(child, scope), child.span) for child in syntax.children)
         return arithmetic.binary(self, syntax.kind, left, right, syntax)
@@ -451,12 +432,6 @@ class Typer(Coercer):
     def negate(self, syntax: Syntax, scope: Scope) -> Operand:
         value = self.value(self.evaluate(syntax.children[0], scope), syntax.children[0].span)
         return arithmetic.negate(self, value, syntax.span)
-
-    def quotient(self, syntax: Syntax, scope: Scope) -> Operand:
-        return arithmetic.quotient(self, syntax, scope)
-
-    def mod(self, syntax: Syntax, scope: Scope) -> Operand:
-        return arithmetic.modulo(self, syntax, scope)
 
     def chance_draw(self, stream: str, syntax: Syntax, scope: Scope) -> Expr:
         """`with chance P`: a draw of the rule's own stream below P."""
@@ -491,13 +466,13 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "choose": Typer.choose,
     "any_of": Typer.quantifier,
     "all_of": Typer.quantifier,
-    "call": Typer.call,
+    "call": call,
     "add": Typer.binary,
     "subtract": Typer.binary,
     "multiply": Typer.binary,
     "divide": Typer.binary,
     "negate": Typer.negate,
-    "quotient": Typer.quotient,
-    "mod": Typer.mod,
+    "quotient": arithmetic.quotient,
+    "mod": arithmetic.modulo,
 }
 """One handler for every kind of syntax node that can stand in an expression."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span
+from powderdsl.model.builtins import MAX_RADIUS
 from powderdsl.model.declarations import (
     AlsoDecl,
     Block,
@@ -239,42 +240,73 @@ class _PackReader(Reader):
         return tuple(StreamDecl(word, 16) for word in self.words(node) if self.name(word, "a stream"))
 
     def kernel(self, key: Scalar, node: Node) -> KernelDecl | None:
-        if isinstance(node, Sequence):
-            rows_node: Node | None = node
-            wrap = False
-        else:
+        """Rows of weights, a shape with its radius, or a mapping with one of them and `edges`."""
+        if isinstance(node, Scalar) and not node.text[:1].isdigit():
+            shape = self.line(node)
+            return KernelDecl(key, (), False, shape) if shape else None
+        if isinstance(node, Mapping):
             entries = self.mapping(node, "kernel", f"the kernel `{key.text}`")
-            rows_node = entries.get("rows", (None, None))[1]
             wrap = self.choice(entries, "edges", ("nothing", "wrap")) == "wrap"
+            if "shape" in entries and "rows" not in entries:
+                shape = self.entry_line(entries, "shape")
+                return KernelDecl(key, (), wrap, shape) if shape else None
+            if len({"shape", "rows"} & entries.keys()) != 1:
+                both = "rows" in entries
+                self.reporter.error(
+                    "PD109", f"the kernel `{key.text}` has {'rows and a shape' if both else 'no rows'}",
+                    entries["shape"][0].span if both else key.span, "one of them" if both else "`rows` is missing",
+                    helps=["`rows`: rows of whole weights; or `shape`: a shape and its radius, such as `disc(3)`"],
+                )  # fmt: skip
+                return None
+            rows = self.kernel_rows(key, entries["rows"][1])
+        else:
+            wrap, rows = False, self.kernel_rows(key, node)
+        return KernelDecl(key, rows, wrap) if rows else None
+
+    def kernel_rows(self, key: Scalar, node: Node) -> tuple[tuple[int, ...], ...] | None:
+        """Rows of weights with a cell in the middle; reports what they lack."""
+        most = 2 * MAX_RADIUS + 1
         rows = []
-        for word in self.words(rows_node):
+        for word in self.words(node):
             parts = word.text.split()
-            if not all(re.fullmatch(r"-?[0-9]{1,3}", part) for part in parts):
+            if not parts or not all(re.fullmatch(r"-?[0-9]{1,3}", part) for part in parts):
                 self.reporter.error(
                     "PD110",
                     "a kernel row that is not whole numbers",
                     word.span,
                     "not a row of weights",
-                    helps=['write "1 0 1"'],
+                    helps=['write "1 0 1", numbers up to 999 with blanks between them'],
                 )
                 return None
-            rows.append(tuple(int(part) for part in parts))
-        if (
-            not rows
-            or len(rows) % 2 == 0
-            or len({len(row) for row in rows}) != 1
-            or len(rows[0]) % 2 == 0
-            or max(len(rows), len(rows[0])) > 31
-        ):
-            self.reporter.error(
-                "PD110",
-                f"kernel `{key.text}` has no middle",
-                key.span,
-                f"{len(rows)} row{'s' * (len(rows) != 1)} of {', '.join(sorted({str(len(row)) for row in rows})) or 'no'} weights",
-                helps=["write an odd number of rows, each with the same odd number of weights, at most 31"],
-            )
+            rows.append((tuple(int(part) for part in parts), word.span))
+        if not rows:
+            self.shape(node, "rows of weights", 'write ["1 1 1", "1 0 1", "1 1 1"]')
             return None
-        return KernelDecl(key, tuple(rows), wrap)
+        width = len(rows[0][0])
+        for row, span in rows:
+            if len(row) > most:
+                label = f"{len(row)} weights: a kernel reaches {MAX_RADIUS} cells to each side"
+                self.reporter.error(
+                    "PD110", "a kernel that is too wide", span, label, helps=[f"write at most {most}"]
+                )
+                return None
+            if len(row) % 2 == 0:
+                helps = ["write an odd number of weights, the cell's own in the middle"]
+                self.reporter.error(
+                    "PD110", f"kernel `{key.text}` has no middle", span, f"{len(row)} weights are an even number", helps=helps
+                )  # fmt: skip
+                return None
+            if len(row) != width:
+                label = f"{len(row)} weights, the first row has {width}"
+                self.reporter.error("PD110", "the rows of a kernel are equally long", span, label)
+                return None
+        if len(rows) > most or len(rows) % 2 == 0:
+            fault = "has no middle" if len(rows) <= most else "is too high"
+            label = f"{len(rows)} rows" + (" are an even number" if len(rows) % 2 == 0 else "")
+            helps = [f"write an odd number of rows, at most {most}, the cell's own in the middle"]
+            self.reporter.error("PD110", f"kernel `{key.text}` {fault}", key.span, label, helps=helps)
+            return None
+        return tuple(row for row, _ in rows)
 
     def element(self, key: Scalar, node: Node) -> ElementDecl:
         entries = self.mapping(node, "element", f"the element `{key.text}`")

@@ -86,7 +86,8 @@ KEYS: dict[str, dict[str, Key]] = {
         "about": Key("text", "what it does, in a sentence"),
     },
     "kernel": {
-        "rows": Key("words", "rows of whole weights, an odd number of each", True),
+        "rows": Key("words", "rows of whole weights, an odd number of each, at most 31"),
+        "shape": Key("line", "instead of rows: a shape and its radius, `disc(3)`"),
         "edges": Key("word", "`nothing` (the default) or `wrap`: what lies outside the grid"),
     },
     "element": {

@@ -98,7 +98,9 @@ def base_symbols(composition: Composition) -> Symbols:
     constants |= {name: Items(tuple(Place(o) for o in offsets)) for name, offsets in DIRECTION_SETS.items()}
     constants |= KERNELS
     constants |= {
-        name: grid_kernel(name, k.decl.rows, k.decl.wrap) for name, k in composition.kernels.items()
+        name: grid_kernel(name, k.decl.rows, k.decl.wrap)
+        for name, k in composition.kernels.items()
+        if k.decl.shape is None
     }
     constants |= {name: SetOf((element.id,), name) for name, element in composition.elements.items()}
     constants |= {name: SetOf(tuple(sorted(ids))) for name, ids in composition.tags.items()}

@@ -157,6 +157,9 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
         return "write the missing `)`"
     if token == "if" and "__ANON_0" in accepted:
         return "say what happens before the `if`: `SET -> ELEMENT if …`"
+    shape = re.search(r"\b(box|ring|disc|diamond|cross|plus)\s*\Z", before)
+    if shape and token.isdigit():
+        return f"write `{shape[1]}({token})`"
     if token == "/" and before.endswith("/"):
         return "whole division, rounded down, is `div`: `a div b`"
     if token == "->" and "->" in before:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from powderdsl.model.types import Kind
-from powderdsl.testing import real_phrases
+from powderdsl.testing import real_phrases, whole_phrases
 from powderdsl.testing.choices import Choices
 from powderdsl.testing.phrase import LIMIT, NUMBER, ONE, PLACE, PLACES, SIDE, SIDES, Phrase
 from powderdsl.testing.vocabulary import CHANCES, Manner, Words
@@ -417,42 +417,10 @@ class Phrases:
         return Phrase(f"clamp({value.text}, -2, 3)", -2, 3, value.fixed)
 
     def _modulo(self, depth: int) -> Phrase:
-        choices = self.choices
-        modulus = choices.pick([2, 3, 1, 4, 7, 64])
-        step, column = ("step", "column") if self.manner.borders else ("step", "step")
-        inner = (
-            choices.pick(["row", "column", "step", "(row + step)", "(column - row)"])
-            if self.manner.borders
-            else "step"
-        )
-        if choices.maybe(50):
-            value = self.whole(depth - 1)
-            if not value.fixed:
-                inner = (
-                    value.text
-                    if choices.maybe(60)
-                    else f"({value.text} {choices.pick('+-')} {choices.pick([step, column])})"
-                )
-        return Phrase(f"({inner} mod {modulus})", 0, modulus - 1)
+        return whole_phrases.modulo(self, depth)
 
     def _quotient(self, depth: int) -> Phrase | None:
-        """A whole division, by constants of both signs or by what may be 0."""
-        choices = self.choices
-        if self.manner.borders and choices.maybe(15):
-            inner = choices.pick(["row", "(column + step)", "(row - 1)"])
-            return Phrase(f"({inner} div {choices.pick([1, 2, 3, 5])} mod {choices.pick([2, 3])})", 0, 2)
-        value = self.whole(depth - 1)
-        if value.fixed:
-            return None
-        if choices.maybe(60):
-            by = choices.pick([2, 3, -2, 8, 1, -1, 7, -5, 64, 100, -64])
-            ends = [value.lo // by, value.hi // by]
-            return Phrase(f"({value.text} div {by})", min(ends), max(ends))
-        divisor = self.whole(depth - 1)
-        if divisor.fixed:
-            return None
-        reach = max(abs(value.lo), abs(value.hi))
-        return Phrase(f"({value.text} div {divisor.text})", -reach, reach)
+        return whole_phrases.quotient(self, depth)
 
     def _choose_whole(self, depth: int) -> Phrase:
         a, b = self.whole(depth - 1), self.whole(depth - 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from powderdsl.model.builtins import KERNELS
+from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
 from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, Kind, integer
 from powderdsl.testing.choices import Choices
 
@@ -176,8 +176,19 @@ def _streams(choices: Choices, words: Words, manner: Manner) -> Tree:
 
 def _kernels(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
+    if manner.borders and choices.maybe(30):
+        shape, radius = choices.pick([*KERNEL_SHAPES]), choices.pick([1, 2, 3, 5])
+        kernel = shaped_kernel(shape, radius)
+        words.kernels[kernel.name] = (1,) * len(kernel.weights)
     for i in range(choices.weighted([(2, 1), (2, 0 if manner.borders else 1), (1, 2)])):
         name = f"k{i}"
+        if choices.maybe(25):
+            shape, radius = choices.pick([*KERNEL_SHAPES]), choices.pick([1, 2, 4])
+            kernel = shaped_kernel(shape, radius)
+            words.kernels[name] = (1,) * len(kernel.weights)
+            wraps = choices.maybe(40) or not manner.borders
+            section[name] = {"shape": kernel.name, "edges": "wrap"} if wraps else kernel.name
+            continue
         height, width = choices.pick([(3, 3), (1, 3), (3, 1), (1, 1), (5, 5), (1, 5), (5, 3)])
         dull = choices.maybe(50)
         weight = (0, 1) if dull else (0, 1, -1, 2, 3, -2)
