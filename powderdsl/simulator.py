@@ -20,6 +20,7 @@ from powderdsl.compiler import BACKENDS, load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.state import SNAP, Slot
 from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import check_sides
 from powderdsl.observe import Observer
 from powderdsl.programs import find_device, make_program
 
@@ -142,6 +143,7 @@ class Simulator:
             tensor = tensor[None]
         if tensor.ndim != 3 or 0 in tensor.shape:
             raise ValueError(f"ids must have the shape [worlds, rows, columns], found {list(tensor.shape)}")
+        check_sides(self.ruleset, (int(tensor.shape[1]), int(tensor.shape[2])))
         if tensor.numel() > MAX_CELLS:
             raise ValueError(f"{tensor.numel():,} cells are more than {MAX_CELLS:,}")
         self._check_ids(tensor, "ids")

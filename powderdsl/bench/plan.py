@@ -10,6 +10,7 @@ from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import suggest
 from powderdsl.model.reactions import moved_ids
 from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import check_sides
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.strewn import check_cells
 
@@ -101,6 +102,8 @@ def make_plan(
             raise ValueError(f"{name}: whole numbers of 1 or more are needed")
     if not 0 < seconds <= MAX_SECONDS:  # false for NaN
         raise ValueError(f"seconds: a number above 0, up to {MAX_SECONDS:g}, is needed")
+    for size in sizes:
+        check_sides(ruleset, size)
     for batch, size in product(batches, sizes):
         check_cells(batch, size)
     chosen = _elements(ruleset, workload, elements, only)

@@ -18,6 +18,7 @@ from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules, set_option
 from powderdsl.cli.progress import progress
 from powderdsl.compiler import BACKENDS
+from powderdsl.model.world_sides import fitting
 
 
 def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
@@ -133,7 +134,7 @@ def command(
             ruleset,
             backends=backends or _usual_backends(device),
             batches=batches,
-            sizes=sizes or ((64, 64),),
+            sizes=sizes or ((fitting(ruleset, 64),) * 2,),
             elements=elements,
             only=only,
             threads=threads,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import fitting
 from powderdsl.worlds.files import failure
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene import FieldValues, Start, load_start
@@ -45,7 +46,8 @@ def start_drawn(
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
     """
     if name is None:
-        return Drawn(strew(ruleset, size or DEFAULT_SIZE, batch or 1, seed or 0))
+        size = size or (fitting(ruleset, DEFAULT_SIZE[0]), fitting(ruleset, DEFAULT_SIZE[1]))
+        return Drawn(strew(ruleset, size, batch or 1, seed or 0))
     if name.lower().endswith(".npz"):
         _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
         return None

@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
+from powderdsl.model.budget import Budget
 from powderdsl.model.operands import ELEMENT_HERE, member, negation
 from powderdsl.model.reactions import facts_of
-from powderdsl.model.satisfy import Budget, Facts, satisfiable
+from powderdsl.model.satisfy import Facts, satisfiable
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule, Ruleset, Swap, Transform
 

@@ -142,6 +142,9 @@ KIND_WORDS: dict[str, str] = {
 MAX_OFFSET = 15
 """How far a rule may look in one step."""
 
+MAX_SIDE_MULTIPLE = 64
+"""The largest number that a pack may ask the sides of worlds to be multiples of."""
+
 MAX_MAGNITUDE = 1_000_000
 """The largest number a rule file may contain."""
 

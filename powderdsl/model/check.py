@@ -122,6 +122,7 @@ def check(
         params=tuple(symbols.params.values()),
         passes=without_dead_overrides(passes, frozenset(name for name, ids in stored.items() if not ids)),
         matrix=matrix,
+        side_multiple=composition.side_multiple,
         order=state_order(composition, symbols, passes),
         tests=examples,
         invariants=invariants,
@@ -143,7 +144,7 @@ def _facts(symbols: Symbols) -> Facts:
     limited = {name: f.of for name, f in symbols.fields.items() if f.of is not None}
     defaults: dict[str, object] = {name: symbols.fields[name].default for name in limited}
     names = {element.id: name for name, element in symbols.composition.elements.items()}
-    return Facts(symbols.ids, symbols.properties, limited, defaults, names)
+    return Facts(symbols.ids, symbols.properties, limited, defaults, symbols.composition.side_multiple, names)
 
 
 def _shaped_kernels(symbols: Symbols, typer: Typer) -> None:

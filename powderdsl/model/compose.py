@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import lcm
 from typing import Generic, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
@@ -64,6 +65,8 @@ class Composition:
     """The place of each id where loops run over elements: as if no palette had been recorded."""
     groups: tuple[tuple[str, ...], ...]
     """The packs whose elements and channels are placed together; the first ones lie where they lie by themselves."""
+    side_multiple: int
+    """The least common multiple of what the packs ask of the sides of worlds."""
     reserved: tuple[int, ...]
     """Ids of elements of a ruleset's own packs that are left out."""
 
@@ -178,6 +181,7 @@ def compose(
         passes=_order_passes(passes, names, reporter),
         names=names,
         order={number: natural.get(word, number) for word, number in ids.items()},
+        side_multiple=lcm(*(pack.side_multiple for pack in packs)),
         groups=tuple(tuple(pack.name.text for pack in group) for group in groups),
         reserved=tuple(ids[c.name] for c in claims if c.name in ids and c.name not in chosen),
     )

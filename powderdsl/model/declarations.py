@@ -118,6 +118,7 @@ class PackDecl:
     passes: tuple[PassDecl, ...]
     tests: tuple[TestDecl, ...]
     invariants: tuple[Syntax, ...] = ()
+    side_multiple: int = 1
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,13 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
             "PD109", f"the test `{decl.name}` has no start world", decl.scalar.span, "`given` is missing"
         )
     given = _rows(decl.given, legend, typer, wildcard=False)
+    if any(side % composition.side_multiple for side in (len(given), len(given[0]))):
+        raise typer.fail(
+            "PD110",
+            f"a world of {len(given)}×{len(given[0])} cells",
+            decl.given.span,
+            f"`side_multiple` asks for multiples of {composition.side_multiple}",
+        )
     expect = _rows(decl.expect, legend, typer, wildcard=True) if decl.expect else None
     if (
         expect is not None

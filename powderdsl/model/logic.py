@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import lcm
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.apart import Glances
+from powderdsl.model.budget import BUDGET, MAX_QUESTION, Budget
+from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
+from powderdsl.model.lasting import lasting
 from powderdsl.model.operands import ELEMENT_HERE, negation
 from powderdsl.model.operands import member as member_of
-from powderdsl.model.satisfy import BUDGET, Budget, Facts, decide, example, satisfiable
+from powderdsl.model.satisfy import Facts, decide, example, satisfiable
 from powderdsl.model.types import (
     Assign,
     Expr,
@@ -76,8 +80,10 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
     work: list[tuple[int, int, Pass]] = []
     left = ALL_MOMENTS * BUDGET
     for pass_ in passes:
+        earlier: dict[str, Expr] = {}
         for moment in pass_.moments:
-            lets = {let.name: let.value for let in moment.lets}
+            lets = earlier | {let.name: let.value for let in moment.lets}
+            earlier = lasting(lets)
             live = []
             for rule in moment.rules:
                 fires = rule.mask is None or satisfiable(facts, [(rule.mask, HERE)], lets)
@@ -170,7 +176,10 @@ def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Ite
                 return
             answer, question = _meet(first, second, glances, facts, lets)
             if answer:
-                yield _conflict(first, second), _in_words(facts, question, lets)
+                yield (
+                    _parity(_conflict(first, second), question, facts, lets),
+                    _in_words(facts, question, lets),
+                )
                 break
             if answer is None and undecided is None:
                 undecided = first
@@ -295,6 +304,24 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
     return Conflict(
         "PD501" if movement else "PD502", message, first.span, second.span, (), (_EXCLUDE, choice)
     )
+
+
+def _parity(
+    conflict: Conflict, question: Sequence[tuple[Expr, Offset]], facts: Facts, lets: dict[str, Expr]
+) -> Conflict:
+    """The conflict with the cure for rules that alternate by row or column: worlds without a seam keep them apart."""
+    asked = [*(condition for condition, _ in question), *lets.values()]
+    nodes = [node for one in asked for node in one.walk()]
+    moduli = [node.value[1] for node in nodes if node.op == "coordinate" and node.value[0] != "step"]
+    multiple = lcm(facts.side_multiple, *moduli)
+    if multiple in (1, facts.side_multiple) or multiple > MAX_SIDE_MULTIPLE:
+        return conflict
+    seamless = replace(facts, side_multiple=multiple, budget=Budget(MAX_QUESTION))
+    if satisfiable(seamless, question, lets):
+        return conflict
+    note = f"they meet only at the seam of a world whose sides are no multiples of {multiple}"
+    cure = f"allow only worlds without a seam: `side_multiple: {multiple}`, a key of the pack"
+    return replace(conflict, notes=(*conflict.notes, note), helps=(cure, *conflict.helps[1:]))
 
 
 def _undecided(conflict: Conflict) -> Conflict:

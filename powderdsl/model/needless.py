@@ -10,8 +10,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.budget import Budget
 from powderdsl.model.operands import ELEMENT_HERE, member, negation
-from powderdsl.model.satisfy import Budget, Facts, satisfiable
+from powderdsl.model.satisfy import Facts, satisfiable
 from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule, Ruleset, Transform
 from powderdsl.syntax.ast import Syntax
 

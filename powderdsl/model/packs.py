@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span
-from powderdsl.model.builtins import MAX_RADIUS
+from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
 from powderdsl.model.declarations import (
     AlsoDecl,
     Block,
@@ -18,6 +18,7 @@ from powderdsl.model.declarations import (
     TestDecl,
     TypedDecl,
 )
+from powderdsl.model.kernel_rows import kernel_rows
 from powderdsl.model.schema import KEYS, Reader, first_line
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
@@ -148,6 +149,7 @@ class _PackReader(Reader):
             passes=tuple(self.pass_(key, node) for key, node in self.named(value("passes"), "a pass")),
             tests=tuple(t for node in self._items(value("tests")) if (t := self.test(node))),
             invariants=self.statements(value("invariants")),
+            side_multiple=self.number(entries, "side_multiple", 1, MAX_SIDE_MULTIPLE) or 1,
         )
 
     def statements(self, node: Node | None) -> tuple[Syntax, ...]:
@@ -258,55 +260,10 @@ class _PackReader(Reader):
                     helps=["`rows`: rows of whole weights; or `shape`: a shape and its radius, such as `disc(3)`"],
                 )  # fmt: skip
                 return None
-            rows = self.kernel_rows(key, entries["rows"][1])
+            rows = kernel_rows(self, key, entries["rows"][1])
         else:
-            wrap, rows = False, self.kernel_rows(key, node)
+            wrap, rows = False, kernel_rows(self, key, node)
         return KernelDecl(key, rows, wrap) if rows else None
-
-    def kernel_rows(self, key: Scalar, node: Node) -> tuple[tuple[int, ...], ...] | None:
-        """Rows of weights with a cell in the middle; reports what they lack."""
-        most = 2 * MAX_RADIUS + 1
-        rows = []
-        for word in self.words(node):
-            parts = word.text.split()
-            if not parts or not all(re.fullmatch(r"-?[0-9]{1,3}", part) for part in parts):
-                self.reporter.error(
-                    "PD110",
-                    "a kernel row that is not whole numbers",
-                    word.span,
-                    "not a row of weights",
-                    helps=['write "1 0 1", numbers up to 999 with blanks between them'],
-                )
-                return None
-            rows.append((tuple(int(part) for part in parts), word.span))
-        if not rows:
-            self.shape(node, "rows of weights", 'write ["1 1 1", "1 0 1", "1 1 1"]')
-            return None
-        width = len(rows[0][0])
-        for row, span in rows:
-            if len(row) > most:
-                label = f"{len(row)} weights: a kernel reaches {MAX_RADIUS} cells to each side"
-                self.reporter.error(
-                    "PD110", "a kernel that is too wide", span, label, helps=[f"write at most {most}"]
-                )
-                return None
-            if len(row) % 2 == 0:
-                helps = ["write an odd number of weights, the cell's own in the middle"]
-                self.reporter.error(
-                    "PD110", f"kernel `{key.text}` has no middle", span, f"{len(row)} weights are an even number", helps=helps
-                )  # fmt: skip
-                return None
-            if len(row) != width:
-                label = f"{len(row)} weights, the first row has {width}"
-                self.reporter.error("PD110", "the rows of a kernel are equally long", span, label)
-                return None
-        if len(rows) > most or len(rows) % 2 == 0:
-            fault = "has no middle" if len(rows) <= most else "is too high"
-            label = f"{len(rows)} rows" + (" are an even number" if len(rows) % 2 == 0 else "")
-            helps = [f"write an odd number of rows, at most {most}, the cell's own in the middle"]
-            self.reporter.error("PD110", f"kernel `{key.text}` {fault}", key.span, label, helps=helps)
-            return None
-        return tuple(row for row, _ in rows)
 
     def element(self, key: Scalar, node: Node) -> ElementDecl:
         entries = self.mapping(node, "element", f"the element `{key.text}`")

@@ -53,6 +53,7 @@ def facts_of(ruleset: Ruleset) -> Facts:
         {prop.name: prop for prop in ruleset.properties},
         {name: f.of for name, f in limited.items() if f.of is not None},
         {name: f.default for name, f in limited.items()},
+        ruleset.side_multiple,
     )
 
 

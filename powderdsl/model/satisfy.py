@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from powderdsl.model.budget import QUESTION, Budget, Exhausted
 from powderdsl.model.types import Expr, Offset, Property
 
 Key = tuple[str, object, Offset]
@@ -24,46 +24,6 @@ Bounds = tuple[Any, Any]
 MAX_DOMAIN = 256
 MAX_LET = 150
 """Nodes of a let's value that are looked through; a larger one is taken for free."""
-
-BUDGET = 500_000
-"""Nodes evaluated in a group of questions: half a second. The largest shipped ruleset needs a twentieth of it."""
-
-MAX_QUESTION = 100_000
-"""Nodes evaluated for one question. A harder one stays undecided, and the others keep their share."""
-
-QUESTION = 60
-"""What a question costs besides its evaluations."""
-
-
-class _Exhausted(Exception):
-    """The question takes too much work: the answer is that it could not be told."""
-
-
-@dataclass
-class Budget:
-    """Work that is left for some questions, counted in nodes. It depends on what is asked, never on time or order."""
-
-    left: int = BUDGET
-
-    def spend(self, nodes: int) -> None:
-        self.left -= nodes
-        if self.left < 0:
-            raise _Exhausted
-
-    @property
-    def is_exhausted(self) -> bool:
-        return self.left < 0
-
-    @contextmanager
-    def question(self, most: int = MAX_QUESTION) -> Iterator[None]:
-        """Spend at most this much within. What one question may not spend is left for the next."""
-        reserve = max(self.left - most, 0)
-        self.left -= reserve
-        try:
-            yield
-        finally:
-            if reserve:
-                self.left = max(self.left, 0) + reserve
 
 
 @dataclass(frozen=True)
@@ -75,6 +35,8 @@ class Facts:
     field_sets: dict[str, frozenset[int]]
     """Fields that exist only on some elements: elsewhere they read their default."""
     field_defaults: dict[str, object]
+    side_multiple: int = 1
+    """The sides of all worlds are multiples of this number."""
     names: dict[int, str] = field(default_factory=dict, compare=False, repr=False)
     """Names of the elements by id, for examples in messages."""
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
@@ -238,6 +200,8 @@ class Search:
         what, name, _ = key
         if what == "element":
             return list(self.facts.ids)
+        if what == "side":
+            return list(range(self.facts.side_multiple))
         if what == "property":
             kind = self.facts.properties[str(name)].kind
             return [0, 1] if kind.name == "flag" else list(range(int(kind.lo), int(kind.hi) + 1))
@@ -274,6 +238,8 @@ class Search:
                     found[_opaque(node, at)] = None
                 case "draw":
                     found[("draw", node.value, at)] = None
+                case "coordinate":
+                    found[_coordinate(node, at, self.facts.side_multiple)[0]] = None
                 case "look":
                     visit(node.args[0], _plus(at, node.value))
                 case "const":
@@ -294,7 +260,7 @@ class Search:
         budget = self.facts.budget  # `spend` written out: this is where the time goes
         budget.left -= 1
         if budget.left < 0:
-            raise _Exhausted
+            raise Exhausted
         match node.op:
             case "const":
                 return node.value
@@ -311,6 +277,9 @@ class Search:
                 return chosen[_opaque(node, at)]
             case "draw":
                 return chosen[("draw", node.value, at)]
+            case "coordinate":
+                key, shift = _coordinate(node, at, self.facts.side_multiple)
+                return (int(str(chosen[key])) + shift) % node.value[1]
             case "look":
                 return self._value(node.args[0], _plus(at, node.value), chosen)
             case _ if _is_opaque(node):
@@ -357,6 +326,11 @@ class Search:
                 return (low, high) if key in chosen else (min(low, default), max(high, default))
             case "draw":
                 return self._span(("draw", node.value, at), chosen)
+            case "coordinate":
+                key, shift = _coordinate(node, at, self.facts.side_multiple)
+                if key not in chosen:
+                    return 0, node.value[1] - 1
+                return ((int(str(chosen[key])) + shift) % node.value[1],) * 2
             case "look":
                 return self._bounds(node.args[0], _plus(at, node.value), chosen)
             case _ if _is_opaque(node):
@@ -406,6 +380,12 @@ def _abs_bounds(node: Expr, a: Bounds) -> Bounds:
     return (0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))), max(abs(a[0]), abs(a[1]))
 
 
+def _quotient_bounds(node: Expr, a: Bounds, b: Bounds) -> Bounds:
+    if a[0] == a[1] and b[0] == b[1]:
+        return (a[0] // b[0] if b[0] else 0,) * 2
+    return node.kind.lo, node.kind.hi
+
+
 _ANY: Bounds = (-math.inf, math.inf)
 _BOUNDS: dict[str, Callable[..., Bounds]] = {
     "and": lambda node, a, b: (a[0] and b[0], a[1] and b[1]),
@@ -422,6 +402,7 @@ _BOUNDS: dict[str, Callable[..., Bounds]] = {
     "mod": lambda node, a: (a[0] % node.value,) * 2 if a[0] == a[1] else (0, node.value - 1),
     "mul": _product_bounds,
     "abs": _abs_bounds,
+    "quotient": _quotient_bounds,
     "choose": _chosen_bounds,
 }
 """The same between bounds. Flags are 0, 1, False or True."""
@@ -436,9 +417,23 @@ def _opaque(node: Expr, at: Offset) -> Key:
     return ("value", node, at)
 
 
+def _coordinate(node: Expr, at: Offset, sides: int) -> tuple[Key, int]:
+    """The variable that a coordinate depends on, and what is added to it.
+
+    The step is the same everywhere. A row or column is known from that of another place if no seam comes between:
+    where the sides of the world are multiples of its modulus. Elsewhere it is free at every place.
+    """
+    axis, modulus = node.value
+    if axis == "step":
+        return _opaque(node, (0, 0)), 0
+    if sides % modulus:
+        return _opaque(node, at), 0
+    return ("side", axis, (0, 0)), at[axis == "column"]
+
+
 def _is_opaque(node: Expr) -> bool:
     """Whether a node is a variable of its own: a count, a field, or something that floats decide."""
-    if node.op in ("field", "let", "count", "sum", "inside", "coordinate", "octant", "param"):
+    if node.op in ("field", "let", "count", "sum", "inside", "octant", "param"):
         if (
             node.kind.name in ("real", "vec2", "chance", "draw", "number")
             or node.kind.hi - node.kind.lo >= MAX_DOMAIN
@@ -468,7 +463,7 @@ def decide(
     try:
         with facts.budget.question():
             return _search(facts, conditions, lets).possible()
-    except _Exhausted:
+    except Exhausted:
         return None
 
 
@@ -477,7 +472,7 @@ def alone(facts: Facts, condition: Expr, lets: dict[str, Expr]) -> dict[Key, fro
     try:
         with facts.budget.question():
             return _search(facts, [(condition, (0, 0))], lets).alone() or {}
-    except _Exhausted:
+    except Exhausted:
         return {}
 
 
@@ -489,7 +484,7 @@ def example(
         with facts.budget.question():
             search = _search(facts, conditions, lets)
             return search.example() if search.possible() else {}
-    except _Exhausted:
+    except Exhausted:
         return {}
 
 

@@ -43,6 +43,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "fields": Key("mapping", "state that cells carry"),
         "streams": Key("any", "sources of random numbers that rules share by name"),
         "params": Key("mapping", "numbers that users override without editing the file"),
+        "side_multiple": Key("number", "rows and columns of all worlds are multiples of this number"),
         "kernels": Key("mapping", "neighbourhoods for `count` and `sum`"),
         "sets": Key("mapping", "names for sets of elements"),
         "elements": Key("mapping", "the pack's elements"),

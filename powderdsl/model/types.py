@@ -452,6 +452,8 @@ class Ruleset:
     """What a cell holds besides its element, as `model/layout.py` orders it."""
     tests: tuple[Example, ...] = field(default=(), metadata=UNMEANING)
     invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
+    side_multiple: int = field(default=1, metadata=UNMEANING)
+    """The rows and columns of all worlds are multiples of this number."""
     declared: Declared | None = field(default=None, compare=False, repr=False)
     """What it was checked from."""
 

@@ -33,11 +33,17 @@ class Work:
 
     rules: int
     left: int
+    side_multiple: int = 1
+    """Worlds whose sides are no multiples of it are not tried: the rules do not allow them."""
 
     @classmethod
     def of(cls, ruleset: Ruleset, left: int = WORK) -> Work:
         """So much work with the rules of a ruleset."""
-        return cls(1 + sum(len(moment.rules) for one in ruleset.passes for moment in one.moments), left)
+        rules = 1 + sum(len(moment.rules) for one in ruleset.passes for moment in one.moments)
+        return cls(rules, left, ruleset.side_multiple)
+
+    def allows(self, sample: Sample) -> bool:
+        return all(side % self.side_multiple == 0 for side in sample.shape)
 
     def spend(self, batch: Sample, steps: int) -> None:
         self.left -= self.rules * steps * (RULE + batch.ids.size)
@@ -82,7 +88,8 @@ def shrink_while(judge: Judge, sample: Sample, steps: int, tries: int, work: Wor
         smaller = sample
         for group in _GROUPS:
             while work.left > 0:
-                found = _first(judge, group(smaller), steps, tries, work)
+                candidates = [one for one in group(smaller) if work.allows(one)]
+                found = _first(judge, candidates, steps, tries, work)
                 if found is None:
                     break
                 smaller, steps = found

@@ -15,6 +15,7 @@ from powderdsl.model.expressions import Typer
 from powderdsl.model.palette import Palette
 from powderdsl.model.schema import Reader, first_line
 from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import fits, size_problem
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.parse import reserved_words as rule_words
@@ -177,6 +178,9 @@ class _TaskReader:
             helps = ["size: [64, 64]"]
             self.reporter.error("PD607", "a size is [rows, columns]", first_line(node), label, helps=helps)
             return 64, 64
+        if not fits(self.ruleset, (numbers[0], numbers[1])):
+            problem = size_problem(self.ruleset, (numbers[0], numbers[1]))
+            self.reporter.error("PD607", problem, first_line(node), "does not fit")
         return numbers[0], numbers[1]
 
     def fill(self) -> int:

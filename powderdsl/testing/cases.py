@@ -14,6 +14,7 @@ from powderdsl.model.declarations import PackDecl
 from powderdsl.model.packs import read_file
 from powderdsl.model.state import SNAP, Slot, slots
 from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import fitting
 from powderdsl.testing.choices import Choices
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ def random_start(
         shape = (choices.whole(1, max_batch), *_sides(choices, max_side))
     palette = [e.id for e in ruleset.elements]
     palette = choices.some(palette, 1, len(palette)) if choices.maybe(40) else palette
+    shape = (shape[0], *(fitting(ruleset, side) for side in shape[1:]))
     fill = _Fill(choices, tuple(shape))
     ids = fill.choose(palette).astype(np.uint8)
     fields: dict[str, np.ndarray] = {}

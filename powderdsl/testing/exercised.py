@@ -39,6 +39,7 @@ NOT_RUN = {
         "also",
         "tests",
         "invariants",
+        "side_multiple",
     },  # how packs meet is decided before the IR
     "element": {"glyph", "about", "override"},
     **{context: {"about"} for context in ("property", "field", "stream", "param", "pass")},
