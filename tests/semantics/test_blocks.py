@@ -122,7 +122,7 @@ def test_other_sizes_are_refused_everywhere(tmp_path, monkeypatch):
     assert "PD607" in result.output
     text = (tmp_path / "blocks.yaml").read_text()
     (tmp_path / "blocks.yaml").write_text(
-        text + "tests: [{odd: {given: a b c, after: 1 step, expect: a b c}}]\n"
+        text + "tests: [{odd: {given: b c b, after: 1 step, expect: b c b}}]\n"
     )
     assert "multiples of 2" in command("check", "blocks.yaml").output
 
