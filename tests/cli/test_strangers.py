@@ -1,0 +1,145 @@
+"""Packs by strangers, from the command line alone: every command that takes rules or a task takes them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.commands import powderdsl
+
+ELEMENT = """
+pack: slime
+needs: core
+elements:
+  slime: {id: 14, density: 3, gravity: yes, color: "#60C040", tags: fluid}
+passes:
+  creep: {after: flow, do: "empty -> slime if count(slime) > 3 with chance 5%"}
+tests:
+  - slime flows:
+      given: |
+        s .
+        # #
+      after: 20 steps
+      always: not wall or below is not slime
+"""
+FIELD = """
+pack: heat
+about: A field, and no element.
+needs: [core, sand]
+fields:
+  heat: {type: 0..9, at: place}
+passes:
+  warm: {do: [heat += 1 where sand, heat -= 1 where empty]}
+"""
+CREATURE = """
+pack: crab
+needs: core
+fields:
+  heading: {type: direction, default: right, at: element, of: crab}
+elements:
+  crab: {color: "#D05030", density: 4, gravity: yes}
+passes:
+  walk:
+    after: flow
+    conflicts: first_wins
+    do:
+      - crab moves right leaving empty if heading is right and right is empty
+      - crab moves left leaving empty if heading is left and left is empty
+    then:
+      - heading := left where crab and heading is right and right is wall
+      - heading := right where crab and heading is left and left is wall
+"""
+AUTOMATON = """
+pack: bugs
+needs: core
+kernels:
+  wide: [ROWS]
+elements:
+  dot: {id: 50, color: "#8040C0"}
+passes:
+  grow:
+    do:
+      - empty -> dot if count(dot in wide) in 34..45
+      - dot -> empty if count(dot in wide) not in 34..58
+""".replace("ROWS", ", ".join(['"' + " ".join("1" * 11) + '"'] * 11))
+
+TASK = """
+task: pool
+rules: powderworld
+size: [12, 12]
+fill: empty
+generate:
+  - square (sand, water) at (2..9, 2..9) half 1..3
+  - frame wall
+agent: {may: [empty, sand], bins: 2, brush: 4, actions: 2, steps_per_action: 1}
+reward: {each: count(sand)}
+"""
+MODEL = "--width 1 --iterations 2 --batch 2 --states 4 --buffer 64 --refresh 2 --backend torch".split()
+AGENT = (
+    "--preset small --features 2 --envs 2 --rollout 4 --batch 4 --epochs 1 --steps 8 --backend torch".split()
+)
+PACKS = {"slime": ELEMENT, "heat": FIELD, "crab": CREATURE, "bugs": AUTOMATON}
+
+
+@pytest.fixture(autouse=True)
+def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, text in PACKS.items():
+        Path(f"{name}.yaml").write_text(text)
+    Path("pool.yaml").write_text(TASK)
+
+
+def run(*words: str) -> str:
+    result = powderdsl(*words)
+    assert result.exit_code == 0, result.stderr
+    return str(result.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PACKS)
+def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
+    file = f"{name}.yaml"
+    run("check", f"powderworld+{file}", "--quick")
+    run(
+        "run",
+        f"powderworld+{file}",
+        "--size",
+        "12x12",
+        "--steps",
+        "3",
+        "--backend",
+        "torch",
+        "--out",
+        "w.npz",
+    )
+    run("wm", "train", "--task", "pool.yaml", *MODEL, "--run", "less")
+    run("wm", "finetune", "less", "--packs", file, "--iterations", "2", "--backend", "torch", "--run", "more")
+    run("wm", "eval", "more", "--split", "train", "--worlds", "2", "--backend", "torch")
+    held = ["--rules", f"powderworld+{file}", "--held-out", name]
+    run("wm", "train", "--task", "pool.yaml", *held, *MODEL, "--run", "held")
+    run("wm", "finetune", "held", "--packs", name, "--iterations", "2", "--backend", "torch", "--run", "back")
+    run("train", "pool.yaml", *AGENT, "--packs", file, "--run", "agent")
+    run("evaluate", "agent", "--episodes", "2")
+    run("train", "pool.yaml", *AGENT, "--slots", "16", "--observation", "compact", "--run", "roomy")
+    run("evaluate", "roomy", "--packs", file, "--episodes", "2")
+    run("record", "pool.yaml", "--packs", file, "--out", "data", "--episodes", "2", "--backend", "torch")
+    palettes = [
+        json.loads(Path(one, "run.json").read_text())["config"]["palette"] for one in ("more", "back")
+    ]
+    assert palettes[0] == palettes[1]
+    added = {"slime": ["slime.slime"], "heat": [], "crab": ["crab.crab"], "bugs": ["bugs.dot"]}[name]
+    assert palettes[0][14:] == added
+
+
+def test_two_packs_with_one_id_and_one_that_has_no_room(tmp_path: Path) -> None:
+    Path("ooze.yaml").write_text(ELEMENT.replace("slime", "ooze"))
+    shown = json.loads(run("show", "powderworld+slime.yaml+ooze.yaml", "--format", "json"))
+    ids = {one["name"]: one["id"] for one in shown["elements"]}
+    assert (ids["slime"], ids["ooze"]) == (14, 15)
+    run("train", "pool.yaml", *AGENT, "--slots", "15", "--run", "agent")
+    result = powderdsl("evaluate", "agent", "--packs", "slime.yaml", "ooze.yaml", "--episodes", "2")
+    assert result.exit_code == 2
+    assert "PD623" in result.stderr
+    assert "--slots 16" in result.stderr
