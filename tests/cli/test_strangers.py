@@ -76,10 +76,40 @@ generate:
 agent: {may: [empty, sand], bins: 2, brush: 4, actions: 2, steps_per_action: 1}
 reward: {each: count(sand)}
 """
-MODEL = "--width 1 --iterations 2 --batch 2 --states 4 --buffer 64 --refresh 2 --backend torch".split()
-AGENT = (
-    "--preset small --features 2 --envs 2 --rollout 4 --batch 4 --epochs 1 --steps 8 --backend torch".split()
-)
+MODEL = [
+    "--width",
+    "1",
+    "--iterations",
+    "2",
+    "--batch",
+    "2",
+    "--states",
+    "4",
+    "--buffer",
+    "64",
+    "--refresh",
+    "2",
+    "--backend",
+    "torch",
+]
+AGENT = [
+    "--preset",
+    "small",
+    "--features",
+    "2",
+    "--envs",
+    "2",
+    "--rollout",
+    "4",
+    "--batch",
+    "4",
+    "--epochs",
+    "1",
+    "--steps",
+    "8",
+    "--backend",
+    "torch",
+]
 PACKS = {"slime": ELEMENT, "heat": FIELD, "crab": CREATURE, "bugs": AUTOMATON}
 
 
