@@ -67,10 +67,12 @@ def find_device(name: str | torch.device) -> torch.device:
     """The torch device of a name. Raises CompileError (PD701) if it is not there."""
     try:
         device = torch.device(name)
+        if device.type == "meta":
+            raise RuntimeError("a meta device has shapes and no values")
         torch.empty(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError, ValueError, ImportError) as error:
         reporter = Reporter()
-        problem = str(error).splitlines()[0]
+        problem = (str(error).splitlines() or [type(error).__name__])[0][:200]
         reporter.error("PD701", f"no device `{name}`", None, notes=[problem], helps=["run on `cpu`"])
         raise CompileError(reporter.diagnostics) from None
     return device

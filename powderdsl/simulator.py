@@ -18,11 +18,12 @@ from powderdsl.backends.torch_job import Job
 from powderdsl.backends.torch_laps import profile_of
 from powderdsl.compiler import BACKENDS, load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
-from powderdsl.model.state import SNAP, Slot
+from powderdsl.model.state import Slot
 from powderdsl.model.types import Ruleset
 from powderdsl.model.world_sides import check_sides
 from powderdsl.observe import Observer
 from powderdsl.programs import find_device, make_program
+from powderdsl.state_checks import check_ids, checked_integers, checked_reals, looked_up
 
 MAX_CELLS = 1 << 31
 
@@ -169,10 +170,9 @@ class Simulator:
         prop = self.ruleset.property(slot.name)
         dtype = getattr(torch, slot.dtype)
         if prop is not None:
-            return self.observer.table(prop.name)[ids.long()].to(dtype)
+            return looked_up(self.observer.table(prop.name), ids, dtype)
         values = torch.tensor([slot.fresh(i) for i in range(256)], dtype=dtype, device=self.device)
-        fresh = values[ids.int()]
-        return fresh.movedim(-1, 1).contiguous() if slot.planes == 2 else fresh
+        return looked_up(values, ids, dtype)
 
     def _tensor(self, value: Any, name: str) -> Tensor:
         flags = getattr(value, "flags", None)
@@ -200,13 +200,7 @@ class Simulator:
         return tensor.clone()
 
     def _check_ids(self, ids: Tensor, name: str) -> None:
-        values = ids.to(torch.int64)
-        inside = (values >= 0) & (values < 256)
-        good = inside & self._known[values.clamp(0, 255)]
-        if not bool(good.all()):
-            place = (~good).nonzero()[0].tolist()
-            bad = int(values[tuple(place)])
-            raise ValueError(f"{name}{place} is {bad}: no element of {self.ruleset.name} has this id")
+        check_ids(ids, self._known, name, self.ruleset)
 
     # Reading and changing worlds
 
@@ -296,37 +290,12 @@ class Simulator:
 
     def _checked(self, slot: Slot, value: Any, ids: Tensor) -> Tensor:
         tensor = self._shaped(value, slot.name, tuple(ids.shape), slot.planes == 2)
-        kind = slot.kind
         if tensor.dtype.is_complex:
             raise TypeError(f"{slot.name} takes real numbers, found {tensor.dtype}")
         if slot.is_real:
-            if not bool(torch.isfinite(tensor).all()):
-                raise ValueError(f"{slot.name} has values that are not finite")
-            real = tensor.to(torch.float32).clamp(kind.lo, kind.hi)
-            return torch.where(real.abs() < SNAP, torch.zeros_like(real), real)
-        if tensor.dtype.is_floating_point and not bool((tensor == tensor.round()).all()):
-            raise TypeError(f"{slot.name} takes whole numbers, found {tensor.dtype}")
-        whole = tensor.to(torch.int64)
-        if kind.name == "element":
-            self._check_ids(whole, slot.name)
-        lo, hi = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(kind.name, (kind.lo, kind.hi))
-        if bool(((whole < lo) | (whole > hi)).any()):
-            raise ValueError(
-                f"{slot.name} takes {lo:g}..{hi:g}, found {int(whole.min())}..{int(whole.max())}"
-            )
-        prop = self.ruleset.property(slot.name)
-        limited = prop.stored if prop is not None else slot.of
-        if limited is not None:
-            usual = (
-                self.observer.table(slot.name)[ids.long()].long()
-                if prop is not None
-                else torch.full_like(whole, int(slot.default))
-            )
-            holders = torch.isin(ids.long(), torch.tensor(sorted(limited), device=self.device))
-            if bool(((whole != usual) & ~holders).any()):
-                names = ", ".join(e.name for e in self.ruleset.elements if e.id in limited)
-                raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
-        return whole.to(getattr(torch, slot.dtype)).clone()
+            return checked_reals(tensor, slot)
+        usual = None if self.ruleset.property(slot.name) is None else self.observer.table(slot.name)
+        return checked_integers(tensor, ids, slot, usual, self._known, self.ruleset)
 
     def paint(self, world: World, *, where: Any, element: str | None = None, **fields: Any) -> World:
         """Set cells of a mask: fresh cells of an element, and values of fields.

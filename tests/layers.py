@@ -7,7 +7,7 @@ from dataclasses import dataclass
 _MODEL = ("bounded_files", "diagnostics", "syntax", "model")
 _COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
 _PROGRAMS = ("programs", "native_start", "auto_program")
-_STEPS = ("observe", "simulator", "provenance")
+_STEPS = ("observe", "state_checks", "simulator", "provenance")
 _SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
 _TESTING = (*_SCREEN, "ledgers", "pack_test_fields", "pack_test_chances", "pack_tests", "testing")
 _AFTER = ("bench", "tasks", "envs", "runs", "datasets", "rl", "worldmodel", "studies", "web", "cli")
@@ -34,7 +34,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "programs": (*_COMPILER, "native_start", "auto_program"),
     "draw": _MODEL,
     "observe": (*_COMPILER, "draw"),
-    "simulator": (*_COMPILER, "programs", "observe"),
+    "state_checks": _MODEL,
+    "simulator": (*_COMPILER, "programs", "observe", "state_checks"),
     "provenance": (*_MODEL, "simulator"),
     "tracing": (*_MODEL, "reference", "provenance", "simulator"),  # explains by what the oracle does
     "worlds": (*_MODEL, "scratch"),

@@ -11,8 +11,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,9 +22,14 @@ from typing import Any
 # Not later: a fork in the middle of an import, which a thread makes, leaves the child waiting for it for ever.
 from filelock import FileLock, Timeout
 
+from powderdsl.bounded_files import read_bytes, read_json
 from powderdsl.scratch import is_scratch, scratch_file, scratch_folder, sweep
 
 LIBRARY, ABOUT = "program", "about.json"
+
+KEY = re.compile(r"[0-9A-Za-z_-]{1,64}")
+LATEST = 1e11
+"""Seconds since the epoch; a later time is a mistake."""
 
 LIMIT = 512 << 20
 """Bytes of libraries that are kept; of more, those used longest ago go."""
@@ -62,14 +68,34 @@ class Entry:
         return max(0.0, time.time() - self.used)
 
 
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and len(value) <= 1000
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= LATEST
+
+
+_HOLDS: dict[str, Callable[[object], bool]] = {
+    "ruleset": _is_text,
+    "backend": _is_text,
+    "compiler": _is_text,
+    "created": _is_number,
+    "seconds": _is_number,
+    "size": lambda value: type(value) is int and 0 <= value <= LIMIT,
+    "sha256": lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9a-f]{64}", value)),
+}
+"""What the fields of `About` may be."""
+
+
 def find(folder: Path, key: str) -> Path | None:
     """The library of a key if it is there and whole; one that is damaged counts as absent. Marks it as used."""
-    about = _about(folder / key)
+    about = _about(folder / key) if KEY.fullmatch(key) else None
     if about is None:
         return None
     library = folder / key / LIBRARY
     try:
-        data = library.read_bytes()
+        data = read_bytes(library, LIMIT)
     except OSError:
         return None
     if len(data) != about.size or hashlib.sha256(data).hexdigest() != about.sha256:
@@ -110,10 +136,11 @@ def entries(folder: Path) -> list[Entry]:
     """What lies in the cache, the last used first."""
     found = []
     for place in sorted(folder.iterdir()):
-        about = None if place.name.startswith(".") else _about(place)
+        about = _about(place) if KEY.fullmatch(place.name) else None
         if about is not None:
             with suppress(OSError):
-                found.append(Entry(place.name, about, (place / ABOUT).stat().st_mtime))
+                used = min(max((place / ABOUT).stat().st_mtime, 0.0), LATEST)
+                found.append(Entry(place.name, about, used))
     return sorted(found, key=lambda entry: (-entry.used, entry.key))
 
 
@@ -161,8 +188,9 @@ def _needed(folder: Path, place: Path) -> bool:
     """Whether a `<key>.json` names a library that is there."""
     if place.suffix != ".json":
         return False
-    kept = read_json(place)
-    return kept is not None and (folder / str(kept.get("library", "")) / ABOUT).is_file()
+    kept = read_object(place)
+    key = kept.get("library") if kept is not None else None
+    return isinstance(key, str) and bool(KEY.fullmatch(key)) and (folder / key / ABOUT).is_file()
 
 
 @contextmanager
@@ -183,12 +211,9 @@ def turn(folder: Path, key: str) -> Iterator[None]:
         lock.release()
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
+def read_object(path: Path) -> dict[str, Any] | None:
     """A JSON object, None if there is none or it is damaged."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+    value = read_json(path)
     return value if isinstance(value, dict) else None
 
 
@@ -200,11 +225,10 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
 
 
 def _about(place: Path) -> About | None:
-    kept = read_json(place / ABOUT)
-    try:
-        return None if kept is None else About(**kept)
-    except TypeError:
+    kept = read_object(place / ABOUT)
+    if kept is None or kept.keys() != _HOLDS.keys():
         return None
+    return About(**kept) if all(holds(kept[name]) for name, holds in _HOLDS.items()) else None
 
 
 def _discard(place: Path) -> None:

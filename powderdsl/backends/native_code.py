@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -45,10 +47,12 @@ def compile_program(program: Program, planes: Program, *, clocks: bool = False) 
 def recall(key: str) -> NativeCode | None:
     """The code that was remembered under a key, if its library is still there. Raises NoCompiler without a cache."""
     folder = current().place()
-    kept = native_cache.read_json(folder / f"{key}.json")
+    kept = native_cache.read_object(folder / f"{key}.json")
     try:
-        library = kept and native_cache.find(folder, kept["library"])
-        return _decode(kept, library) if kept and library else None
+        if kept is None or kept.pop("sha256") != _digest(kept):
+            return None
+        library = native_cache.find(folder, kept["library"])
+        return None if library is None else _decode(kept, library)
     except (KeyError, TypeError, ValueError, AttributeError):
         return None  # damaged: it will be written anew
 
@@ -56,9 +60,15 @@ def recall(key: str) -> NativeCode | None:
 def remember(key: str, code: NativeCode) -> None:
     """Keep what a program needs besides its library. A cache that cannot be written only costs time."""
     try:
-        native_cache.write_json(current().place() / f"{key}.json", _encode(code))
+        kept = _encode(code)
+        native_cache.write_json(current().place() / f"{key}.json", {**kept, "sha256": _digest(kept)})
     except OSError:
         return
+
+
+def _digest(kept: dict[str, Any]) -> str:
+    """A hash that tells whether a file is as it was written: where its numbers point, native code reads and writes."""
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
 
 def _encode(code: NativeCode) -> dict[str, Any]:

@@ -108,6 +108,10 @@ def command(
     drawn = start_drawn(ruleset, world, size, batch, seed)
     sim = compile(ruleset, backend=backend, device=device, threads=threads or 1)
     start = start_world(sim, drawn, world, seed)
+    if out is not None and out.suffix.lower() == ".npz":
+        from powderdsl.worlds.store import check_saved
+
+        check_saved(out, start.shape)
     used = _set_threads(threads, start)
     plan = Plan(steps, every, fps, scale, out, watch)
     began = time.perf_counter()

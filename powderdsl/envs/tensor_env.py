@@ -14,6 +14,7 @@ from torch import Tensor
 
 from powderdsl.backends.torch_random import MASK, mix
 from powderdsl.envs.observations import observation_of
+from powderdsl.simulator import MAX_CELLS
 from powderdsl.tasks.episodes import Episodes, TaskProgram, check_actions, compile_task, load_task
 from powderdsl.tasks.task import Task
 
@@ -84,8 +85,10 @@ class TensorEnv:
             if isinstance(task, Task) and (knobs or params):
                 raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
             found = task if isinstance(task, Task) else load_task(task, knobs=knobs, params=params)
+            check_cells(num_envs, found.size)
             task = compile_task(found, split=split, backend=backend, device=device, threads=threads)
         self.program, self.task, self.split = task, task.task, task.split
+        check_cells(num_envs, self.task.size)
         self.num_envs, self.worlds = num_envs, worlds
         self.simulator = self.program.simulator
         self.device = self.simulator.device
@@ -352,6 +355,13 @@ class TensorEnv:
 def _check_count(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise ValueError(f"{name} must be a whole number from 1, found {value!r}")
+
+
+def check_cells(num_envs: int, size: tuple[int, int]) -> None:
+    """Raises ValueError for more worlds than a simulator takes."""
+    most = MAX_CELLS // (size[0] * size[1])
+    if num_envs > most:
+        raise ValueError(f"num_envs must be a whole number from 1 to {most:,} here, found {num_envs:,}")
 
 
 def _mode(value: AutoresetMode | str) -> AutoresetMode:

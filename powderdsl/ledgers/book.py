@@ -233,7 +233,9 @@ def _sum_text(weights: Mapping[str, int]) -> str:
 
 
 def ledger(ruleset: Ruleset) -> Ledger:
-    """The ledger of a checked ruleset: decided from its rules, no world is run."""
+    """The ledger of a checked ruleset: decided from its rules, no world is run. Raises TypeError for anything else."""
+    if not isinstance(ruleset, Ruleset):
+        raise TypeError(f"ledger takes a Ruleset, from powderdsl.load; found {type(ruleset).__name__}")
     parts = [ledger_facts(ruleset) for _ in range(3)]  # each with work of its own
     names = {element.id: element.name for element in ruleset.elements}
     found = find_changes(ruleset, parts[0])

@@ -80,16 +80,17 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"
         raise does_not_fit(found.path, why)
     own = _own_env(found, config, env)
+    checkpoint = found.checkpoint()
+    _check_size(found, checkpoint.state, config.features)
     network = ActorCriticCnnPolicy(
         own.observation.space,
         MultiDiscrete(np.array(own.action_nvec)),
         lambda _: config.learning_rate,
         **policy_kwargs(config, own),
     )
-    checkpoint = found.checkpoint()
     try:
         network.load_state_dict(checkpoint.state["policy"])
-    except RuntimeError as error:
+    except (RuntimeError, TypeError, AttributeError, KeyError) as error:
         why = " ".join(str(error).split())[:300]
         raise does_not_fit(found.path, f"its network is another: {why}") from None
     network.to(env.device).set_training_mode(False)
@@ -152,6 +153,14 @@ def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:
         packs=(*config.packs, *packs),
         palette=recorded_palette(run),
     )
+
+
+def _check_size(run: RunFolder, state: Any, features: int) -> None:
+    """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError (PD623)."""
+    policy = state.get("policy") if isinstance(state, dict) else None
+    weights = policy.get("mlp_extractor.policy_net.0.weight") if isinstance(policy, dict) else None
+    if getattr(weights, "shape", None) != (features, features):
+        raise does_not_fit(run.path, f"its network has no layer of {features:,} features")
 
 
 def config_of(run: RunFolder) -> TrainConfig:

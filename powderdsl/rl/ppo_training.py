@@ -25,14 +25,16 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from powderdsl.compiler import whole_palette
 from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
+from powderdsl.envs.tensor_env import check_cells
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.observe import Observer
 from powderdsl.rl.policies import policy_kwargs, recorded_palette
 from powderdsl.rl.ppo_config import TrainConfig, check_config
-from powderdsl.runs import Metrics, RunFolder, open_run, read_run
+from powderdsl.runs import Metrics, RunFolder, does_not_fit, open_run, read_run
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import Task
+from powderdsl.worlds.files import failure
 
 KIND = "ppo"
 ASKED = "asked.json"
@@ -56,6 +58,10 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     check_config(config)
     task, palette = _task_and_palette(config, Path(folder))
     check_split(task, config.split)
+    try:
+        check_cells(config.envs, task.size)
+    except ValueError as error:
+        raise failure("PD640", f"`envs`: {error}") from None
     plain = {
         **config.identity,
         "task_fingerprint": fingerprint(task),
@@ -77,7 +83,11 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         with run.metrics(step) as metrics:
             model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
             if found is not None:
-                _restore(model, env, found.state)
+                try:
+                    _restore(model, env, found.state)
+                except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
+                    why = " ".join(str(error).split())[:300]
+                    raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
             keeper = _Keeper(run, env, config.checkpoint_minutes, progress)
             try:
                 model.learn(config.steps - step, callback=keeper, reset_num_timesteps=found is None)

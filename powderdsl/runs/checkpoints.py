@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import pickle
 import re
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 import torch
 
 from powderdsl.bounded_files import read_bytes
+from powderdsl.runs.pickles import checked
 from powderdsl.worlds.files import failure, replacing
 
 NAME = re.compile(r"([0-9]{12})-([0-9a-f]{16})\.pt")
@@ -64,7 +64,7 @@ def save_checkpoint(folder: Path, step: int, state: Any) -> Path:
 def latest_checkpoint(folder: Path, device: str | torch.device = "cpu") -> Checkpoint | None:
     """The newest checkpoint whose digest is right; None if there is none. Damaged ones are passed over.
 
-    Loading executes nothing: only tensors and plain values are read.
+    Loading executes nothing: only tensors and plain values are read, and they take no more memory than the file.
 
     Raises:
         CompileError: PD620 for a file that is whole and holds something else.
@@ -76,10 +76,10 @@ def latest_checkpoint(folder: Path, device: str | torch.device = "cpu") -> Check
             continue
         if hashlib.sha256(data).hexdigest()[:16] == digest:
             try:
-                state = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
-            except (pickle.UnpicklingError, RuntimeError) as error:
-                why = str(error).strip().partition("\n")[0]
-                raise failure("PD620", f"{path} is no checkpoint of a run", notes=(why,)) from None
+                state = torch.load(checked(data), map_location=device, weights_only=True)
+            except Exception as error:  # a crafted file raises whatever it likes
+                why = (str(error).strip().partition("\n")[0] or type(error).__name__)[:300]
+                raise failure("PD620", f"{path} is not a checkpoint of a run", notes=(why,)) from None
             return Checkpoint(step, state, path)
     return None
 

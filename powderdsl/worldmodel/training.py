@@ -202,8 +202,12 @@ def _restore(
             fit_weights(model, parent, grow=True)
         return 0, []
     fit_weights(model, found)
-    optimizer.load_state_dict(found.state["optimizer"])
-    return found.step, list(found.state["recent"])
+    try:
+        optimizer.load_state_dict(found.state["optimizer"])
+        return found.step, [float(one) for one in found.state["recent"]]
+    except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
+        why = " ".join(str(error).split())[:300]
+        raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
 
 
 class _Trainer:
@@ -407,9 +411,28 @@ def load_trained(
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise failure("PD620", f"{run.path} is no run that can be used here", notes=(str(error),)) from None
     checkpoint = run.checkpoint(device)
+    if network is None:
+        _check_size(run, config, palette, checkpoint)
     model = network or UNet(len(palette), config.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     fit_weights(model, checkpoint)
     return Trained(run, config, palette, model.to(device).eval(), checkpoint)
+
+
+def _check_size(
+    run: RunFolder, config: TrainConfig, palette: tuple[str | None, ...], checkpoint: Checkpoint
+) -> None:
+    """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError."""
+    if type(config.width) is not int or not 1 <= config.width <= MAX_WIDTH or not 1 <= len(palette) <= 256:
+        why = "its network has sizes that no training gives"
+        raise failure("PD620", f"{run.path} is no run that can be used here", notes=(why,))
+    with torch.device("meta"):
+        wanted = {name: one.shape for name, one in UNet(len(palette), config.width).state_dict().items()}
+    state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
+    found = (
+        {name: getattr(one, "shape", None) for name, one in state.items()} if isinstance(state, dict) else {}
+    )
+    if wanted != found:
+        raise does_not_fit(checkpoint.path, "its weights are those of another network")
 
 
 def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:

@@ -21,6 +21,9 @@ from powderdsl.worlds.raster import MAX_CELLS
 MAX_REPORTED = 8
 """Wrong colours that are named one by one. A smoothed picture has thousands."""
 
+MAX_COLORS = 1 << 16
+"""Wrong colors that are counted. A picture with more has more of them below."""
+
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 """Pixel formats of eight bits or fewer: those with more have colours that no element can have."""
 
@@ -34,24 +37,39 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
     path = Path(path)
     # Four bytes a pixel as one number: red lowest, opacity highest.
     packed = _pixels(path).view("<u4")[..., 0]
-    colors, first, index, counts = np.unique(
-        packed, return_index=True, return_inverse=True, return_counts=True
-    )
     owners: dict[int, list[Element]] = {}
     for element in elements:
         owners.setdefault(_pack(element.color), []).append(element)
-    wrong = [place for place, color in enumerate(colors.tolist()) if len(owners.get(color, [])) != 1]
-    if wrong:
-        wrong.sort(key=lambda place: first[place])
-        found = []
-        for place in wrong[:MAX_REPORTED]:
-            pixel = divmod(int(first[place]), packed.shape[1])
-            found.append(_wrong_color(path, int(colors[place]), pixel, int(counts[place]), owners))
-        if len(wrong) > MAX_REPORTED:
-            found.append(_many_colors(path, len(wrong)))
-        raise CompileError(found)
-    ids = np.array([owners[color][0].id for color in colors.tolist()], dtype=np.uint8)
-    return ids[index].reshape(packed.shape)
+    ids, known = np.zeros(packed.shape, np.uint8), np.zeros(packed.shape, np.bool_)
+    for color, owned in owners.items():
+        if len(owned) == 1:
+            where = packed == color
+            ids[where] = owned[0].id
+            known |= where
+    if not known.all():
+        raise CompileError(_wrong_colors(path, packed, known, owners))
+    return ids
+
+
+def _wrong_colors(
+    path: Path, packed: NDArray[np.uint32], known: NDArray[np.bool_], owners: dict[int, list[Element]]
+) -> list[Diagnostic]:
+    """What to say of the colors of pixels that are not known, by their first pixels."""
+    found: dict[int, tuple[int, int]] = {}
+    for row, (line, good) in enumerate(zip(packed, known, strict=True)):
+        wrong = np.flatnonzero(~good)
+        colors, first, counts = np.unique(line[wrong], return_index=True, return_counts=True)
+        for color, at, count in zip(colors.tolist(), wrong[first].tolist(), counts.tolist(), strict=True):
+            place, before = found.get(color, (row * packed.shape[1] + at, 0))
+            found[color] = place, before + count
+        if len(found) > MAX_COLORS:
+            break
+    listed = sorted(found.items(), key=lambda item: item[1][0])
+    result = [
+        _wrong_color(path, color, divmod(place, packed.shape[1]), count, owners)
+        for color, (place, count) in listed[:MAX_REPORTED]
+    ]
+    return result if len(found) <= MAX_REPORTED else [*result, _many_colors(path, len(found))]
 
 
 def _pack(color: str) -> int:
@@ -118,10 +136,11 @@ def _wrong_color(
 
 
 def _many_colors(path: Path, count: int) -> Diagnostic:
+    number = f"more than {MAX_COLORS:,}" if count > MAX_COLORS else f"{count:,}"
     helps = (
         "draw with a hard brush in the elements' colours, one pixel a cell, and scale without smoothing",
     )
-    return Diagnostic("PD609", f"{count:,} colours in {path} are no element's", Label(None), helps=helps)
+    return Diagnostic("PD609", f"{number} colours in {path} are no element's", Label(None), helps=helps)
 
 
 def _distance(one: str, other: str) -> int:

@@ -4,37 +4,48 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from powderdsl.bounded_files import parse_json
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.types import ELEMENT
 from powderdsl.simulator import Simulator, World
-from powderdsl.worlds.files import replacing
+from powderdsl.worlds.archives import Archive, BadArchive, open_archive
+from powderdsl.worlds.files import failure, replacing
+from powderdsl.worlds.raster import MAX_CELLS
 
 FORMAT = 1
-MAX_BYTES = 1 << 32
-"""Uncompressed size of all arrays of a file, at most."""
+SLOT, IDS = "slot_", "slot_element"
+CLOCK = ("seed", "index", "step")
+MAX_ABOUT = 1 << 20
+"""Bytes of what a file says of itself."""
+MORE = 1 << 24
+"""Bytes that arrays may take beyond those of twice the worlds: fields of packs that are not loaded."""
 
 
 def save(world: World, path: str | Path) -> None:
     """Write worlds with everything their future hangs on. The file appears whole or not at all.
 
     Raises:
-        CompileError: PD613 if the place cannot be written, PD602 if the disk is full.
+        CompileError: PD613 if the place cannot be written, PD602 if the disk is full, PD607 if there are more than
+            MAX_CELLS cells. TypeError: `world` is not a world.
     """
+    if not isinstance(world, World):
+        raise TypeError(f"save takes a World, found {type(world).__name__}")
     target = Path(path)
+    check_saved(target, world.shape)
     ruleset = world.sim.ruleset
     about = {
         "format": FORMAT,
         "ruleset": ruleset.name,
         "palette": {str(element.id): element.qualified for element in ruleset.elements},
     }
-    arrays = {f"slot_{name}": value.cpu().numpy() for name, value in world.state.items()}
-    clock = {name: getattr(world, name).cpu().numpy() for name in ("seed", "index", "step")}
+    arrays = {f"{SLOT}{name}": value.cpu().numpy() for name, value in world.state.items()}
+    clock = {name: getattr(world, name).cpu().numpy() for name in CLOCK}
     with replacing(target, follow=True) as temporary:
         try:
             with temporary.open("wb") as file:
@@ -49,86 +60,111 @@ def load_world(path: str | Path, sim: Simulator) -> World:
     """Worlds from a file, for a simulator whose ruleset may number its elements differently.
 
     Raises:
-        CompileError: PD602 if the file is no saved world; PD603 if the ruleset lacks one of its elements or fields.
+        CompileError: PD602 if the file is not a saved world; PD603 if the ruleset lacks one of its elements or fields;
+            PD607 if it has more than MAX_CELLS cells. TypeError: `sim` is not a simulator.
     """
+    if not isinstance(sim, Simulator):
+        raise TypeError(f"load_world takes a Simulator, from powderdsl.compile; found {type(sim).__name__}")
+    source = Path(path)
+    try:
+        with open_archive(source) as archive:
+            return _loaded(archive, sim, source)
+    except FileNotFoundError:
+        raise _bad(source, "does not exist") from None
+    except OSError as error:
+        raise _bad(source, f"cannot be read: {error.strerror or error}") from None
+    except BadArchive as error:
+        raise _bad(source, f"is not a saved world: {error}") from None
+
+
+def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
     import torch
 
-    source = Path(path)
-    data = _read(source)
-    try:
-        about = json.loads(str(data.pop("about")))
-        if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise _bad(source, f"was saved in another format than {FORMAT}")
-        palette = {int(number): str(name) for number, name in about["palette"].items()}
-        clock = {
-            name: torch.from_numpy(data.pop(name).astype(np.int64)).to(sim.device)
-            for name in ("seed", "index", "step")
-        }
-        ids = data.pop("slot_element")
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise _bad(source, f"is no saved world: {type(error).__name__} {error}") from None
-    if (
-        ids.dtype != np.uint8
-        or ids.ndim != 3
-        or 0 in ids.shape
-        or any(value.shape != (len(ids),) for value in clock.values())
-    ):
-        raise _bad(source, "is no saved world: its arrays do not fit together")
-    numbers = _numbers(palette, ids, sim, source)
+    palette, saved_in = _about(archive, source)
+    shape = _shape(archive, sim, source)
+    clock = {name: torch.from_numpy(_clock(archive, name, source)).to(sim.device) for name in CLOCK}
+    ids = archive.read(IDS)
     fields: dict[str, Any] = {}
-    for key, value in data.items():
-        name = key.removeprefix("slot_")
+    for key in archive.headers:
+        name = key.removeprefix(SLOT)
+        if key in ("about", IDS, *CLOCK):
+            continue
         slot = next((s for s in sim.slots if s.name == name), None)
         if slot is None:
-            if value.any() and sim.ruleset.property(name) is None:
+            if sim.ruleset.property(name) is None and archive.read(key).any():
                 raise _mismatch(
                     source,
-                    f"the field `{name}` of {about['ruleset']} is not in {sim.ruleset.name}",
+                    f"the field `{name}` of {saved_in} is not in {sim.ruleset.name}",
                     "load the pack that has it",
                 )
             continue
-        if slot.kind == ELEMENT:
-            value = _numbers(palette, value, sim, source)[value]
-        fields[name] = value
+        if archive.headers[key].shape != (shape if slot.planes != 2 else (shape[0], 2, *shape[1:])):
+            raise _bad(source, f"is not a saved world: `{key}` does not fit its elements")
+        value = archive.read(key)
+        fields[name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
     try:
-        world = sim.replace(sim.world(numbers[ids]), **fields)
+        world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
         return World(sim, world.state, **clock)
     except (ValueError, TypeError) as error:
         raise _bad(source, str(error)) from None
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """The arrays of a file, after looking at how much they claim to hold. No pickles."""
+def _about(archive: Archive, path: Path) -> tuple[dict[int, str], str]:
+    """The palette, and the name of the ruleset."""
+    header = archive.headers.get("about")
+    if header is None or header.shape != () or header.dtype.kind != "U" or header.size > MAX_ABOUT:
+        raise _bad(path, "is not a saved world: it does not say what it is")
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                raise _bad(path, "holds more than 4 GiB")
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except FileNotFoundError:
-        raise _bad(path, "does not exist") from None
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        zipfile.BadZipFile,
-        KeyError,
-        NotImplementedError,
-        MemoryError,
-        RuntimeError,
-    ) as error:
-        raise _bad(path, f"cannot be read: {error}") from None
-    except CompileError:
-        raise
-    except Exception as error:  # a damaged archive raises whatever its codec likes
-        raise _bad(path, f"is damaged: {error}") from None
+        about = parse_json(str(archive.read("about")).encode())
+        if not isinstance(about, dict) or about.get("format") != FORMAT:
+            raise _bad(path, f"was saved in another format than {FORMAT}")
+        palette = {int(number): str(name) for number, name in about["palette"].items()}
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise _bad(path, f"is not a saved world: {type(error).__name__} {words}") from None
+    return palette, str(about.get("ruleset"))[:100]
 
 
-def _numbers(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
-    """Our id for each of the file's, uint8 [256]; reports elements that we do not have."""
+def _shape(archive: Archive, sim: Simulator, path: Path) -> tuple[int, ...]:
+    """[worlds, rows, columns], if the arrays are not larger than those of such worlds can be."""
+    header = archive.headers.get(IDS)
+    if header is None or header.dtype != np.uint8 or len(header.shape) != 3 or 0 in header.shape:
+        raise _bad(path, "is not a saved world: it has no elements [worlds, rows, columns]")
+    cells = prod(header.shape)
+    check_saved(path, header.shape)
+    a_cell = sum(max(1, slot.planes) * np.dtype(slot.dtype).itemsize for slot in sim.slots)
+    if archive.size > MORE + 2 * cells * a_cell:
+        raise _bad(path, f"is not a saved world: it has {archive.size:,} bytes of arrays for {cells:,} cells")
+    return header.shape
+
+
+def check_saved(path: Path, shape: tuple[int, ...]) -> None:
+    """Raises CompileError (PD607) for worlds [worlds, rows, columns] that are too many for a file."""
+    if prod(shape) > MAX_CELLS:
+        size = "×".join(f"{side:,}" for side in shape)
+        helps = (f"the worlds of a file have at most {MAX_CELLS:,} cells together",)
+        raise failure("PD607", f"{path}: {size} cells", helps=helps)
+
+
+def _clock(archive: Archive, name: str, path: Path) -> Any:
+    header = archive.headers.get(name)
+    batch = archive.headers[IDS].shape[:1]
+    if header is None or header.dtype.kind not in "iu" or header.shape != batch:
+        raise _bad(path, f"is not a saved world: its arrays do not fit together (`{name}`)")
+    values = archive.read(name).astype(np.int64)
+    if (values < 0).any():
+        raise _bad(path, f"is not a saved world: `{name}` is below 0")
+    return values
+
+
+def _translated(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
+    """The file's ids as ours, uint8; reports elements that we do not have."""
+    if ids.dtype != np.uint8:
+        raise _bad(path, f"is not a saved world: elements are bytes, found {ids.dtype}")
     ours = {element.qualified: element.id for element in sim.ruleset.elements}
-    table = np.zeros(256, np.uint8)
-    for number in np.unique(ids).tolist():
+    table = bytearray(256)
+    data = ids.tobytes()
+    for number in sorted(set(data)):
         name = palette.get(number)
         if name is None:
             raise _bad(path, f"has the id {number}, which is not in its palette")
@@ -139,7 +175,7 @@ def _numbers(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> A
                 f"load the pack `{name.split('.')[0]}` too",
             )
         table[number] = ours[name]
-    return table
+    return np.frombuffer(data.translate(table), np.uint8).reshape(ids.shape)
 
 
 def _bad(path: Path, problem: str) -> CompileError:

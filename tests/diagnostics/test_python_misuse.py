@@ -11,6 +11,7 @@ import pytest
 
 import powderdsl
 from powderdsl.diagnostics import CompileError
+from powderdsl.envs.tensor_env import TensorEnv
 
 NAN = float("nan")
 SHAPE = (2, 4, 5)
@@ -47,9 +48,24 @@ def step(**rest: Any) -> Callable[[], Any]:
     return lambda: simulator().step(world(), **rest)
 
 
+def env(**how: Any) -> Callable[[], Any]:
+    return lambda: TensorEnv("sand-pushing", **how)
+
+
 ROWS: list[tuple[str, Callable[[], Any], type[Exception], str]] = [
     # what is done, how, what is raised, what the message names
     ("ids that are fractions", make(full(0.5)), TypeError, "ids"),
+    ("a ledger of a name", lambda: powderdsl.ledger("core"), TypeError, "Ruleset"),  # type: ignore[arg-type]
+    ("a ledger of nothing", lambda: powderdsl.ledger(None), TypeError, "Ruleset"),  # type: ignore[arg-type]
+    ("saving nothing", lambda: powderdsl.save(None, "x.npz"), TypeError, "World"),  # type: ignore[arg-type]
+    (
+        "loading into rules",
+        lambda: powderdsl.load_world("x.npz", simulator().ruleset),  # type: ignore[arg-type]
+        TypeError,
+        "Simulator",
+    ),
+    ("a thousand million worlds", env(num_envs=10**9), ValueError, "num_envs"),
+    ("worlds beyond all integers", env(num_envs=10**30), ValueError, "num_envs"),
     ("ids that are flags", make(full(True)), TypeError, "ids"),
     ("ids that are complex", make(full(1j)), TypeError, "ids"),
     ("ids that are text", make("sand"), TypeError, "ids"),
@@ -134,6 +150,8 @@ DIAGNOSTICS: list[tuple[str, Callable[[], Any], str]] = [
     ("rules by number", lambda: powderdsl.load(3), "PD304"),  # type: ignore[arg-type]
     ("a backend of others", lambda: powderdsl.compile("life", backend="jax"), "PD701"),
     ("a device of others", lambda: powderdsl.compile("life", device="gpu"), "PD701"),
+    ("a device without values", lambda: powderdsl.compile("life", device="meta"), "PD701"),
+    ("an extension's device", lambda: powderdsl.compile("life", device="privateuseone"), "PD701"),
     ("a world that is not there", lambda: powderdsl.load_world("nowhere.npz", simulator()), "PD602"),
 ]
 

@@ -1,0 +1,100 @@
+"""Whether values can be held by cells, some cells at a time: a check takes many times the memory of what it checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from powderdsl.model.state import SNAP, Slot
+from powderdsl.model.types import Ruleset
+
+CHUNK = 1 << 20
+"""Cells that are looked at together."""
+
+
+def check_ids(ids: Tensor, known: Tensor, name: str, ruleset: Ruleset) -> None:
+    """Raises ValueError for ids that a ruleset does not have. `known`: bool [256]."""
+    start = 0
+    for part in ids.reshape(-1).split(CHUNK):
+        values = part.to(torch.int64)
+        good = (values >= 0) & (values < 256) & known[values.clamp(0, 255)]
+        if not bool(good.all()):
+            at = int((~good).nonzero()[0])
+            place = [int(one) for one in np.unravel_index(start + at, tuple(ids.shape))]
+            raise ValueError(f"{name}{place} is {int(values[at])}: no element of {ruleset.name} has this id")
+        start += len(part)
+
+
+def looked_up(table: Tensor, ids: Tensor, dtype: torch.dtype) -> Tensor:
+    """The entry of a table [256] or [256, 2] for each of the ids [B, H, W]: of `dtype`, [B, H, W] or [B, 2, H, W]."""
+    vectors = table.ndim == 2
+    shape = (len(ids), 2, *ids.shape[1:]) if vectors else ids.shape
+    out = torch.empty(shape, dtype=dtype, device=ids.device)
+    for rows in _rows(ids):
+        found = table[ids[:, rows].int()]
+        if vectors:
+            out[:, :, rows] = found.movedim(-1, 1)
+        else:
+            out[:, rows] = found
+    return out
+
+
+def _rows(ids: Tensor) -> Iterator[slice]:
+    """The rows of worlds [B, H, W] in parts."""
+    batch, height, width = ids.shape
+    step = max(1, CHUNK // max(1, batch * width))
+    return (slice(start, start + step) for start in range(0, height, step))
+
+
+def checked_reals(tensor: Tensor, slot: Slot) -> Tensor:
+    """Values as a float32 slot holds them, in memory of their own. Raises ValueError."""
+    if not bool(torch.isfinite(tensor).all()):
+        raise ValueError(f"{slot.name} has values that are not finite")
+    real = tensor.to(torch.float32).clamp(slot.kind.lo, slot.kind.hi).contiguous()
+    for part in real.view(-1).split(CHUNK):
+        part.masked_fill_(part.abs() < SNAP, 0)
+    return real
+
+
+def checked_integers(
+    tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, known: Tensor, ruleset: Ruleset
+) -> Tensor:
+    """Values [B, H, W] as a slot of integers holds them, in memory of their own.
+
+    Args:
+        ids: of the cells. usual: what cells have that cannot hold a value of their own, [256] by id; None for the
+            slot's default. known: bool [256], the ids of the ruleset.
+
+    Raises:
+        TypeError, ValueError: values that the slot cannot hold, or not in these cells.
+    """
+    out = torch.empty(tensor.shape, dtype=getattr(torch, slot.dtype), device=ids.device)
+    for rows in _rows(ids):
+        out[:, rows] = _integers(tensor[:, rows], ids[:, rows], slot, usual, known, ruleset)
+    return out
+
+
+def _integers(
+    tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, known: Tensor, ruleset: Ruleset
+) -> Tensor:
+    kind = slot.kind
+    if tensor.dtype.is_floating_point and not bool((tensor == tensor.round()).all()):
+        raise TypeError(f"{slot.name} takes whole numbers, found {tensor.dtype}")
+    whole = tensor.to(torch.int64)
+    if kind.name == "element":
+        check_ids(whole, known, slot.name, ruleset)
+    lo, hi = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(kind.name, (kind.lo, kind.hi))
+    if bool(((whole < lo) | (whole > hi)).any()):
+        raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {int(whole.min())}..{int(whole.max())}")
+    prop = ruleset.property(slot.name)
+    limited = prop.stored if prop is not None else slot.of
+    if limited is not None:
+        default = torch.full_like(whole, int(slot.default)) if usual is None else usual[ids.int()].long()
+        holders = torch.isin(ids.long(), torch.tensor(sorted(limited), device=ids.device))
+        if bool(((whole != default) & ~holders).any()):
+            names = ", ".join(e.name for e in ruleset.elements if e.id in limited)
+            raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
+    return whole
