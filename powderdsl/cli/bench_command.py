@@ -86,12 +86,13 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @click.option("--seed", type=WholeType(0, 2**63 - 1), default=0, show_default=True, help="Of the worlds.")
 @set_option
 @click.option("--profile", is_flag=True, help="What each pass costs.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object with every figure, instead of tables.")
 @click.option(
-    "--json",
+    "--out",
     "data",
     type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write every figure and every round.",
+    metavar="FILE.json",
+    help="Where else to write the JSON object.",
 )
 @click.option(
     "--plot",
@@ -115,6 +116,7 @@ def command(
     seed: int,
     settings: dict[str, str],
     profile: bool,
+    as_json: bool,
     data: Path | None,
     plot: Path | None,
 ) -> int:
@@ -147,7 +149,7 @@ def command(
             profile=profile,
         )
     report, interrupt = _measured(plan)
-    click.echo(report_text(report))
+    click.echo(json.dumps(report_data(report), indent=2) if as_json else report_text(report))
     if data is not None:
         _write_json(data, report)
     if plot is not None and report.cells:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK, counted, write_diagnostics
+from powderdsl.cli.options import layout_options
 from powderdsl.cli.plain_table import table
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
@@ -33,14 +34,7 @@ ALWAYS_TOLD = ("PD515",)
 
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
-@click.option(
-    "--format",
-    "layout",
-    type=click.Choice(("text", "short", "json")),
-    default="text",
-    show_default=True,
-    help="Full text with carets, one line each, or one JSON list.",
-)
+@layout_options("One JSON list instead of text.", ("short", "One line for each mistake, without carets."))
 @click.option("--notes", is_flag=True, help="Also list what is worth knowing, such as rules that are asleep.")
 @click.option("--warnings-as-errors", is_flag=True, help="Exit with 1 if there are warnings.")
 @click.option("--quick", is_flag=True, help="Do not try invariants: only what the rules themselves say.")

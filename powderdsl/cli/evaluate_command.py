@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import ManyWords, WholeType, check_writable, packs_option, set_option
+from powderdsl.cli.options import (
+    ManyWords,
+    WholeType,
+    check_writable,
+    layout_options,
+    packs_option,
+    set_option,
+)
 from powderdsl.cli.plain_table import table
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import BACKENDS
@@ -55,14 +62,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
     "--backend", type=click.Choice(list(BACKENDS)), help="What runs the rules.  [default: the run's]"
 )
 @click.option("--device", help="A torch device.  [default: the run's]")
-@click.option(
-    "--format",
-    "layout",
-    type=click.Choice(("text", "json")),
-    default="text",
-    show_default=True,
-    help="A table, or one JSON object.",
-)
+@layout_options("One JSON object instead of a table.")
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="FILE.json", help="Where else to write the JSON object."
 )

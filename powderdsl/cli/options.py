@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -21,6 +22,29 @@ Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 MAX_SIDE = 1 << 24
 """Rows or columns of a world; how many cells it may have is the worlds' business."""
+
+
+def layout_options(about: str, *more: tuple[str, str]) -> Callable[[Decorated], Decorated]:
+    """`--json` as every command has it, passed on as `layout`: ``text``, ``json``, or one of `more` (flag, help).
+
+    `--format LAYOUT` means the same; it was the spelling of some commands, and is no longer shown.
+    """
+    flags = (("json", about), *more)
+
+    def decorate(function: Decorated) -> Decorated:
+        @wraps(function)
+        def command(*args: Any, layout: str | None, **values: Any) -> Any:
+            asked = [name for name, _ in flags if values.pop(f"as_{name}")] + ([layout] if layout else [])
+            return function(*args, layout=asked[0] if asked else "text", **values)
+
+        names = ("text", *(name for name, _ in flags))
+        option = click.option("--format", "layout", type=click.Choice(names), hidden=True)
+        decorated = option(command)
+        for name, help_text in reversed(flags):
+            decorated = click.option(f"--{name}", f"as_{name}", is_flag=True, help=help_text)(decorated)
+        return decorated  # type: ignore[return-value]
+
+    return decorate
 
 
 class WholeType(click.ParamType):

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from powderdsl.cli.exits import BadInput, colour_wanted
-from powderdsl.cli.options import WholeType, load_rules, set_option
+from powderdsl.cli.options import WholeType, layout_options, load_rules, set_option
 from powderdsl.cli.plain_table import Painted, table
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
@@ -23,14 +23,7 @@ from powderdsl.tasks.task_names import is_task
 
 @click.command("show")
 @click.argument("rules", metavar="RULES|TASK")
-@click.option(
-    "--format",
-    "layout",
-    type=click.Choice(("text", "json")),
-    default="text",
-    show_default=True,
-    help="Tables, or one JSON object.",
-)
+@layout_options("One JSON object instead of tables.")
 @set_option
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
 @click.option("--split", default="train", show_default=True, help="Of a task: which worlds.")

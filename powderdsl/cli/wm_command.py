@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import Decorated, ManyWords, WholeType, backend_option, check_writable, set_option
+from powderdsl.cli.options import (
+    Decorated,
+    ManyWords,
+    WholeType,
+    backend_option,
+    check_writable,
+    layout_options,
+    set_option,
+)
 from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -220,7 +228,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     default=0,
     help="Test under so many rulesets that training never saw.",
 )
-@click.option("--format", "layout", type=click.Choice(["text", "json"]), default="text", show_default=True)
+@layout_options("One JSON object instead of a table.")
 @click.option("--out", metavar="FILE", type=click.Path(path_type=Path), help="[default: RUN/evaluation.json]")
 @_machine_options
 def eval_command(

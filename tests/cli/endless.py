@@ -90,7 +90,7 @@ COMMANDS = {
         ),
         "model/checkpoints/[0-9]*.pt",
     ),
-    "bench": Endless(("bench", "life", "--backend", "torch", "--seconds", "3600", "--json", "x.json"), ""),
+    "bench": Endless(("bench", "life", "--backend", "torch", "--seconds", "3600", "--out", "x.json"), ""),
     "fuzz": Endless(
         ("fuzz", "--jobs", "2", "--seeds", "0..900000", "--backends", "dense,native", "--save", "found"),
         "tmp/.powderdsl-*/*",

@@ -21,7 +21,7 @@ def _folder(tmp_path, monkeypatch):
 
 
 def test_all_combinations_are_measured(tmp_path):
-    result = powderdsl(*DENSE, "--backend", "reference", "--batch", "3", "--json", "x.json", "--profile")
+    result = powderdsl(*DENSE, "--backend", "reference", "--batch", "3", "--out", "x.json", "--profile")
     assert result.exit_code == 0
     data = json.loads((tmp_path / "x.json").read_text())
     measured = [(cell["backend"], cell["batch"]) for cell in data["cells"]]
@@ -56,7 +56,7 @@ def test_parameters_can_be_set():
         (["life", "--seconds", "nan"], "seconds"),
         (["life", "--seconds", "-1"], "seconds"),
         (["life", "--device", "abacus"], "PD701"),
-        (["life", "--json", "no/such/folder.json"], "PD613"),
+        (["life", "--out", "no/such/folder.json"], "PD613"),
         (["life", "--plot", "no/such/folder.png"], "PD613"),
     ],
 )
@@ -91,7 +91,7 @@ def test_ctrl_c_reports_what_was_measured(monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_command, "measure_events", interrupted)
-    result = powderdsl(*DENSE, "--json", "x.json")
+    result = powderdsl(*DENSE, "--out", "x.json")
     assert result.exit_code == exits.INTERRUPTED
     assert "interrupted: 1 of 2 rounds" in result.stdout
     data = json.loads((tmp_path / "x.json").read_text())

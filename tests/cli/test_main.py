@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 
 import click
@@ -186,3 +187,41 @@ def test_a_closed_pipe_is_no_mistake():
         running.stdout.close()
         assert "Traceback" not in running.stderr.read()
         running.wait(timeout=60)
+
+
+JSON = {
+    "check life": ("check", "life"),
+    "show life": ("show", "life"),
+    "test life": ("test", "life", "--drawn", "0", "--examples", "0", "--no-keep"),
+    "cache list": ("cache", "list"),
+    "trace life": ("trace", "life", "--at", "1,1", "--step", "1", "--size", "8", "--backend", "reference"),
+    "bench life": (
+        "bench",
+        "life",
+        "--backend",
+        "torch",
+        "--seconds",
+        "0.01",
+        "--rounds",
+        "1",
+        "--size",
+        "8",
+    ),
+}
+
+
+@pytest.mark.parametrize("arguments", JSON.values(), ids=JSON)
+def test_json_has_one_spelling(arguments):
+    result = powderdsl(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    json.loads(result.stdout)
+    assert "--json" in powderdsl(*arguments[: 2 if arguments[0] == "cache" else 1], "--help").stdout
+
+
+@pytest.mark.parametrize("command", ["check", "show"])
+def test_the_older_spelling_still_works_and_is_not_shown(command):
+    assert (
+        powderdsl(command, "life", "--format", "json").stdout == powderdsl(command, "life", "--json").stdout
+    )
+    assert powderdsl(command, "life", "--format", "text").stdout == powderdsl(command, "life").stdout
+    assert "--format" not in powderdsl(command, "--help").stdout
