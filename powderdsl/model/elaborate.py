@@ -22,6 +22,7 @@ from powderdsl.model.operands import (
     conjunction,
     constant,
 )
+from powderdsl.model.qualified import certain
 from powderdsl.model.scope import IDENTITY, Matrix, Scope, turned
 from powderdsl.model.symbols import default_of, read_kind, stream_ident
 from powderdsl.model.types import (
@@ -380,6 +381,8 @@ class Elaborator:
         """The field that is assigned, its kind, and where."""
         operand: Operand
         offset = (0, 0)
+        if syntax.kind == "optional_attribute":
+            syntax = certain(self.typer, syntax, scope)
         if syntax.kind == "attribute":
             base = self._owner(syntax, scope)
             offset = self.typer.offset(base.offset, syntax.span)

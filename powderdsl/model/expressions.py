@@ -34,6 +34,7 @@ from powderdsl.model.operands import (
     look,
     negation,
 )
+from powderdsl.model.qualified import of_pack, optional_attribute
 from powderdsl.model.scope import IDENTITY, Scope, turned
 from powderdsl.model.symbols import Symbols
 from powderdsl.model.types import CHANCE, DIRECTION, DRAW, ELEMENT, FLAG, Expr, Kernel
@@ -225,9 +226,9 @@ class Typer(Coercer):
                 self.used.add(qualified)
                 param = self.symbols.params[qualified]
                 return Expr("param", param.kind, value=qualified, span=syntax.span)
-        qualified_operand = self._of_pack(syntax, scope)
-        if qualified_operand is not None:
-            return qualified_operand
+        own = of_pack(self, syntax, scope)
+        if own is not None:
+            return own
         base = self.evaluate(base_syntax, scope)
         word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
         if isinstance(base, Absent):
@@ -261,21 +262,6 @@ class Typer(Coercer):
                     helps=(f"write `{text}`",),
                 )
         raise self.wrong(value, "a field, property or neighbour after the dot", word)
-
-    def _of_pack(self, syntax: Syntax, scope: Scope) -> Operand | None:
-        """``pack.name``, or ``below.pack.name``: what one pack defines, whatever others call theirs."""
-        (pack,) = syntax.children
-        if pack.kind not in ("name", "optional_name", "attribute"):
-            return None
-        name = self.symbols.composition.names.qualified(pack.text, syntax.text)
-        inner = Scope("", scope.locals, scope.orientation)
-        if name is None or self.find(pack.text, pack.span, inner) is not None:
-            return None
-        found = self.find(name, syntax.span, Scope("", {}, scope.orientation))
-        if pack.kind == "attribute" and isinstance(found, Expr):
-            place = self.place(self.evaluate(pack.children[0], scope), pack.children[0].span)
-            return look(found, place.offset, syntax.span)
-        return found if pack.kind != "attribute" else None
 
     # Literals and lists
 
@@ -446,6 +432,7 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "name": Typer.name,
     "optional_name": Typer.optional_name,
     "attribute": Typer.attribute,
+    "optional_attribute": optional_attribute,
     "integer": Typer.number,
     "decimal": Typer.number,
     "percent": Typer.number,

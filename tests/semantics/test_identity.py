@@ -242,3 +242,18 @@ def test_names_of_strangers_hide_nothing() -> None:
     rules = powderdsl.load("core", mine, theirs)
     assert [element.name for element in rules.elements] == ["empty", "wall", "reed", "pace", "damp", "wet"]
     assert powderdsl.load("core", theirs, mine).element("reed")
+
+
+def test_names_after_a_dot_may_be_absent() -> None:
+    mine = pack("mine", '  bee: {color: "#306030"}', "passes:\n  buzz:\n    do:\n"
+                "      - bee -> one.slime? if below is one.slime? and below.wet? > 1\n"
+                "    then: bee swaps above if above is empty, then above.one.wet? += 1\n")  # fmt: skip
+    rules, notes = load_with_diagnostics("core", mine)
+    asleep = [note.message for note in notes if note.code == "PD506" and "mine" in str(note.primary.span)]
+    assert asleep == [
+        "this rule is asleep: `wet` is not loaded",
+        "this rule is asleep: `one.wet` is not loaded",
+    ]
+    rules, notes = load_with_diagnostics("core", "one.yaml", mine)
+    buzz = next(one for one in rules.passes if one.name == "buzz")
+    assert [len(moment.rules) for moment in buzz.moments] == [1, 1]
