@@ -52,9 +52,7 @@ def certain(typer: Typer, syntax: Syntax, scope: Scope) -> Syntax:
         return plain
     if symbols.composition.names.qualified(before.text, syntax.text) is not None:
         return plain
-    packs = {pack.name.text for pack in symbols.composition.packs}
-    unknown = before.kind == "name" and typer.find(before.text, before.span, scope) is None
-    if unknown or (before.kind == "attribute" and before.text in packs):
+    if before.kind in ("name", "attribute") and typer.find(before.text, before.span, scope) is None:
         raise Asleep(qualified)
     if typer.find(syntax.text, syntax.span, scope) is None:
         raise Asleep(syntax.text)
