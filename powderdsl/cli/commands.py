@@ -71,7 +71,7 @@ class CommandGroup(click.Group):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")
         options["standalone_mode"] = False
-        if os.environ.get(LIFELINE):
+        if os.environ.pop(LIFELINE, None):
             end_with_stdin()
         # Without arguments of a caller's, the command is all that this process does.
         with printable_streams(), interruptible(until_exit=args is None) as over:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import lru_cache
+from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
@@ -64,10 +65,17 @@ def check_study(study: Study, reporter: Reporter, find: Callable[[tuple[str, ...
     check_unused(check.places)
 
 
+Pairs = tuple[tuple[str, Any], ...]
+
+
+def _task(text: str, knobs: Pairs = (), params: Pairs = ()) -> Task:
+    path = Path(text)
+    return _loaded(text, knobs, params, path.stat().st_mtime_ns if path.is_file() else 0)
+
+
 @lru_cache(maxsize=64)
-def _task(
-    text: str, knobs: tuple[tuple[str, int], ...] = (), params: tuple[tuple[str, str], ...] = ()
-) -> Task:
+def _loaded(text: str, knobs: Pairs, params: Pairs, stamp: int) -> Task:
+    """A task, once for all of its uses; `stamp` tells versions of a file apart."""
     return load_task(text, knobs=dict(knobs), params=dict(params))
 
 
@@ -306,6 +314,13 @@ class _StudyCheck:
             for word in varied:
                 message = f"`{word.option}` says which rulesets are drawn: `rulesets` says how many"
                 self.report(word, step, message)
+        for word in words.get("swap", ()):
+            known = [one.name for one in task.ruleset.properties]
+            if not words.get("rules") and word.filled not in known:
+                message = f"the rules {task.ruleset.name} have no property `{word.filled}`"
+                self.report(
+                    word, step, message, code="PD301", helps=suggest(word.filled, known, "properties")
+                )
         for word in varied:
             value = given.get(VARIETY[word.option])
             if word.option in ("chances", "leave-out") and value is not None:
@@ -322,7 +337,9 @@ class _StudyCheck:
                 self.run(step, on)
             return
         made = self.places.maker(step)
+        learned: list[str] = []
         while made.command != ("wm", "train") and made.on_step:
+            learned += [word.filled for word in self.places.words(made, values).get("packs", ())]
             made = self.places.maker(made)
         if made.command != ("wm", "train"):
             return
@@ -338,8 +355,21 @@ class _StudyCheck:
         rules = _first(before, "rules")
         self.rules(step, words, name, None if rules is None else rules.filled)
         if step.command == ("wm", "eval"):
+            if rules is None and not words.get("rules"):
+                added = [one.filled for one in before.get("packs", ())]
+                self.only(step, words, [*_task(name).ruleset.packs, *added, *learned])
             self.knobs_and_params(step, words, name if word is None else word.filled, task)
             self.split(step, words, task)
+
+    def only(self, step: Step, words: Words, packs: Sequence[str]) -> None:
+        """Whether worlds can draw elements of some packs alone. Packs from files are not asked for their names."""
+        if any("." in pack for pack in packs):
+            return
+        for word in words.get("only", ()):
+            if word.filled not in packs:
+                helps = suggest(word.filled, packs, "packs")
+                message = f"the rules have no pack `{word.filled}`"
+                self.report(word, step, message, code="PD304", helps=helps)
 
     def rules(self, step: Step, words: Words, task: str, base: str | None = None) -> None:
         """The rules of a step, and packs that are added or left out. `base`: those that a network was trained on."""

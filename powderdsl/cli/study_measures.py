@@ -36,6 +36,7 @@ def check_measure(places: Places, measure: Measure, task_of: Callable[[Step, Val
         one
         for one in places.study.steps
         if one.on_step
+        and not (one.command == ("wm", "eval") and "out" in dict(one.options))  # it writes there instead
         and (maker := places.maker(one)).name == measure.step
         and maker.command in EVALUATES.get(one.command, ())
     ]
