@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.names import Names
@@ -49,6 +50,25 @@ def title_of(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
     gone = [f"-{name}" for name in members if name not in loaded]
     added = [f"+{name}" for name in loaded if name not in members]
     return "".join(["+".join(one.name.text for one in named), *gone, *added])
+
+
+def names_left_out(ruleset: RulesetDecl | None) -> frozenset[str]:
+    """What the packs define that are left out of a ruleset: its own lines may ask for it as if there were a `?`."""
+    found: set[str] = set()
+    for pack in ruleset.left_out if ruleset else ():
+        found |= {decl.name.text for decl in pack.elements}
+        found |= {decl.name.text for decl in (*pack.properties, *pack.fields)}
+        found |= {decl.name.text for decl in pack.streams} | {decl.name.text for decl in pack.kernels}
+        found |= {scalar.text for scalar, _ in pack.tags} | {scalar.text for scalar, _ in pack.sets}
+    return frozenset(found)
+
+
+def with_optional(syntax: Syntax, names: frozenset[str]) -> Syntax:
+    """The expression with a `?` behind some names."""
+    kind = "optional_name" if syntax.kind == "name" and syntax.text in names else syntax.kind
+    return replace(
+        syntax, kind=kind, children=tuple(with_optional(child, names) for child in syntax.children)
+    )
 
 
 def words_of(syntax: Syntax) -> Iterator[str]:

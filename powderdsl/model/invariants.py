@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from powderdsl.diagnostics import Reporter, Span, suggest
-from powderdsl.model.claim_scopes import words_of
+from powderdsl.model.claim_scopes import names_left_out, with_optional, words_of
 from powderdsl.model.compose import Composition
 from powderdsl.model.declarations import RulesetDecl
 from powderdsl.model.expressions import Typer
@@ -56,8 +56,9 @@ def check_invariants(
     """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(pack.name.text, line, None) for pack in composition.packs for line in pack.invariants]
+    gone = names_left_out(composition.ruleset) - composition.names.owners.keys()
     for ruleset in composition.ruleset.lineage if composition.ruleset else ():
-        written += [(ruleset.name.text, line, ruleset) for line in ruleset.invariants]
+        written += [(ruleset.name.text, with_optional(line, gone), ruleset) for line in ruleset.invariants]
     found = []
     reporter = typer.reporter
     for pack, line, author in written:

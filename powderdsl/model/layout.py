@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from powderdsl.diagnostics import Reporter, suggest
+from powderdsl.model.claim_scopes import names_left_out
 from powderdsl.model.compose import Composition
 from powderdsl.model.symbols import Symbols
 from powderdsl.model.types import Element, MatrixChannel, Move, Pass, Swap, Transform
@@ -33,6 +34,7 @@ def matrix_channels(
     size = own_slots(composition)
     first = [MatrixChannel(by_id[n].name if n in by_id else "", id=n) for n in range(size)]
     written = composition.ruleset.placing.matrix if composition.ruleset else ()
+    gone = names_left_out(composition.ruleset)
     if written:
         for scalar in written:
             name = scalar.text.removesuffix("?")
@@ -40,7 +42,8 @@ def matrix_channels(
                 channels += first
                 continue
             found = _named(name, composition, symbols)
-            if not found and not scalar.text.endswith("?"):
+            waits = scalar.text.endswith("?") or not gone.isdisjoint(name.split("."))
+            if not found and not waits:
                 known = ["elements", *symbols.properties, *symbols.fields]
                 helps = [
                     *suggest(name.partition(".")[0], known, "channels"),

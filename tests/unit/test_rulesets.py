@@ -99,6 +99,22 @@ def test_leaving_a_pack_out_leaves_its_parameters_out() -> None:
     assert library.load("wet.yaml-water").packs == ("core", "sand")
 
 
+def test_lines_of_a_ruleset_about_what_is_left_out_sleep() -> None:
+    lines = "matrix: [elements, density, whiff]\ninvariants: [count(grit) never rises, wall never changes]\n"
+    write(
+        {
+            "grit": PACK + "fields: {whiff: {type: 0..9, at: place}}\n",
+            "airy": f"ruleset: airy\npacks: [core, grit]\n{lines}",
+            "still": "ruleset: still\nextends: airy\nwithout: grit\n",
+        }
+    )
+    for rules in ("airy.yaml-grit", "still.yaml"):
+        found = library.load(rules)
+        assert [one.span.text for one in found.invariants if one.pack == "airy"] == ["wall never changes"]
+        assert (found.matrix[-1].name, found.matrix[-1].source) == ("whiff", "")
+    assert len(library.load("airy.yaml").invariants) == 5
+
+
 # What is wrong
 
 
