@@ -22,7 +22,7 @@ from powderdsl.model.operands import (
     conjunction,
     constant,
 )
-from powderdsl.model.qualified import certain
+from powderdsl.model.qualified import certain, of_pack
 from powderdsl.model.scope import IDENTITY, Matrix, Scope, turned
 from powderdsl.model.symbols import default_of, read_kind, stream_ident
 from powderdsl.model.types import (
@@ -383,7 +383,12 @@ class Elaborator:
         offset = (0, 0)
         if syntax.kind == "optional_attribute":
             syntax = certain(self.typer, syntax, scope)
-        if syntax.kind == "attribute":
+        own = of_pack(self.typer, syntax, scope) if syntax.kind == "attribute" else None
+        if isinstance(own, Expr) and own.op == "look":
+            operand, offset = own.args[0], own.value
+        elif own is not None:
+            operand = own
+        elif syntax.kind == "attribute":
             base = self._owner(syntax, scope)
             offset = self.typer.offset(base.offset, syntax.span)
             word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
