@@ -56,8 +56,6 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
         return Verdict("killed", "check", min(new))
     if meaning(ruleset) == original.meaning:
         return Verdict("equivalent", "the same model")
-    if lowered(ruleset) == original.lowered:
-        return Verdict("equivalent", "the same program")
     sim = compile(ruleset, backend="planes")
     broken, differs = broken_invariant(original, sim)
     if broken is not None:
@@ -66,8 +64,11 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if failed is not None:
         by = "generated" if is_generated(failed) else "test"
         return Verdict("killed", by, f"{failed.pack}: {failed.name}")
-    if not differs and proven_equal(original.ruleset, ruleset):
-        return Verdict("equivalent", "the same in every case")
+    if not differs:  # proofs come last: few mutants need them
+        if lowered(ruleset) == original.lowered:
+            return Verdict("equivalent", "the same program")
+        if proven_equal(original.ruleset, ruleset):
+            return Verdict("equivalent", "the same in every case")
     return Verdict("survived")
 
 
