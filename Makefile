@@ -19,7 +19,7 @@ test test-all golden: export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all check lint types format golden wheel clean distclean
+.PHONY: help setup demo test test-all check lint types format golden wheel clean distclean mutation
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
@@ -65,6 +65,9 @@ types: $(VENV)/.ready  ## mypy over the package
 format: $(VENV)/.ready  ## lay the code out as `make lint` wants it
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
+
+mutation: $(VENV)/.ready  ## judge all mutants of the shipped packs, and write the table of docs/testing.md (minutes)
+	@$(BIN)/python docs/mutation_table.py --jobs $$(nproc)
 
 golden: $(VENV)/.ready  ## write the golden files anew; read the diff before committing it
 	@$(BIN)/python -m pytest --quiet -m golden --update-golden $(ARGS)

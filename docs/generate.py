@@ -7,6 +7,7 @@ A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is be
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 import textwrap
@@ -226,8 +227,35 @@ def mutations() -> str:
     return table(("pack", "mistake", "noticed by"), rows)
 
 
+def mutation_testing() -> str:
+    """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
+    from powderdsl.mutation.tally import COUNTED, by_hand_share, noticed_share
+
+    measured = json.loads((DOCS / "mutation.json").read_text(encoding="utf-8"))
+    rows = []
+    total = dict.fromkeys(COUNTED, 0)
+    for entry in measured.values():
+        for pack, counts in entry["packs"].items():
+            rows.append((f"`{pack}`", counts))
+            total = {key: total[key] + counts[key] for key in COUNTED}
+    shown = [key for key in COUNTED if key != "killed"]
+    return table(
+        ("pack", *shown, "noticed", "by hand"),
+        (
+            (
+                name,
+                *(str(counts[key]) for key in shown),
+                f"{100 * noticed_share(counts):.1f} %",
+                f"{100 * by_hand_share(counts):.0f} %",
+            )
+            for name, counts in [*rows, ("**all**", total)]
+        ),
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "mutations": mutations,
+    "mutation testing": mutation_testing,
     "directions": directions,
     "direction sets": direction_sets,
     "kernels": kernels,

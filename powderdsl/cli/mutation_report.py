@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,13 +107,13 @@ def _because(outcome: Outcome) -> str:
 
 def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
     """How many there were, and what noticed them."""
-    counts = tally([outcome for _, outcome in found])
-    real = counts["mutants"] - counts["equivalent"]
-    share = f"{100 * counts['killed'] / real:.1f} %" if real else "none"
+    from powderdsl.mutation.tally import noticed_share, tally
+
+    counts = tally(outcome for _, outcome in found)
     by = ", ".join(f"{counts[key]} by {words}" for key, words in WORDS.items())
     return (
         f"{counted(counts['mutants'], 'mutant')}, {counts['equivalent']} equivalent,"
-        f" {counts['killed']} noticed ({by}), {counts['survived']} survived: {share}"
+        f" {counts['killed']} noticed ({by}), {counts['survived']} survived: {100 * noticed_share(counts):.1f} %"
     )
 
 
@@ -124,20 +123,6 @@ WORDS = {
     "test": "tests",
     "generated": "generated tests",
 }
-
-
-def tally(outcomes: Sequence[Outcome]) -> Counter[str]:
-    """Numbers of mutants: all, equivalent, killed, survived, and killed by each kind of notice."""
-    counts: Counter[str] = Counter()
-    for outcome in outcomes:
-        verdict = outcome.verdict
-        if verdict.status == "invalid":
-            continue
-        counts["mutants"] += 1
-        counts[verdict.status] += 1
-        if verdict.status == "killed":
-            counts[verdict.by] += 1
-    return counts
 
 
 def _write(found: list[tuple[Mutant, Outcome]]) -> None:
@@ -157,10 +142,12 @@ def _write(found: list[tuple[Mutant, Outcome]]) -> None:
 
 
 def _data(found: list[tuple[Mutant, Outcome]]) -> dict[str, Any]:
-    counts = tally([outcome for _, outcome in found])
-    keys = ("mutants", "equivalent", "killed", "survived", *WORDS)
+    from powderdsl.mutation.tally import tally
+
+    packs = dict.fromkeys(mutant.pack for mutant, _ in found)
     return {
-        **{key: counts[key] for key in keys},
+        **tally(outcome for _, outcome in found),
+        "packs": {pack: tally(outcome for mutant, outcome in found if mutant.pack == pack) for pack in packs},
         "list": [
             {
                 "place": mutant.place,

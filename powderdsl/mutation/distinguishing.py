@@ -69,28 +69,45 @@ def distinguish(
         focus: ids of elements that are likely to matter: they are in most of the worlds.
         seed: other worlds for another seed, the same for the same.
     """
-    for names, samples in _searches(first, second, focus, seed):
-        for sample, steps in samples:
-            when = differs_after(first, second, sample, steps, names)
-            found = np.nonzero(when)[0]
-            if len(found):
-                best = int(found[when[found].argmin()])
-                return _small(first, second, sample.one(best), int(when[best]), names)
+    names = _shared(first, second)
+    only_fields: tuple[Sample, int] | None = None
+    for sample, steps in fresh_samples(first.ruleset, focus, seed):
+        one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
+        found = _soonest(_differs(one, other, ("element",)))
+        if found is not None:
+            return _small(first, second, sample.one(found[0]), found[1], ("element",))
+        found = _soonest(_differs(one, other, names))
+        if found is not None and only_fields is None:
+            only_fields = sample.one(found[0]), found[1]
+    if only_fields is None and len(names) > 1 and set(first.slots) == set(second.slots):
+        only_fields = _with_fields(first, second, names, seed)
+    return None if only_fields is None else _small(first, second, *only_fields, names)
+
+
+def _shared(first: Simulator, second: Simulator) -> tuple[str, ...]:
+    """What both hold, elements first."""
+    known = {slot.name for slot in second.slots}
+    return tuple(slot.name for slot in first.slots if slot.name in known)
+
+
+def _soonest(when: Array) -> tuple[int, int] | None:
+    """The world that differs soonest, and after how many steps."""
+    found = np.nonzero(when)[0]
+    if not len(found):
+        return None
+    best = int(found[when[found].argmin()])
+    return best, int(when[best])
+
+
+def _with_fields(
+    first: Simulator, second: Simulator, names: tuple[str, ...], seed: int
+) -> tuple[Sample, int] | None:
+    """A world that differs, of those whose fields hold anything that they can."""
+    for sample, steps in _fielded_samples(first.ruleset, seed):
+        found = _soonest(differs_after(first, second, sample, steps, names))
+        if found is not None:
+            return sample.one(found[0]), found[1]
     return None
-
-
-def _searches(
-    first: Simulator, second: Simulator, focus: Sequence[int], seed: int
-) -> Iterator[tuple[tuple[str, ...], Iterator[tuple[Sample, int]]]]:
-    """What is looked at, and in which worlds: elements in fresh ones, then all that both hold, then in any worlds."""
-    yield ("element",), fresh_samples(first.ruleset, focus, seed)
-    shared = {slot.name: slot for slot in second.slots}
-    names = tuple(slot.name for slot in first.slots if slot.name in shared)
-    if len(names) == 1:
-        return
-    yield names, fresh_samples(first.ruleset, focus, seed)
-    if all(slot == shared.get(slot.name) for slot in first.slots):
-        yield names, _fielded_samples(first.ruleset, seed)
 
 
 def _fielded_samples(ruleset: Ruleset, seed: int) -> Iterator[tuple[Sample, int]]:
@@ -118,12 +135,15 @@ def differs_after(
     first: Simulator, second: Simulator, sample: Sample, steps: int, names: Sequence[str]
 ) -> Array:
     """After which step each world differs in one of these slots, 0 if it does not: int [B]."""
-    one, _ = run_sample(first, sample, steps)
-    other, _ = run_sample(second, sample, steps)
-    when = np.zeros(len(sample), np.int64)
-    for step in range(steps, 0, -1):
+    one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
+    return _differs(one, other, names)
+
+
+def _differs(first: list[State], second: list[State], names: Sequence[str]) -> Array:
+    when = np.zeros(len(first[0]["element"]), np.int64)
+    for step in range(len(first) - 1, 0, -1):
         for name in names:
-            wrong = (one[step][name] != other[step][name]).reshape(len(sample), -1).any(1)
+            wrong = (first[step][name] != second[step][name]).reshape(len(when), -1).any(1)
             when[wrong] = step
     return when
 

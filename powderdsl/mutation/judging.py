@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -120,9 +121,9 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
     Only such worlds are asked about the invariants.
     """
     ruleset = sim.ruleset
-    if len(ruleset.invariants) != len(original.ruleset.invariants):
-        return None, False
-    single = [one for one in ruleset.invariants if not is_paired(one.claim)]
+    broken = original_breaks(original)
+    kept = [one for number, one in enumerate(ruleset.invariants) if number not in broken]
+    single = [one for one in kept if not is_paired(one.claim)]
     any_differs = False
     if same_state(original.ruleset, ruleset):
         for batch in original.batches():
@@ -134,21 +135,38 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
                 return found, True
             if any_differs and not single:
                 break
+    found = next((one for one in kept if is_paired(one.claim) and _is_broken(one, original, sim)), None)
+    return found, any_differs or found is not None
+
+
+def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool:
+    """Whether some world breaks an invariant that needs more than one run of it."""
+    ruleset = sim.ruleset
+    if isinstance(invariant.claim, Local) and horizon(ruleset) <= invariant.claim.radius:
+        return False
+    if isinstance(invariant.claim, Symmetric) and ruleset.streams:
+        return False  # the same draws may be used in another way, and frequencies take thousands of worlds
     runs = _Mutated(sim)
-    for one in ruleset.invariants:
-        if is_paired(one.claim) and not _is_local(one, ruleset):
-            for sample in original.samples[:PAIRED]:
-                start = sample.without(one.without, ruleset)
-                wrong = breaks(one.claim, runs, start, 1).first.any()
-                if wrong and isinstance(one.claim, Symmetric) and ruleset.streams:
-                    break  # the same draws may be used in another way
-                if wrong:
-                    return one, True
-    return None, any_differs
+    samples = (sample.without(invariant.without, ruleset) for sample in original.samples[:PAIRED])
+    return any(bool(breaks(invariant.claim, runs, sample, 1).first.any()) for sample in samples)
 
 
-def _is_local(invariant: Invariant, ruleset: Ruleset) -> bool:
-    return isinstance(invariant.claim, Local) and horizon(ruleset) <= invariant.claim.radius
+@lru_cache(maxsize=4)
+def original_breaks(original: Original) -> frozenset[int]:
+    """Places of invariants that the original itself breaks: what more packs change is no news of a mutant."""
+    found = set()
+    for number, one in enumerate(original.ruleset.invariants):
+        if is_paired(one.claim):
+            broken = _is_broken(one, original, original.sim)
+        else:
+            everywhere = np.ones(1, bool)
+            broken = any(
+                _broken_in(batch, original, original.sim, [one], batch.states, everywhere) is not None
+                for batch in original.batches()
+            )
+        if broken:
+            found.add(number)
+    return frozenset(found)
 
 
 def _broken_in(

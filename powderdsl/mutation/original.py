@@ -54,7 +54,7 @@ class Batch:
     states: list[State]
 
 
-@dataclass
+@dataclass(eq=False)
 class Original:
     """A composition, loaded once for all its mutants."""
 
