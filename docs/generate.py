@@ -231,7 +231,8 @@ def mutation_testing() -> str:
     """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
     from powderdsl.mutation.tally import COUNTED, by_hand_share, noticed_share
 
-    measured = json.loads((DOCS / "mutation.json").read_text(encoding="utf-8"))
+    path = DOCS / "mutation.json"
+    measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     rows = []
     total = dict.fromkeys(COUNTED, 0)
     for entry in measured.values():

@@ -66,8 +66,8 @@ def main(arguments: list[str]) -> int:
         if not arguments or rules in arguments or set(packs) & set(arguments):
             measured[rules] = count(rules, packs, jobs)
             print(f"{rules}: {measured[rules]['seconds']} s", flush=True)
-    ordered = {rules: measured[rules] for rules in compositions() if rules in measured}
-    RESULTS.write_text(json.dumps(ordered, indent=1) + "\n", "utf-8")
+            ordered = {name: measured[name] for name in compositions() if name in measured}
+            RESULTS.write_text(json.dumps(ordered, indent=1) + "\n", "utf-8")
     import generate
 
     return generate.main([])

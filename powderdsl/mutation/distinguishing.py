@@ -12,6 +12,7 @@ import numpy as np
 
 from powderdsl.model.reactions import unchanging_ids
 from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import fitting
 from powderdsl.properties.running import run_sample
 from powderdsl.properties.samples import Array, Sample, State, random_samples
 from powderdsl.properties.shrink import Work, shrink_while
@@ -152,7 +153,8 @@ def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator
     """Worlds and how many steps they run, small ones first."""
     known = [element.id for element in ruleset.elements]
     frames = sorted(unchanging_ids(ruleset))
-    for number, (rows, columns, worlds, steps) in enumerate(ROUNDS):
+    for number, (least_rows, least_columns, worlds, steps) in enumerate(ROUNDS):
+        rows, columns = fitting(ruleset, least_rows), fitting(ruleset, least_columns)
         random = np.random.default_rng([seed, number])
         ids = np.empty((worlds, rows, columns), np.uint8)
         for group in range(0, worlds, GROUP):

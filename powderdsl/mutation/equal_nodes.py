@@ -253,6 +253,8 @@ class _Cases:
             case "count":
                 return self._count(node, at)
         parts = [self.value(part, place) for part, place in _reads(node, at)]
+        if node.op not in _EVALUATE:
+            raise Undecided
         found: Array = _EVALUATE[node.op](node, self, at, *parts).astype(np.int32)
         return found
 
@@ -348,6 +350,7 @@ _EVALUATE: dict[str, Callable[..., Any]] = {
     "add": lambda node, cases, at, a, b: a + b,
     "sub": lambda node, cases, at, a, b: a - b,
     "mul": lambda node, cases, at, a, b: a * b,
+    "quotient": lambda node, cases, at, a, b: np.where(b == 0, 0, a // np.where(b == 0, 1, b)),
     "neg": lambda node, cases, at, a: -a,
     "abs": lambda node, cases, at, a: np.abs(a),
     "min": lambda node, cases, at, a, b: np.minimum(a, b),

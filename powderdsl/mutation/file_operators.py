@@ -143,11 +143,18 @@ class _FileChanges:
                     yield from self._lost("field", (*path, (node, number)))
                 case "resets":
                     yield from self._lost("field", (*path, (node, number)))
+                case "about":
+                    continue
+                case _:  # the default of an element
+                    yield from self._line(value)
+                    yield from self._lost("field", (*path, (node, number)))
 
     def _param(self, name: str, node: Node, path: Path) -> Iterator[Change]:
         yield from self._line(node.get("default") if isinstance(node, Mapping) else node)
 
     def _kernel(self, name: str, node: Node, path: Path) -> Iterator[Change]:
+        if isinstance(node, Mapping):
+            yield from self._line(node.get("shape"))
         rows = node.get("rows") if isinstance(node, Mapping) else node
         for row in rows.items if isinstance(rows, Sequence) else (rows,):
             if not isinstance(row, Scalar):

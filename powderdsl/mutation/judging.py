@@ -89,10 +89,10 @@ def failed_test(original: Original, sim: Simulator, pack: str) -> Example | None
 
 
 def _portions(ruleset: Ruleset, pack: str) -> Iterator[list[Example]]:
-    """Tests in portions: written by hand first, then those of the mutated pack, then short ones."""
-    portions: dict[tuple[bool, bool, bool], list[Example]] = {}
+    """Tests in portions: by hand before generated, exact before counted, those of the mutated pack, short ones."""
+    portions: dict[tuple[bool, ...], list[Example]] = {}
     for one in ruleset.tests:
-        key = is_generated(one), one.pack != pack, one.steps > FEW_STEPS
+        key = is_generated(one), bool(one.often), one.pack != pack, one.steps > FEW_STEPS
         portions.setdefault(key, []).append(one)
     for key in sorted(portions):
         yield portions[key]

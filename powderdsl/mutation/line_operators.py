@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from powderdsl.model.builtins import DIRECTION_SETS
+from powderdsl.model.builtins import DIRECTION_SETS, KERNEL_SHAPES
 from powderdsl.mutation.exchangeable import Names
 from powderdsl.mutation.mutants import Change, Edit
 from powderdsl.syntax.ast import Syntax
@@ -163,7 +163,7 @@ def _own(node: Syntax, parent: Syntax | None, names: Names) -> Iterator[Change]:
         case "choose":
             yield _exchanged("arithmetic", node, children[0], children[2])
         case "call":
-            yield from _call(node)
+            yield from _call(node, names)
         case "any_of" | "all_of":
             start = node.span.start
             yield Change("connective", (Edit(start, start + 3, "all" if node.kind == "any_of" else "any"),))
@@ -181,7 +181,7 @@ def _own(node: Syntax, parent: Syntax | None, names: Names) -> Iterator[Change]:
         case "for_" if len(children) > 1:
             yield _exchanged("order", node, children[0], children[1])
         case "transform" | "swap" | "move" | "assign":
-            yield from _rule(node)
+            yield from _rule(node, names)
         case "then":
             yield from _effects(node)
         case "update":
@@ -248,9 +248,12 @@ def _exchanged(operator: str, parent: Syntax, first: Syntax, second: Syntax) -> 
     return Change(operator, (Edit(a, b, text[c:d]), Edit(c, d, text[a:b])))
 
 
-def _call(node: Syntax) -> Iterator[Change]:
+def _call(node: Syntax, names: Names) -> Iterator[Change]:
     name = node.text.split()[0]
     start = node.span.start
+    if name in ("count", "sum") and not any(_names_kernel(part, node, names) for part in node.children):
+        for kernel in ("ring", "cross"):
+            yield Change("kernel", (Edit(node.span.end - 1, node.span.end - 1, f" in {kernel}"),))
     if CALLS.get(name):
         yield Change("arithmetic", (Edit(start, start + len(name), CALLS[name]),))
     if name in ("abs", "clamp", "opposite"):
@@ -260,6 +263,9 @@ def _call(node: Syntax) -> Iterator[Change]:
             node,
             f"({node.children[0].span.text})" if name != "opposite" else node.children[0].span.text,
         )
+    for shape in KERNEL_SHAPES if name in KERNEL_SHAPES else ():
+        if shape != name:
+            yield Change("kernel", (Edit(start, start + len(name), shape),))
     if name in ("count", "min", "max") and len(node.children) > 1:
         for number in range(len(node.children)):
             yield Change("set" if name == "count" else "arithmetic", (_without(node, number),))
@@ -293,12 +299,18 @@ def _tuple(node: Syntax, parent: Syntax | None) -> Iterator[Change]:
         yield _exchanged("order", node, node.children[0], node.children[-1])
 
 
-def _rule(node: Syntax) -> Iterator[Change]:
-    """A rule without its condition or its chance, or the other way round."""
+def _rule(node: Syntax, names: Names) -> Iterator[Change]:
+    """A rule without its condition or its chance, or the other way round, or with a draw that others share."""
+    condition, chance = node.child("condition"), node.child("chance")
+    stream = next((name for name, kind in names.kinds.items() if kind == "stream"), None)
+    if condition is not None and chance is not None and stream is not None:
+        asked = f" and {stream} < {chance.children[0].span.text}"
+        end = condition.span.end
+        yield Change("stream", (Edit(end, end, asked), Edit(chance.span.start, chance.span.end, "")))
     first, second = node.children[:2] if len(node.children) > 1 else (None, None)
     if node.kind == "transform" and first is not None and second is not None:
-        names = {"name", "optional_name"}
-        if first.kind in names and second.kind in names:
+        words = {"name", "optional_name"}
+        if first.kind in words and second.kind in words:
             yield _exchanged("element", node, first, second)
     for part in node.children:
         if part.kind in ("condition", "where", "chance"):

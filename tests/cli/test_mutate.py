@@ -86,3 +86,16 @@ def test_an_unknown_pack_is_refused(folder):
     result = mutate("spread.yaml", "--pack", "nowhere")
     assert result.exit_code == 2
     assert "spread" in result.stderr
+
+
+@pytest.mark.parametrize("arguments", [("--write",), ("--pack", "life"), ("--mutants", "3"), ("--jobs", "1")])
+def test_options_of_mutations_need_them(folder, arguments):
+    result = powderdsl("test", "life", *arguments)
+    assert result.exit_code == 2
+    assert "--mutate" in result.stderr
+
+
+def test_mutations_take_no_settings(folder):
+    result = mutate("core+water", "--set", "water.melt=5%")
+    assert result.exit_code == 2
+    assert "--set" in result.stderr
