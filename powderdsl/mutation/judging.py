@@ -94,8 +94,8 @@ def _portions(ruleset: Ruleset, pack: str) -> Iterator[list[Example]]:
     for one in ruleset.tests:
         key = is_generated(one), bool(one.often), one.pack != pack, one.steps > FEW_STEPS
         portions.setdefault(key, []).append(one)
-    for key in sorted(portions):
-        yield portions[key]
+    for _, some in sorted(portions.items(), key=lambda portion: portion[0]):
+        yield some
 
 
 # Invariants
