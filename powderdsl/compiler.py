@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +20,13 @@ from powderdsl.model.check import check
 from powderdsl.model.compose import compose
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.layout import own_slots
+from powderdsl.model.optional_names import words_of_tree
 from powderdsl.model.outgrown import with_outgrown
 from powderdsl.model.packs import read_file
 from powderdsl.model.palette import Palette
 from powderdsl.model.types import Param, Ruleset, Value
 from powderdsl.syntax.sources import path_beside, read_source
+from powderdsl.syntax.yaml_tree import parse_yaml
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
@@ -58,6 +61,18 @@ def shipped(folder: str) -> Path:
 def shipped_rules() -> list[str]:
     """Names of the packs and rulesets that come with powderdsl."""
     return sorted(path.stem for path in shipped("rules").glob("*.yaml"))
+
+
+@cache
+def _shipped_words() -> dict[str, str]:
+    """What the shipped packs define, each word with its pack."""
+    found: dict[str, str] = {}
+    for path in sorted(shipped("rules").glob("*.yaml")):
+        reporter = Reporter()
+        source = read_source(path, reporter)
+        for word in words_of_tree(parse_yaml(source, reporter) if source else None):
+            found.setdefault(word, path.stem)
+    return found
 
 
 def shipped_tests() -> list[str]:
@@ -102,7 +117,7 @@ def load_with_diagnostics(
     reporter = Reporter()
     packs, ruleset = read(names, reporter)
     reporter.raise_if_errors()
-    model = check(packs, ruleset, reporter, palette)
+    model = check(packs, ruleset, reporter, palette, _shipped_words)
     if params:
         model = set_params(model, params, reporter)
     reporter.raise_if_errors()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -114,13 +114,13 @@ def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> l
     return [replace(one, added=added.get(one.example.span, ())) for one in results]
 
 
-def _passing(ruleset: Ruleset | None, places: set[Span], sim: Simulator) -> set[Span]:
+def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: Simulator) -> tuple[Span, ...]:
     """Which of some tests pass with other rules, by where they stand."""
     tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
     if ruleset is None or not tests:
-        return set()
+        return ()
     results = run_examples(replace(ruleset, tests=tests), sim.backend, str(sim.device))
-    return {result.example.span for result in results if result.passed}
+    return tuple(dict.fromkeys(result.example.span for result in results if result.passed))
 
 
 def start_of(example: Example, sim: Simulator, seed: int) -> World:

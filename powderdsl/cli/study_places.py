@@ -116,7 +116,7 @@ class Places:
             self.reporter.error(code, message, self.place("step", step.name), label, **more)
             return
         span = self.place("word", step.name, word.option, str(word.number))
-        names = names_in([word.text])
+        names = sorted(names_in([word.text]))
         written = [self._written(name, word) for name in names] if len(names) == 1 else []
         if written and written[0] is not None:
             used = Label(span, f"as `{word.written}`")

@@ -39,6 +39,7 @@ _ROWS = (
     ("PD110", "invalid-literal", _ERROR),
     ("PD111", "invalid-name", _ERROR),
     ("PD112", "path-leaves-folder", _ERROR),
+    ("PD113", "empty-section", _WARNING),
     # PD2xx: the syntax of one line
     ("PD201", "syntax-error", _ERROR),
     ("PD202", "expression-too-large", _ERROR),
@@ -59,6 +60,10 @@ _ROWS = (
     ("PD312", "name-qualified", _NOTE),
     ("PD313", "id-taken", _NOTE),
     ("PD314", "ruleset-cycle", _ERROR),
+    ("PD315", "optional-name-misspelt", _WARNING),
+    ("PD316", "value-contested", _WARNING),
+    ("PD317", "value-replaced", _NOTE),
+    ("PD318", "override-changes-id", _WARNING),
     # PD4xx: kinds and ranges
     ("PD401", "wrong-kind", _ERROR),
     ("PD402", "value-out-of-range", _ERROR),
@@ -85,6 +90,7 @@ _ROWS = (
     ("PD513", "condition-decides-nothing", _WARNING),
     ("PD514", "rule-overruled", _WARNING),
     ("PD515", "scope-outgrown", _NOTE),
+    ("PD516", "write-lost", _WARNING),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),

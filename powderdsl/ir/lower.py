@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.lower_expressions import Pair, Planes, lower_expression
+from powderdsl.ir.lower_live import live_passes
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, PassGraph, Program, SlotType, Step, Type, whole
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Assign, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
@@ -45,7 +46,7 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
         s.name: whole(int(s.default), int(s.default)) for s in slot_types if s.resets and s.type.name == "int"
     }
     passes = []
-    for pass_ in ruleset.passes:
+    for pass_ in live_passes(ruleset):
         graph = _PassLowering(ruleset, table, {s.name: s.type for s in slot_types} | ranges).lower(pass_)
         for name, node in graph.outputs:
             if name in ranges:

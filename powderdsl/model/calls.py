@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Span, suggest
@@ -162,10 +163,28 @@ def _abs(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 
 def _clamp(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     value, low, high = ((typer.value(typer.evaluate(c, scope), c.span), c.span) for c in syntax.children)
+    least, most = _bounds_of(low[0]), _bounds_of(high[0])
+    if least is not None and most is not None and least[0] > most[1]:
+        raise typer.fail(
+            "PD406",
+            "the bounds of `clamp` are the wrong way round",
+            high[1],
+            "below the other bound",
+            (f"write `clamp({value[1].text}, {high[1].text}, {low[1].text})`",),
+        )
     raised = arithmetic.extreme(typer, "max", [value, low], syntax.span)
     return arithmetic.extreme(
         typer, "min", [(typer.value(raised, syntax.span), syntax.span), high], syntax.span
     )
+
+
+def _bounds_of(value: Expr | Number) -> tuple[Fraction | float, Fraction | float] | None:
+    """The least and the greatest value of a number, if they are known."""
+    if isinstance(value, Number):
+        return value.value, value.value
+    if value.op == "const" and isinstance(value.value, (int, float)):
+        return value.value, value.value
+    return (value.kind.lo, value.kind.hi) if value.kind.name == "int" else None
 
 
 def _opposite(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.compose import Composition, compose
 from powderdsl.model.constants import constant_of
+from powderdsl.model.contested import given_values, report_contested
 from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
@@ -18,8 +19,10 @@ from powderdsl.model.field_values import add_field_values, unknown_element_key
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.layout import matrix_channels, state_order
 from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
-from powderdsl.model.needless import report_needless, report_undrawn
+from powderdsl.model.lost_writes import report_lost_writes
+from powderdsl.model.needless import report_needless, report_undrawn, silent_rules
 from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
+from powderdsl.model.optional_names import report_misspelt
 from powderdsl.model.palette import Palette
 from powderdsl.model.satisfy import Facts
 from powderdsl.model.scope import Scope
@@ -82,10 +85,13 @@ def check(
     ruleset: RulesetDecl | None,
     reporter: Reporter,
     palette: Palette | None = None,
+    elsewhere: Callable[[], Mapping[str, str]] = dict,
 ) -> Ruleset:
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter.
 
-    `palette` has ids that were recorded earlier: see `model/palette.py`.
+    Args:
+        palette: ids that were recorded earlier, see `model/palette.py`.
+        elsewhere: words that packs define which are not loaded, with the pack.
     """
     typer, given = resolve_names(packs, ruleset, reporter, palette)
     symbols, composition = typer.symbols, typer.symbols.composition
@@ -94,6 +100,8 @@ def check(
     invariants = check_invariants(composition, typer, partial(_typer_of, packs))
     typer.unknown.report()
     reporter.raise_if_errors()
+    report_contested(composition, reporter)
+    report_misspelt(packs, ruleset, elsewhere, reporter)
 
     elements = tuple(_tagged(element, composition) for element in composition.elements.values())
     passes = tuple(elaborated.passes)
@@ -110,6 +118,7 @@ def check(
     matrix = matrix_channels(composition, symbols, passes, reporter)
     reporter.raise_if_errors()
     report_needless(passes, facts, reporter)
+    report_lost_writes(passes, symbols.fields, facts, silent_rules(reporter), reporter)
     found = Ruleset(
         name=composition.name,
         about=composition.about,
@@ -259,47 +268,36 @@ def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Spa
     """Fill in the properties' values; where elements' own values stand: property, id, place."""
     composition = symbols.composition
     given: dict[tuple[str, str], tuple[Syntax, str]] = {}
-    sources = [(named.pack, name, named.decl.values) for name, named in composition.element_decls.items()]
-    for pack in composition.packs:
-        own = pack.name.text
-        for also in pack.also:
-            word = also.element.text.removesuffix("?")
-            sources.append((own, composition.element(word, own) or word, also.values))
-    for pack_name, element, values in sources:
-        for key, syntax in values:
-            name = composition.names.of(pack_name, key.text.removesuffix("?"))
-            if name in composition.properties:
-                given[(name, element)] = (syntax, pack_name)
-            elif name not in composition.fields and not key.text.endswith("?"):
-                typer.reporter.error(
-                    "PD108",
-                    f"unknown property `{name}`",
-                    key.span,
-                    "no loaded pack declares it",
-                    helps=[
-                        *suggest(
-                            name,
-                            [
-                                *composition.properties,
-                                *composition.fields,
-                                "id",
-                                "color",
-                                "glyph",
-                                "about",
-                                "tags",
-                            ],
-                            "properties",
-                        ),
-                        f"if its pack may be absent, write `{name}?`",
-                    ],
-                )
+    for pack, name, element, key, syntax in given_values(composition):
+        if name in composition.properties:
+            given[(name, element)] = (syntax, pack)
+        elif name not in composition.fields and not key.text.endswith("?"):
+            typer.reporter.error(
+                "PD108",
+                f"unknown property `{name}`",
+                key.span,
+                "no loaded pack declares it",
+                helps=[
+                    *suggest(
+                        name,
+                        [
+                            *composition.properties,
+                            *composition.fields,
+                            "id",
+                            "color",
+                            "glyph",
+                            "about",
+                            "tags",
+                        ],
+                        "properties",
+                    ),
+                    f"if its pack may be absent, write `{name}?`",
+                ],
+            )
     for name, named in composition.properties.items():
-        for key, syntax in named.decl.values:
+        for key, _ in named.decl.values:
             word = key.text.removesuffix("?")
-            found = composition.element(word, named.pack)
-            if found is not None:
-                given[(name, found)] = (syntax, named.pack)
-            elif not key.text.endswith("?"):
+            if composition.element(word, named.pack) is None and not key.text.endswith("?"):
                 unknown_element_key(key, "property", f"the property `{name}`", symbols, typer)
         if name in symbols.properties:
             prop = symbols.properties[name]

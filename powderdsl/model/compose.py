@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,11 +21,10 @@ from powderdsl.model.declarations import (
 )
 from powderdsl.model.names import PASS, NameBook, Names, needs_of
 from powderdsl.model.palette import Claim, Palette, composed_ids, recorded_ids, report_ids
+from powderdsl.model.pass_order import order_passes
 from powderdsl.model.types import Element
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
-
-MAX_PASSES = 200
 
 T = TypeVar("T")
 
@@ -178,7 +176,7 @@ def compose(
         params=params,
         kernels=kernels,
         sets=sets,
-        passes=_order_passes(passes, names, reporter),
+        passes=order_passes(passes, names, reporter),
         names=names,
         order={number: natural.get(word, number) for word, number in ids.items()},
         side_multiple=lcm(*(pack.side_multiple for pack in packs)),
@@ -254,6 +252,7 @@ def _chosen_elements(packs: Sequence[PackDecl], book: NameBook, reporter: Report
             known = book.find(decl.name.text, pack.name.text, "element") if decl.override else None
             if known is not None:
                 before = chosen[known]
+                _check_same_id(decl, before, reporter)
                 named = Named(pack.name.text, decl, known)
                 chosen[known] = _Chosen(named, (before.named, *before.replaced))
                 continue
@@ -278,6 +277,17 @@ def _chosen_elements(packs: Sequence[PackDecl], book: NameBook, reporter: Report
     return chosen
 
 
+def _check_same_id(decl: ElementDecl, before: _Chosen, reporter: Reporter) -> None:
+    """Warn if an element that overrides asks for another id than the one it replaces."""
+    old = next((one.decl for one in (before.named, *before.replaced) if one.decl.id is not None), decl)
+    if old.id_scalar and decl.id_scalar and decl.id != old.id:
+        reporter.report(
+            "PD318", f"`{decl.name.text}` gets the id {decl.id} instead of {old.id}", decl.id_scalar.span,
+            "its channel moves too", secondary=[Label(old.id_scalar.span, "the id of the element that it replaces")],
+            helps=["leave out `id`: an element that overrides another keeps its id"],
+        )  # fmt: skip
+
+
 def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
     """The packs whose elements and channels are placed together, one group after the other.
 
@@ -288,7 +298,7 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     left_out = ruleset.left_out if ruleset else ()
     first = [pack for pack in (*packs, *left_out) if pack.name.text in own]
     first.sort(key=lambda pack: own.index(pack.name.text))
-    others = _needed_first([pack for pack in packs if pack.name.text not in own])
+    others = needed_first([pack for pack in packs if pack.name.text not in own])
     return [*([first] if first else []), *([pack] for pack in others)]
 
 
@@ -327,7 +337,7 @@ def _claims_of(pack: PackDecl, chosen: dict[str, _Chosen], own: bool) -> Iterato
         )
 
 
-def _needed_first(packs: Sequence[PackDecl]) -> list[PackDecl]:
+def needed_first(packs: Sequence[PackDecl]) -> list[PackDecl]:
     """The packs in load order, but each after those that it needs. Packs that need each other stay as they are."""
     needs = needs_of(packs)
     ordered: list[PackDecl] = []
@@ -413,10 +423,10 @@ def _tags(composition: Composition, reporter: Reporter) -> dict[str, frozenset[i
                     ],
                 )
 
+    for element, named in composition.element_decls.items():
+        give(named.pack, element, named.decl.tags)
     for pack in composition.packs:
         own = pack.name.text
-        for decl in pack.elements:
-            give(own, names.of(own, decl.name.text), decl.tags)
         for also in pack.also:
             word = also.element.text.removesuffix("?")
             name = composition.element(word, own)
@@ -433,67 +443,3 @@ def _tags(composition: Composition, reporter: Reporter) -> dict[str, frozenset[i
                 )
             give(own, name or word, also.tags)
     return {tag: frozenset(ids) for tag, ids in members.items()}
-
-
-def _order_passes(
-    passes: dict[str, Named[PassDecl]], names: Names, reporter: Reporter
-) -> tuple[Named[PassDecl], ...]:
-    """Sort passes by `after` and `before`; what those leave open is decided by load order."""
-    if len(passes) > MAX_PASSES:
-        last = list(passes.values())[MAX_PASSES].decl.name.span
-        reporter.error(
-            "PD508", f"{len(passes):,} passes", last, f"the limit is {MAX_PASSES}", helps=["load fewer packs"]
-        )
-        return tuple(passes.values())
-    earlier: dict[str, dict[str, Span]] = {name: {} for name in passes}
-    for name, named in passes.items():
-        for scalars, is_after in ((named.decl.after, True), (named.decl.before, False)):
-            for scalar in scalars:
-                word = scalar.text.removesuffix("?")
-                other = names.of_pass(named.pack, word)
-                if other in passes:
-                    first, second = (other, name) if is_after else (name, other)
-                    earlier[second][first] = scalar.span
-                elif not scalar.text.endswith("?"):
-                    reporter.error(
-                        "PD301",
-                        f"unknown pass `{word}`",
-                        scalar.span,
-                        "no loaded pack has it",
-                        helps=[
-                            *suggest(word, passes, "passes"),
-                            f"if its pack may be absent, write `{word}?`",
-                        ],
-                    )
-    ordered: list[str] = []
-    waiting = list(passes)
-    while waiting:
-        ready = next((name for name in waiting if not set(earlier[name]) & set(waiting)), None)
-        if ready is None:
-            _report_cycle(waiting, earlier, reporter)
-            return tuple(passes[name] for name in [*ordered, *waiting])
-        waiting.remove(ready)
-        ordered.append(ready)
-    return tuple(passes[name] for name in ordered)
-
-
-def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], reporter: Reporter) -> None:
-    path = [waiting[0]]
-    cycle: list[str] = []
-    while not cycle:
-        step = next(name for name in earlier[path[-1]] if name in waiting)
-        if step in path:
-            cycle = [*path[path.index(step) :], step]
-        path.append(step)
-    labels = [
-        Label(earlier[later][first], f"`{first}` before `{later}`")
-        for later, first in itertools.pairwise(cycle)
-    ]
-    reporter.error(
-        "PD307",
-        "passes wait for each other: " + " after ".join(f"`{name}`" for name in cycle),
-        labels[0].span,
-        labels[0].text,
-        secondary=labels[1:],
-        helps=["take one of these names out of its `after` or `before`"],
-    )

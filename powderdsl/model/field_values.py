@@ -8,6 +8,7 @@ from difflib import get_close_matches
 
 from powderdsl.diagnostics import Label, suggest
 from powderdsl.model.constants import constant_of
+from powderdsl.model.contested import given_values
 from powderdsl.model.expressions import Typer
 from powderdsl.model.operands import Poisoned
 from powderdsl.model.schema import KEYS
@@ -41,29 +42,15 @@ def add_field_values(symbols: Symbols, typer: Typer) -> None:
 
 
 def _written(symbols: Symbols, typer: Typer) -> Iterator[tuple[str, Written]]:
-    """Every value with the pack that says it: those of elements first, then `also`, then those beside the fields."""
+    """Every value of a field with the pack that says it, in rising precedence."""
     composition = symbols.composition
-
-    def field_of(pack: str, key: Scalar) -> str:
-        return composition.names.of(pack, key.text.removesuffix("?"))
-
-    for element, named in composition.element_decls.items():
-        for key, syntax in named.decl.values:
-            if (name := field_of(named.pack, key)) in composition.fields:
-                yield named.pack, (name, element, key, syntax)
-    for decl in composition.packs:
-        pack = decl.name.text
-        for also in decl.also:
-            found = composition.element(also.element.text.removesuffix("?"), pack)
-            for key, syntax in also.values:
-                if found is not None and (name := field_of(pack, key)) in composition.fields:
-                    yield pack, (name, found, key, syntax)
+    for pack, name, element, key, syntax in given_values(composition):
+        if name in composition.fields and element in composition.elements:
+            yield pack, (name, element, key, syntax)
     for name, field in composition.fields.items():
-        for key, syntax in field.decl.values:
-            found = composition.element(key.text.removesuffix("?"), field.pack)
-            if found is not None:
-                yield field.pack, (name, found, key, syntax)
-            elif not key.text.endswith("?"):
+        for key, _ in field.decl.values:
+            known = composition.element(key.text.removesuffix("?"), field.pack)
+            if known is None and not key.text.endswith("?"):
                 unknown_element_key(key, "field", f"the field `{name}`", symbols, typer)
 
 

@@ -31,9 +31,14 @@ SILENT = ("PD503", "PD506", "PD509")
 def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) -> None:
     """Report comparisons that ranges decide, and rules that others always overrule."""
     quick = replace(facts, budget=Budget(BUDGET))
-    known = [one.primary.span for one in reporter.diagnostics if one.code in SILENT and one.primary.span]
+    known = silent_rules(reporter)
     _report_decided(passes, known, reporter)
     _report_overruled(passes, quick, known, reporter)
+
+
+def silent_rules(reporter: Reporter) -> list[Span]:
+    """The rules of which it was reported already that they never happen."""
+    return [one.primary.span for one in reporter.diagnostics if one.code in SILENT and one.primary.span]
 
 
 # Comparisons

@@ -130,6 +130,8 @@ OPEN = {
 """Mappings that take further keys, and what those name."""
 
 VALUES = ("word", "number", "flag", "line")
+
+SECTIONS = ("text", "mapping", "words", "list", "statements", "any")
 """Shapes of which there is no empty value."""
 
 PREFIXES = {"pass": ("for ", "repeat "), "block": ("for ", "repeat ")}
@@ -182,14 +184,14 @@ class Reader:
             prefixed = key.text.startswith(PREFIXES.get(context, ())) and bool(PREFIXES.get(context))
             misspelt = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
             row = known.get(key.text)
-            if (
-                row
-                and row.shape in VALUES
-                and isinstance(value, Scalar)
-                and value.style == "plain"
-                and not value.text
-            ):
+            empty = isinstance(value, Scalar) and value.style == "plain" and not value.text
+            if row and isinstance(value, Scalar) and empty and (row.required or row.shape in VALUES):
                 self._no_value(key, value, row)
+            elif row and empty and row.shape in SECTIONS:
+                self.reporter.report(
+                    "PD113", f"`{key.text}` is empty", key.span, "nothing stands after it",
+                    helps=[f"`{key.text}`: {row.about}", "remove it, or indent what belongs to it"],
+                )  # fmt: skip
             elif row or prefixed or (context in OPEN and not misspelt):
                 entries[key.text] = (key, value)
                 if row:

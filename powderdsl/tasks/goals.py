@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
@@ -105,7 +105,12 @@ class GoalChecker:
         if kind == "negate":
             return Scalar("neg", (self.value(parts[0]),))
         if kind in _BINARY:
-            return Scalar(_BINARY[kind], (self.value(parts[0]), self.value(parts[1])))
+            first, second = self.value(parts[0]), self.value(parts[1])
+            if kind in ("divide", "mod") and _always_zero(second):
+                raise self.typer.fail(
+                    "PD402", "division by zero", parts[1].span, "this is 0", ("divide by another number",)
+                )
+            return Scalar(_BINARY[kind], (first, second))
         if kind == "choose":
             yes, condition, no = parts
             return Scalar("choose", (self.truth(condition), self.value(yes), self.value(no)))
@@ -245,6 +250,36 @@ class GoalChecker:
 
 
 _SUMMABLE = ("int", "flag", "real")
+
+
+_CONSTANT: dict[str, Callable[..., float]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "mod": lambda a, b: a % b,
+    "min": min,
+    "max": max,
+    "neg": lambda a: -a,
+    "abs": abs,
+}
+
+
+def _always_zero(scalar: Scalar) -> bool:
+    """Whether a number comes to 0 in every world."""
+    return _constant(scalar) == 0
+
+
+def _constant(scalar: Scalar) -> float | None:
+    """What numbers alone come to; None where the world matters. Divisors are known not to be 0."""
+    if scalar.op == "const":
+        return float(scalar.value)
+    args = [_constant(arg) for arg in scalar.args]
+    if scalar.op == "mul" and 0 in args:
+        return 0.0
+    if scalar.op not in _CONSTANT or None in args:
+        return None
+    return _CONSTANT[scalar.op](*args)
 
 
 def parts_of(scalar: Scalar) -> list[Scalar]:

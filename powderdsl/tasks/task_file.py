@@ -305,9 +305,11 @@ class _TaskReader:
             variants = [base] if stands is None else self.stands(base, stands[1])
             told = self.reader.text(entries, "about")
             if key.text == "train":
-                plans[0] = ("train", told or about, variants)
-            else:
-                plans.append((key.text, told, variants))
+                self.reporter.error(
+                    "PD302", "the split `train` is there already", key.span, "it is what the task itself says",
+                    helps=["choose another name, or change `generate`, `let` and `parts` of the task"],
+                )  # fmt: skip
+            plans.append((key.text, told, variants))
         splits, used = [], set()
         for name, told, variants in plans:
             generators = []

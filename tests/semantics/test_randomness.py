@@ -182,3 +182,39 @@ passes:
     assert len({one[i].tobytes() for i in range(4)}) == 4
     again = simulator.step(simulator.replace(world, one=0, two=0))
     assert not np.array_equal(again["one"].numpy().astype(bool), one)
+
+
+VINES = """pack: vines
+elements:
+  soil: {{id: 0, color: "#6F4E37"}}
+  vine: {{id: 1, color: "#2A9D8F"}}
+passes:
+  grow:
+{block}
+"""
+
+
+@pytest.mark.parametrize(
+    ("block", "independent"),
+    [
+        ("    symmetry: rotations\n    do: soil -> vine if above is vine with chance 30%", 1),
+        ("    for side in sides:\n      - soil -> vine if side is vine with chance 30%", 4),
+        ("    repeat 4:\n      - soil -> vine if above is vine with chance 30%", 4),
+        (
+            "    symmetry: mirror\n    for side in (above, left):\n      - soil -> vine if side is vine with chance 30%",
+            2,
+        ),
+        (
+            "    do:\n      - soil -> vine if above is vine with chance 30%\n"
+            "      - soil -> vine if left is vine with chance 30%",
+            2,
+        ),
+    ],
+)
+def test_rounds_draw_for_themselves_and_copies_of_a_symmetry_share(block: str, independent: int) -> None:
+    count = 20_000
+    sim = compile_ruleset(load_text(VINES.format(block=block)), backend="planes")
+    world = sim.world([[[0, 1, 0], [1, 0, 1], [0, 1, 0]]] * count, seed=3)
+    grown = float((sim.step(world, steps=1).ids[:, 1, 1] == 1).double().mean())
+    expected = 1 - 0.7**independent
+    assert abs(grown - expected) < DEVIATIONS * (expected * (1 - expected) / count) ** 0.5

@@ -161,6 +161,9 @@ MALFORMED = [
     ("count(sand in slot) / 10", "change(taken)", "PD406", "taken"),
     ("count(sand in slot) / 10", "count(interact < 5%)", "PD406", "interact < 5%"),
     ("count(sand in slot) / 10", "1 if count(sand) else 2", "PD401", "count(sand)"),
+    ("count(sand in slot) / 10", "count(sand in slot) / 0", "PD402", "0"),
+    ("count(sand in slot) / 10", "count(sand in slot) / (5 - 5 * 1)", "PD402", "5 - 5 * 1"),
+    ("count(sand in slot) / 10", "count(sand in slot) mod (0 * taken)", "PD402", "0 * taken"),
     ("count(sand in slot) / 10", "5", "PD805", "5"),
     ("count(sand in slot) / 10", "count(sand and water)", "PD805", "sand and water"),
     ("each: count", "every: count", "PD108", "every"),
@@ -176,6 +179,7 @@ MALFORMED = [
     ("  test:\n", "  test:\n    stands: []\n", "PD107", "[]"),
     ("  test:\n", "  test:\n    stands: [{let: {row: 4}}]\n", "PD109", "{"),
     ("  test:\n", "  te st:\n", "PD111", "te st"),
+    ("  test:\n", "  train:\n", "PD302", "train"),
 ]  # fmt: skip
 
 

@@ -1,0 +1,249 @@
+"""What a pack says and nobody hears: each such loss has a diagnostic, or a result that is written down."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from powderdsl.compiler import load_with_diagnostics
+from powderdsl.diagnostics import CODES, Severity
+from powderdsl.model.types import Ruleset
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def loaded(rules: str, **packs: str) -> tuple[Ruleset, list[tuple[str, str]]]:
+    """A composition, and its remarks with codes of this page: the code and what is underlined."""
+    for name, text in packs.items():
+        Path(f"{name}.yaml").write_text(f"pack: {name}\n{text}", encoding="utf-8")
+    ruleset, remarks = load_with_diagnostics(rules)
+    codes = ("PD113", "PD315", "PD316", "PD317", "PD318", "PD516")
+    return ruleset, [
+        (one.code, one.primary.span.text) for one in remarks if one.code in codes and one.primary.span
+    ]
+
+
+# --- optional names
+
+
+OIL = """needs: core
+elements:
+  oil: {{id: 20, density: 2, gravity: yes, color: "#1B1B1E", tags: [fluid, {tag}?], {burns}?: 30%}}
+also:
+  {wood}?: {tag}?
+passes:
+  oil:
+    after: [flow, {fire}?]
+    do:
+      - oil -> {fire}? if count(lava?) > 0 or below is ({wood}?, wall)
+"""
+RIGHT = {"tag": "fuel", "burns": "burns", "wood": "wood", "fire": "fire"}
+
+
+@pytest.mark.parametrize("word", ["fule", "fuell", "ful", "feul"])
+def test_misspelt_tags_are_found(word: str) -> None:
+    _, found = loaded("core+oil.yaml", oil=OIL.format(**{**RIGHT, "tag": word}))
+    assert found == ([("PD315", f"{word}?")] if len(word) > 3 else [])
+
+
+@pytest.mark.parametrize(("what", "word"), [("burns", "burnz"), ("wood", "wodo"), ("fire", "fier")])
+@pytest.mark.parametrize("others", ["core", "powderworld"])
+def test_misspelt_names_are_found_wherever_they_stand(what: str, word: str, others: str) -> None:
+    _, found = loaded(f"{others}+oil.yaml", oil=OIL.format(**{**RIGHT, what: word}))
+    assert found == [("PD315", f"{word}?")]
+
+
+@pytest.mark.parametrize("others", ["core", "core+sand+water", "powderworld", "powderworld-fire-lava"])
+def test_names_that_some_pack_defines_are_quiet(others: str) -> None:
+    assert loaded(f"{others}+oil.yaml", oil=OIL.format(**RIGHT))[1] == []
+
+
+@pytest.mark.parametrize("word", ["food", "wool", "ash", "tar", "smoke", "salt_water", "mud", "honey"])
+def test_other_words_are_quiet(word: str) -> None:
+    assert loaded("core+oil.yaml", oil=OIL.format(**{**RIGHT, "wood": word}))[1] == []
+
+
+def test_a_name_of_a_strangers_pack_is_quiet_once_that_is_loaded() -> None:
+    oil = OIL.format(**{**RIGHT, "wood": "woodd"})
+    other = 'elements:\n  woodd: {color: "#123456"}\n'
+    assert loaded("core+oil.yaml", oil=oil)[1] == [("PD315", "woodd?")]
+    assert loaded("core+oil.yaml+other.yaml", oil=oil, other=other)[1] == []
+
+
+def test_a_question_mark_in_a_world_is_no_name() -> None:
+    text = 'needs: [core, sand]\ntests:\n  - it falls:\n      given: s\n      after: 1 step\n      expect: "sad?"\n'
+    Path("drawn.yaml").write_text(f"pack: drawn\n{text.replace('sad?', '?')}", encoding="utf-8")
+    assert [one.code for one in load_with_diagnostics("core+sand+drawn.yaml")[1] if one.code == "PD315"] == []
+
+
+# --- values that several packs give
+
+
+def value(ruleset: Ruleset, name: str, element: str) -> object:
+    prop, found = ruleset.property(name), ruleset.element(element)
+    assert prop is not None
+    assert found is not None
+    return prop.values[found.id]
+
+
+LIGHT = "needs: {needs}\nalso:\n  sand?: {{density: {density}}}\n"
+
+
+def test_a_pack_that_needs_the_other_replaces_its_value() -> None:
+    light = LIGHT.format(needs="[core, sand]", density=2)
+    for rules in ("core+sand+light.yaml", "core+light.yaml+sand"):
+        ruleset, found = loaded(rules, light=light)
+        assert value(ruleset, "density", "sand") == 2
+        assert found == [("PD317", "density")]
+
+
+def test_a_pack_that_does_not_is_warned_of() -> None:
+    ruleset, found = loaded("core+sand+light.yaml", light=LIGHT.format(needs="core", density=2))
+    assert value(ruleset, "density", "sand") == 2
+    assert found == [("PD316", "density")]
+
+
+def test_two_strangers_are_warned_of_and_the_last_one_holds() -> None:
+    packs = {name: LIGHT.format(needs="[core, sand]", density=n) for n, name in ((2, "two"), (3, "three"))}
+    for rules, holds in (("two.yaml+three.yaml", 3), ("three.yaml+two.yaml", 2)):
+        ruleset, found = loaded(f"core+sand+{rules}", **packs)
+        assert value(ruleset, "density", "sand") == holds
+        assert sorted(found) == [("PD316", "density"), ("PD317", "density")]
+
+
+def test_a_pack_built_on_another_holds_in_any_order() -> None:
+    first = LIGHT.format(needs="[core, sand]", density=2)
+    second = LIGHT.format(needs="[core, sand, first]", density=3)
+    for rules in ("first.yaml+second.yaml", "second.yaml+first.yaml"):
+        ruleset, found = loaded(f"core+sand+{rules}", first=first, second=second)
+        assert value(ruleset, "density", "sand") == 3
+        assert found == [("PD317", "density")] * 2
+
+
+def test_the_same_value_twice_is_no_loss() -> None:
+    assert loaded("core+sand+light.yaml", light=LIGHT.format(needs="core", density=4))[1] == []
+    assert loaded("core+fire+b.yaml", b="also:\n  wood: {burns: 0.05}\n")[1] == []
+
+
+def test_defaults_of_fields_follow_the_same_rules() -> None:
+    heat = "needs: [core, sand]\nfields:\n  heat: {type: 0..9, at: element, sand: 3}\n"
+    hot, warm = ("needs: [core, heat]\nalso:\n  sand?: {heat: %d}\n" % n for n in (5, 4))  # noqa: UP031
+    ruleset, found = loaded("core+sand+heat.yaml+hot.yaml+warm.yaml", heat=heat, hot=hot, warm=warm)
+    field, sand = ruleset.field("heat"), ruleset.element("sand")
+    assert field is not None
+    assert sand is not None
+    assert field.own == ((sand.id, 3),)
+    assert {code for code, _ in found} == {"PD316"}
+
+
+# --- overriding elements
+
+
+FLOATS = """elements:
+  sand: {{{id}override: yes, density: 2, gravity: yes, color: "#F3C23A"{tags}}}
+"""
+
+
+def test_an_element_that_overrides_keeps_nothing_but_the_id() -> None:
+    ruleset, found = loaded("core+sand+floats.yaml", floats=FLOATS.format(id="", tags=""))
+    sand = ruleset.element("sand")
+    assert sand is not None
+    assert (sand.id, sand.tags, found) == (2, frozenset(), [])
+
+
+def test_tags_that_third_packs_give_stay() -> None:
+    ruleset, _ = loaded(
+        "core+sand+floats.yaml+third.yaml",
+        floats=FLOATS.format(id="", tags=", tags: fluid"),
+        third="needs: [core, sand]\nalso:\n  sand: acid_proof\n",
+    )
+    sand = ruleset.element("sand")
+    assert sand is not None
+    assert sand.tags == {"fluid", "acid_proof"}
+
+
+def test_another_id_is_told() -> None:
+    ruleset, found = loaded("core+sand+floats.yaml", floats=FLOATS.format(id="id: 33, ", tags=""))
+    sand = ruleset.element("sand")
+    assert sand is not None
+    assert sand.id == 33
+    assert found == [("PD318", "33")]
+    assert loaded("core+sand+floats.yaml", floats=FLOATS.format(id="id: 2, ", tags=""))[1] == []
+
+
+# --- writes that are lost
+
+
+YARD = """elements:
+  floor: {{id: 0, color: "#EDF6F9"}}
+  crate: {{id: 1, color: "#83C5BE"}}
+  heap: {{id: 2, color: "#006D77"}}
+fields:
+  load: {{type: 0..9, at: element, of: crate}}
+passes:
+  fill: {{after: stack, do: load += 1 where crate and above is heap}}
+  read: {{after: fill, do: crate -> heap if load == 9}}
+  stack:
+    {symmetry}do: {rule}
+"""
+
+
+@pytest.mark.parametrize(
+    ("rule", "lost"),
+    [
+        ("load := 2 where floor", "load := 2"),
+        ("load += 2 where (floor, heap) and below is crate", "load += 2"),
+        ("right.load := 2 where right is heap", "right.load := 2"),
+        ("load := 2 where count(crate) > 2", None),
+        ("right.load := 2 where left is crate", None),
+        ("crate -> heap if above is heap, then load := 1", "load := 1"),
+        ("heap -> crate if above is heap, then load := 1", None),
+        ("floor -> above if above is (heap, floor), then load := 1", "load := 1"),
+        ("floor -> above if above is (heap, crate), then load := 1", None),
+        ("crate moves right leaving floor if right is floor, then right.load += 1", None),
+        ("heap moves right leaving floor if right is floor, then right.load += 1", "right.load += 1"),
+        ("heap moves right leaving floor if right is floor, then load += 1", "load += 1"),
+        ("crate moves right leaving floor if right is floor, then load += 1", None),
+        ("heap swaps below if below is floor, then below.load := 1", "below.load := 1"),
+        ("heap swaps below if below is crate, then load := 1", None),
+        ("heap swaps below if below is crate, then below.load := 1", "below.load := 1"),
+        ("heap -> floor if left is crate and right is heap, then left.load += 1", None),
+        ("heap -> floor if left is crate and right is heap, then right.load += 1", "right.load += 1"),
+    ],
+)
+@pytest.mark.parametrize("symmetry", ["", "symmetry: mirror\n    conflicts: drop_both\n    "])
+def test_writes_that_no_cell_can_take_are_found(rule: str, lost: str | None, symmetry: str) -> None:
+    _, found = loaded("yard.yaml", yard=YARD.format(rule=rule, symmetry=symmetry))
+    assert found == ([] if lost is None else [("PD516", lost)])
+
+
+def test_one_copy_that_writes_is_enough() -> None:
+    loop = "for e in (floor, crate):\n      - load := 2 where e and above is heap"
+    text = YARD.format(rule="PLACE", symmetry="").replace("do: PLACE", loop)
+    assert loaded("yard.yaml", yard=text)[1] == []
+
+
+# --- sections, functions
+
+
+@pytest.mark.parametrize(
+    "section", ["elements", "passes", "fields", "params", "also", "tests", "invariants", "needs"]
+)
+def test_empty_sections_are_told(section: str) -> None:
+    text = f"tags: {{soft: a tag}}\n{section}:\nsets: {{nothing: soft}}\n"
+    assert ("PD113", section) in loaded("core+yard.yaml", yard=text)[1]
+    meant = text.replace(
+        f"{section}:", f"{section}: " + ("[]" if section in ("tests", "invariants", "needs") else "{}")
+    )
+    assert ("PD113", section) not in loaded("core+yard.yaml", yard=meant)[1]
+
+
+def test_every_remark_is_a_warning_or_a_note() -> None:
+    """None of them keeps strangers' packs from being loaded together."""
+    for code in ("PD113", "PD315", "PD316", "PD318", "PD516"):
+        assert CODES[code].severity is Severity.WARNING
+    assert CODES["PD317"].severity is Severity.NOTE
