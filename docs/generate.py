@@ -32,10 +32,10 @@ from powderdsl.model.builtins import (
     RESERVED,
     shaped_kernel,
 )
-from powderdsl.model.pass_order import MAX_PASSES
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
 from powderdsl.model.expressions import MAX_ROUNDS, MAX_SET_DEPTH
+from powderdsl.model.pass_order import MAX_PASSES
 from powderdsl.model.schema import KEYS, MAX_NAME, OPEN
 from powderdsl.model.text import show_offset
 from powderdsl.model.types import Kernel

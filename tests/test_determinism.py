@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-import yaml
 
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.model.declarations import PackDecl
+from powderdsl.model.packs import read_file
 from tests.set_iteration import all_faults
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -21,8 +23,6 @@ SEEDS = range(10)
 ORDER_DOES_NOT_MATTER = {
     "mutation.equal_nodes": "sorts by the whole of what it sorts",
     "studies.study_run": "stops all processes that run, and none of them reads the others",
-}
-    "studies.study_run": "stops all processes that run, and none of them reads the others"
 }
 """Modules that go through sets, and why nothing comes of it."""
 
@@ -184,12 +184,16 @@ def test_check_prints_the_same_under_all_hash_seeds(tmp_path: Path) -> None:
 def compositions() -> list[str]:
     """Every shipped ruleset, every shipped pack and example with what it needs, and `powderworld` with each example."""
     files = [*sorted((ROOT / "rules").glob("*.yaml")), *sorted((ROOT / "docs" / "examples").glob("*.yaml"))]
-    found = {path: yaml.safe_load(path.read_text(encoding="utf-8").replace("?", "")) for path in files}
-    needs = {path.stem: data.get("needs", []) for path, data in found.items()}
+    found = {
+        path: read_file(Source(path.name, path.read_text(encoding="utf-8")), Reporter()) for path in files
+    }
+    needs = {
+        path.stem: [word.text for word in decl.needs] if isinstance(decl, PackDecl) else []
+        for path, decl in found.items()
+    }
 
     def before(name: str) -> list[str]:
-        direct = [needs[name]] if isinstance(needs[name], str) else needs[name]
-        return [*dict.fromkeys(one for need in direct for one in (*before(need), need))]
+        return [*dict.fromkeys(one for need in needs[name] for one in (*before(need), need))]
 
     rules = []
     for path in files:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from powderdsl.model.budget import Budget
 from powderdsl.model.reactions import facts_of
-from powderdsl.model.satisfy import Budget, Facts, satisfiable
+from powderdsl.model.satisfy import Facts, satisfiable
 from powderdsl.model.types import Moment, Pass, Ruleset
 
 BUDGET = 100_000

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.budget import Budget
 from powderdsl.model.operands import ELEMENT_HERE, look, member
-from powderdsl.model.satisfy import Budget, Facts, satisfiable
+from powderdsl.model.satisfy import Facts, satisfiable
 from powderdsl.model.types import Assign, Expr, Field, Moment, Move, Offset, Pass, Rule, Swap, Transform
 
 HERE: Offset = (0, 0)

@@ -15,9 +15,17 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax.ast import Syntax
 
 
+OF_COMPOSITIONS = ("PD315", "PD316")
+"""Warnings for whoever puts packs together: what is misspelt beside all known words, which of two values is lost."""
+
+
 def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Diagnostic, ...]:
     """The same remarks, where warnings that nobody would get without the added packs are notes (PD515)."""
-    warnings = [one for one in remarks if one.severity is Severity.WARNING and one.primary.span]
+    warnings = [
+        one
+        for one in remarks
+        if one.severity is Severity.WARNING and one.primary.span and one.code not in OF_COMPOSITIONS
+    ]
     if not warnings or ruleset.declared is None or len(ruleset.packs) < 2:
         return remarks
     composition = compose(ruleset.declared.packs, ruleset.declared.ruleset, Reporter())
