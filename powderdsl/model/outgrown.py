@@ -14,7 +14,6 @@ from powderdsl.model.text import place_of
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.ast import Syntax
 
-
 OF_COMPOSITIONS = ("PD315", "PD316")
 """Warnings for whoever puts packs together: what is misspelt beside all known words, which of two values is lost."""
 
