@@ -18,7 +18,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
 from powderdsl.cli.commands import COMMANDS
-from powderdsl.compiler import shipped_rules
+from powderdsl.compiler import MAX_BASES, shipped_rules
 from powderdsl.model.builtins import (
     DIRECTION_SETS,
     DIRECTIONS,
@@ -156,6 +156,7 @@ def limits() -> str:
         ("rounds of `repeat`, or of one variable's range", 64),
         ("rounds of one loop over several variables", MAX_ROUNDS),
         ("sets that are defined by each other, in a row", MAX_SET_DEPTH),
+        ("rulesets that extend each other, in a row", MAX_BASES),
         ("passes of a ruleset", MAX_PASSES),
         ("moments of a pass", MAX_MOMENTS),
         ("rules of a ruleset, loops unrolled", MAX_RULES),
