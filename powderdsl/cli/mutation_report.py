@@ -62,22 +62,24 @@ def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
     numbers = sampled(mutants, plan.mutants, plan.seed)
     outcomes: dict[int, Outcome] = {}
     events = run_campaign(name, plan.packs, numbers, plan.jobs or os.cpu_count() or 1, plan.seed)
-    interrupted = False
+    interrupt: KeyboardInterrupt | None = None
     with progress(name, len(numbers), lines=True) as show:
         try:
             for outcome in events:
                 outcomes[outcome.number] = outcome
                 alive = sum(one.verdict.status == "survived" for one in outcomes.values())
                 show(len(outcomes), f"{alive} survived")
-        except KeyboardInterrupt:
-            interrupted = True
+        except KeyboardInterrupt as caught:
+            interrupt = caught
         finally:
             events.close()  # its processes end
     found = [(mutants[number], outcomes[number]) for number in sorted(outcomes)]
     if not plan.as_json:
-        _tell(name, found, monotonic() - began, len(numbers), interrupted)
+        _tell(name, found, monotonic() - began, len(numbers), interrupt is not None)
     if plan.write:
         _write(found)
+    if interrupt is not None:
+        raise interrupt
     return _data(found)
 
 

@@ -57,6 +57,8 @@ class Endless:
     busy: str
     again: Sequence[str] = ("run", "life", *SMALL, "--steps", "3", "--out", "x.npz")
     status: int = 0
+    processes: int = 1
+    """So many run when it is in the middle of its work."""
 
 
 COMMANDS = {
@@ -100,6 +102,7 @@ COMMANDS = {
         ("test", "core+sand", "--examples", "9000000", "--seconds", "86400", "--no-keep"),
         "",
     ),
+    "mutate": Endless(("test", "--mutate", "powderworld", "--jobs", "2"), "", processes=3),
     "study": Endless(
         ("study", "study.yaml", "--out", "out", "--jobs", "2"),
         "out/runs/*seed=1/trained/checkpoints/[0-9]*.pt",
@@ -151,6 +154,8 @@ class Place:
         if command.busy:
             pattern = command.busy
             waited(lambda: running.poll() is not None or any(self.folder.glob(pattern)))
+        elif command.processes > 1:
+            waited(lambda: running.poll() is not None or len(self.survivors()) >= command.processes)
         else:  # it writes nothing: it has imported everything once it has used some processor time
             waited(lambda: running.poll() is not None or seconds_of(running.pid) > 4)
         return running.poll() is None
