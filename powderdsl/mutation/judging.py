@@ -22,7 +22,7 @@ from powderdsl.properties.samples import Array, Sample, State
 from powderdsl.simulator import Simulator, compile
 
 NOTICED = ("check", "invariant", "test", "generated")
-"""What may notice a mutant, in rising order of cost. `test` are those written by hand."""
+"""What may notice a mutant. `test` are those written by hand; the quick ones of them are asked before invariants."""
 
 FEW_STEPS = 20
 """Tests of so many steps run before longer ones."""
@@ -58,10 +58,13 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if meaning(ruleset) == original.meaning:
         return Verdict("equivalent", "the same model")
     sim = compile(ruleset, backend="planes")
-    broken, differs = broken_invariant(original, sim)
-    if broken is not None:
-        return Verdict("killed", "invariant", one_line(broken.span))
-    failed = failed_test(original, sim, mutant.pack)
+    differs = True
+    failed = failed_test(original, sim, mutant.pack, quick=True)
+    if failed is None:
+        broken, differs = broken_invariant(original, sim)
+        if broken is not None:
+            return Verdict("killed", "invariant", one_line(broken.span))
+        failed = failed_test(original, sim, mutant.pack, quick=False)
     if failed is not None:
         by = "generated" if is_generated(failed) else "test"
         return Verdict("killed", by, f"{failed.pack}: {failed.name}")
@@ -76,9 +79,12 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
 # Tests
 
 
-def failed_test(original: Original, sim: Simulator, pack: str) -> Example | None:
-    """A test that the original passes and the mutant fails: one written by hand, if there is one."""
-    for some in _portions(sim.ruleset, pack):
+def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -> Example | None:
+    """A test that the original passes and the mutant fails: one written by hand, if there is one.
+
+    `quick`: only those that cost less than invariants do; otherwise only the others.
+    """
+    for some in _portions(sim.ruleset, pack, quick):
         known = tuple(one for one in some if one.name not in original.failing)
         if known:
             results = run_examples(replace(sim.ruleset, tests=known), sim=sim)
@@ -88,11 +94,13 @@ def failed_test(original: Original, sim: Simulator, pack: str) -> Example | None
     return None
 
 
-def _portions(ruleset: Ruleset, pack: str) -> Iterator[list[Example]]:
+def _portions(ruleset: Ruleset, pack: str, quick: bool) -> Iterator[list[Example]]:
     """Tests in portions: by hand before generated, exact before counted, those of the mutated pack, short ones."""
     portions: dict[tuple[bool, ...], list[Example]] = {}
     for one in ruleset.tests:
         key = is_generated(one), bool(one.often), one.pack != pack, one.steps > FEW_STEPS
+        if quick != (not key[0] and not key[1] and not key[3]):
+            continue
         portions.setdefault(key, []).append(one)
     for _, some in sorted(portions.items(), key=lambda portion: portion[0]):
         yield some
