@@ -5,7 +5,8 @@ Fenced blocks are run page by page, in order, in one temporary directory:
 * ``yaml``: a pack or ruleset. A block without ``pack:`` is part of a pack called `example`. Comments at its
   top say what it is loaded with (its `needs` otherwise) and what is expected: ``# with: core+sand``,
   ``# error: PD301``, ``# warning: PD507``, ``# note: PD506``; ``# file: docs/examples/x.yaml`` demands that
-  it is all of that file. It is saved under its name for later blocks to load, and its `tests:` are run.
+  it is all of that file but its invariants and tests. It is saved under its name for later blocks to load, and its
+  `tests:` are run.
   One with ``task:`` is a task, which must have no mistakes; one with ``scene:`` is drawn with those rules.
 * ``statements`` of a generator and ``rewards``, one a line, with the names of `TASK`.
 * ``rules``: one rule a line, each loaded in a pass of its own. ``expressions``: one value a line.
@@ -104,7 +105,8 @@ def run_yaml(block: Block) -> None:
     name = re.search(r"^(?:pack|ruleset): *(\w+)", text, re.MULTILINE)
     assert name, "the block names no pack"
     if block.expected("file"):
-        assert text.partition("\n")[2] == (ROOT / block.expected("file")).read_text(encoding="utf-8")
+        whole = (ROOT / block.expected("file")).read_text(encoding="utf-8")
+        assert text.partition("\n")[2] == re.split(r"^(?:invariants|tests):", whole, flags=re.MULTILINE)[0]
     needs = re.search(r"^needs: *\[?([^\]\n]*)", text, re.MULTILINE)
     packs = block.expected("with") or "+".join(needs[1].split(", ") if needs else [])
     path = Path(f"{name[1]}.yaml")

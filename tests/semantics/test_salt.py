@@ -44,8 +44,9 @@ def amount(ids: torch.Tensor, sim: Simulator, element: str) -> int:
     return int((ids == id_of(sim, element)).sum())
 
 
-def test_it_is_ten_lines_of_yaml() -> None:
-    lines = SALT.read_text(encoding="utf-8").splitlines()
+def test_its_rules_are_ten_lines_of_yaml() -> None:
+    text = SALT.read_text(encoding="utf-8")
+    lines = text[: text.index("invariants:")].splitlines()
     assert len([line for line in lines if line.strip()]) <= 10
     assert max(map(len, lines)) <= 100
     assert set(yaml.safe_load("\n".join(lines))) == {"pack", "about", "needs", "elements", "passes"}
