@@ -45,7 +45,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "pack_test_fields": _SCREEN,
     "pack_test_chances": _SCREEN,
     "pack_tests": (*_SCREEN, "pack_test_fields", "pack_test_chances"),
-    "testing": (*_SCREEN, "ledgers", "pack_tests", "scratch"),
+    "testing": (*_SCREEN, "ledgers", "pack_tests", "scratch", "interrupts"),
     "properties": (*_TESTING, "user_cache"),
     "mutation": (*_TESTING, "properties"),
     "pytest_plugin": (*_TESTING, "properties"),
