@@ -58,7 +58,7 @@ def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
         (("--seeds", "5..2"), "no range of seeds"),
         (("--backends", "dense,sparse"), "no backend `sparse`"),
         (("--seeds", "0..2", "--seconds", "3"), "not both"),
-        (("--replay", "nowhere.yaml"), "cannot read nowhere.yaml"),
+        (("--replay", "nowhere.yaml"), "cannot read `nowhere.yaml`"),
         (("--resume", "--save", "nowhere"), "cannot read nowhere/state.json"),
     ],
 )
