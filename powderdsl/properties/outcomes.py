@@ -10,17 +10,22 @@ import numpy as np
 
 from powderdsl.diagnostics import Span
 from powderdsl.draw import palette, rgb, scale, to_numpy
+from powderdsl.model.field_words import direction_word
 from powderdsl.model.restrict import Difference
+from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of
-from powderdsl.model.types import Ruleset
+from powderdsl.model.types import Kind, Ruleset
 from powderdsl.properties.breaks import Tested
-from powderdsl.properties.samples import Array, Sample
+from powderdsl.properties.samples import Array, Sample, fresh
 
 STATUSES = ("proven", "tested", "untested", "differs", "broken")
 """``differs``: a world breaks it because packs are loaded that it does not speak of."""
 
 MAX_DRAWN = 40
 """Rows and columns that are drawn in full."""
+
+MAX_TEXT = 200
+"""Characters of a field that are shown."""
 
 
 @dataclass(frozen=True)
@@ -117,17 +122,37 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
     names = {element.id: element.name for element in ruleset.elements}
     there = np.unique([*found.before.ravel(), *found.after.ravel()]).tolist()
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
-    for name, values in found.sample.fields.items():
-        yield f"{name}: {_short(values[0])}"
+    yield from _field_lines(found, ruleset, names)
     for name, values in found.sample.params.items():
         yield f"{name} = {float(values[0]):g}"
     if found.sample.clock.any():
         yield f"the clock says {int(found.sample.clock[0])}"
 
 
-def _short(values: Array) -> str:
-    text = str(values.tolist())
-    return text if len(text) <= 200 else f"{text[:200]} …"
+def _field_lines(found: Counterexample, ruleset: Ruleset, names: Mapping[int, str]) -> Iterator[str]:
+    """The fields that are not as in fresh cells, row by row, each value as a word."""
+    for slot in slots(ruleset):
+        values = found.sample.fields.get(slot.name)
+        if values is None or np.array_equal(values, fresh(ruleset, slot, found.sample.ids)):
+            continue
+        cells = values[0] if slot.planes == 1 else np.moveaxis(values[0], 0, -1)
+        rows = (" ".join(_word(value, slot.kind, names) for value in row) for row in cells)
+        text = " / ".join(rows)
+        yield f"{slot.name}: {text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} …'}"
+
+
+def _word(value: Any, kind: Kind, names: Mapping[int, str]) -> str:
+    """A value of a field as tests write it."""
+    match kind.name:
+        case "flag":
+            return "yes" if value else "no"
+        case "element":
+            return names.get(int(value), "?")
+        case "direction":
+            return direction_word(int(value))
+        case "vec2":
+            return ",".join(f"{float(part):g}" for part in value)
+    return f"{float(value):g}"
 
 
 def picture(found: Counterexample, ruleset: Ruleset) -> Array:

@@ -93,10 +93,16 @@ def shrink_while(judge: Judge, sample: Sample, steps: int, tries: int, work: Wor
                 if found is None:
                     break
                 smaller, steps = found
+        for name in smaller.fields if work.left > 0 else ():  # without it, it is as in fresh cells
+            rest = {other: values for other, values in smaller.fields.items() if other != name}
+            found = _first(judge, [replace(smaller, fields=rest)], steps, tries, work)
+            if found is not None:
+                smaller, steps = found
         if smaller is sample:
             break
         sample = smaller
-    return sample, steps
+    found = _first(judge, _plain_seed(sample), steps, 1, work) if tries > 1 else None
+    return found or (sample, steps)
 
 
 def _later(
@@ -180,6 +186,24 @@ def _fewer_fields(sample: Sample) -> list[Sample]:
     ]
 
 
+def _fewer_values(sample: Sample) -> list[Sample]:
+    """With one value of a field that is 0."""
+    found = []
+    for name, values in sample.fields.items():
+        for place in np.argwhere(values).tolist():
+            fewer = values.copy()
+            fewer[tuple(place)] = 0
+            found.append(replace(sample, fields={**sample.fields, name: fewer}))
+    return found
+
+
+def _plain_seed(sample: Sample) -> list[Sample]:
+    """With a seed that is easy to write."""
+    if 0 <= int(sample.seeds[0]) < SEEDS:
+        return []
+    return [replace(sample, seeds=np.array([number])) for number in range(SEEDS)]
+
+
 def _early(sample: Sample) -> list[Sample]:
     return [replace(sample, clock=np.zeros(1, np.int64))] if sample.clock.any() else []
 
@@ -244,4 +268,5 @@ _GROUPS: tuple[Callable[[Sample], list[Sample]], ...] = (
     _fewer_fields,
     _fewer_kinds,
     _fewer_cells,
+    _fewer_values,
 )
