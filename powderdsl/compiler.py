@@ -24,7 +24,7 @@ from powderdsl.model.optional_names import words_of_tree
 from powderdsl.model.outgrown import with_outgrown
 from powderdsl.model.packs import read_file
 from powderdsl.model.palette import Palette
-from powderdsl.model.types import Param, Ruleset, Value
+from powderdsl.model.types import Kind, Param, Ruleset, Value
 from powderdsl.syntax.sources import path_beside, read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
 
@@ -417,15 +417,27 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
             found[name] = param_value(known[name], value)
         except ValueError as error:
             reporter.error(
-                "PD402", f"parameter `{name}`: {error}", None, notes=[f"it is a {known[name].kind}"]
+                "PD402",
+                f"parameter `{name}`: {error}",
+                None,
+                notes=[f"it is {_kind_in_words(known[name].kind)}"],
             )
     return ruleset.with_params(found)
 
 
+def _kind_in_words(kind: Kind) -> str:
+    if kind.name == "chance":
+        return "a chance: write a percentage from 0% to 100%, or a number from 0 to 1"
+    if kind.name == "flag":
+        return "a flag: write yes or no"
+    return f"a {'whole' if kind.name == 'int' else 'real'} number from {kind.lo:g} to {kind.hi:g}"
+
+
 def param_value(param: Param, value: Any) -> Value:
     """A value for a parameter from text (``"5%"``, ``"yes"``) or a number. Raises ValueError."""
+    shown = None
     if isinstance(value, str):
-        text = value.strip()
+        text = shown = value.strip()
         words = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
         try:
             value = (
@@ -443,7 +455,9 @@ def param_value(param: Param, value: Any) -> Value:
         raise ValueError(f"{value!r} is not a number") from None
     lo, hi = (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
     if not lo <= number <= hi:
-        raise ValueError(f"{number:g} lies outside {lo:g}..{hi:g}")
+        if param.kind.name == "chance":
+            raise ValueError(f"{shown or format(number, 'g')} lies outside 0%..100%")
+        raise ValueError(f"{shown or format(number, 'g')} lies outside {lo:g}..{hi:g}")
     if param.kind.name in ("int", "flag") and number != int(number):
         raise ValueError(f"{number:g} is not whole")
     return int(number) if param.kind.name in ("int", "flag") else number

@@ -91,6 +91,11 @@ def character_name(char: str) -> str:
     return f"U+{ord(char):04X} {unicodedata.name(char, 'without a name')}"
 
 
+def shown_character(char: str) -> str:
+    """A character in a message: as it is, and what it is if it is not ASCII."""
+    return f"`{char}`" if char.isascii() else f"`{printable(char)}` ({character_name(char)})"
+
+
 # Streams
 
 

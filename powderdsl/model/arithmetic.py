@@ -248,6 +248,8 @@ def negate(typer: Typer, value: Value, span: Span) -> Operand:
         return Number(-value.value)
     if value.kind.name == "int":
         return Expr("neg", integer(-value.kind.hi, -value.kind.lo), (value,), span=span)
+    if value.kind.name in ("element", "flag"):
+        raise typer.wrong(value, "a number", span, "an item of a list has a blank after its `-`")
     if value.kind.name == "vec2":
         return Expr("neg", VEC2, (value,), span=span)
     return Expr("neg", REAL, (typer.real(value, span),), span=span)

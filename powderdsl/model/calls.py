@@ -11,6 +11,7 @@ from powderdsl.model import arithmetic
 from powderdsl.model.builtins import FUNCTIONS, KERNEL_SHAPES, KERNELS, MAX_RADIUS, shaped_kernel
 from powderdsl.model.operands import Number, Operand, Place, disjunction
 from powderdsl.model.types import DIRECTION, FLAG, REAL, VEC2, Expr, Kernel, integer
+from powderdsl.model.unknown import ELSEWHERE
 from powderdsl.syntax.ast import Syntax
 
 if TYPE_CHECKING:
@@ -65,7 +66,10 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     name_span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(name))
     function = FUNCTIONS.get(name)
     if function is None and name not in KERNEL_SHAPES:
-        helps = suggest(name, [*FUNCTIONS, *KERNEL_SHAPES], "functions")
+        meant = ELSEWHERE.get(name.lower())
+        helps = (meant,) if meant else suggest(name, [*FUNCTIONS, *KERNEL_SHAPES], "functions")
+        if not helps:
+            helps = (f"functions: {', '.join(f'`{known}`' for known in FUNCTIONS)}",)
         raise typer.fail("PD301", f"unknown function `{name}`", name_span, "not a function", helps)
     (lo, hi), usage = (function.arity, function.signature) if function else ((1, 1), f"{name}(RADIUS)")
     count = len(syntax.children)

@@ -24,6 +24,7 @@ from powderdsl.model.needless import report_needless, report_undrawn, silent_rul
 from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
 from powderdsl.model.optional_names import report_misspelt
 from powderdsl.model.palette import Palette
+from powderdsl.model.property_words import not_a_value
 from powderdsl.model.satisfy import Facts
 from powderdsl.model.scope import Scope
 from powderdsl.model.symbols import (
@@ -319,6 +320,9 @@ def _values(
     """A property's values by id. A value may name a parameter, which stays changeable."""
 
     def value(syntax: Syntax, owner: str) -> Value | str:
+        if syntax.kind == "name" and typer.find(syntax.text, syntax.span, Scope(owner, {})) is None:
+            not_a_value(prop, syntax, typer)
+            return default_of(prop.kind)
         try:
             expr = typer.of_kind(typer.evaluate(syntax, Scope(owner, {})), prop.kind, syntax.span)
         except (Poisoned, Asleep):

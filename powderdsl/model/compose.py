@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property
 from math import lcm
 from typing import Generic, TypeVar
@@ -102,6 +103,7 @@ def compose(
     `palette` has ids that were recorded earlier.
     """
     _check_needs(packs, reporter)
+    reporter.raise_if_errors()  # every name of a pack that lacks would be a mistake of its own
     book = NameBook(packs, ruleset.renames if ruleset else (), reporter)
     chosen = _chosen_elements(packs, book, reporter)
     groups = _groups(packs, ruleset)
@@ -204,16 +206,13 @@ def _check_renamed(ruleset: RulesetDecl | None, book: NameBook, reporter: Report
 
 def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
     loaded = {pack.name.text: pack for pack in packs}
+    missing: dict[str, list[Scalar]] = {}
+    needing: dict[str, list[str]] = {}
     for pack in packs:
         for need in pack.needs:
             if need.text not in loaded:
-                reporter.error(
-                    "PD305",
-                    f"pack `{pack.name.text}` needs `{need.text}`, which is not loaded",
-                    need.span,
-                    "not loaded",
-                    helps=[_need_help(need.text, pack.name.text, loaded)],
-                )
+                missing.setdefault(need.text, []).append(need)
+                needing.setdefault(need.text, []).append(pack.name.text)
         for other in pack.conflicts:
             if other.text in loaded:
                 reporter.error(
@@ -224,11 +223,26 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
                     secondary=[Label(loaded[other.text].name.span, "loaded too")],
                     helps=["leave one of them out"],
                 )
+    for name, places in missing.items():
+        first, *others = needing[name]
+        count = f" and {len(others)} others need" if others else " needs"
+        reporter.error(
+            "PD305",
+            f"pack `{first}`{count} `{name}`, which is not loaded",
+            places[0].span,
+            "not loaded",
+            secondary=[Label(place.span, "needed here too") for place in places[1:4]],
+            helps=_need_helps(name, [first, *others], loaded),
+        )
 
 
-def _need_help(need: str, pack: str, loaded: Iterable[str]) -> str:
-    close = suggest(need, set(loaded) - {pack})
-    return close[0] if close and close[0].startswith("did") else f"load it too, as in `{need}+{pack}`"
+def _need_helps(need: str, needing: Sequence[str], loaded: Iterable[str]) -> list[str]:
+    close = get_close_matches(need, sorted(set(loaded) - set(needing)), n=1, cutoff=0.75)
+    if close:
+        return [f"did you mean `{close[0]}`?"]
+    if len(needing) == 1:
+        return [f"load it too, as in `{need}+{needing[0]}`"]
+    return [f"load `{need}` too, or leave out what needs it: {', '.join(f'`{name}`' for name in needing)}"]
 
 
 @dataclass(frozen=True)

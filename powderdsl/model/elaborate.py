@@ -197,7 +197,11 @@ class Elaborator:
                     f"a loop of {header.text} rounds",
                     header.span,
                     "1 to 64 are possible",
-                    helps=["repeat less often"],
+                    helps=[
+                        "leave the rules out, or write a number from 1 to 64"
+                        if rounds < 1
+                        else "write a number from 1 to 64; a `repeat` inside another multiplies"
+                    ],
                 )
                 return []
             return [(scope, f"{label}round {i + 1}") for i in range(rounds)]

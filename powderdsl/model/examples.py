@@ -77,7 +77,7 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
             "PD110",
             "`expect` has another size than `given`",
             decl.expect.span,
-            f"`given` has {len(given)} rows of {len(given[0])} cells",
+            f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}",
         )
     reader = GridReader(typer, pack, legend)
     fields = reader.read(decl.fields, given, expected=False)
@@ -168,7 +168,25 @@ def _whole_world(height: int, width: int) -> Kernel:
     return Kernel("world", tuple((dy, dx, 1) for dy, dx in offsets), wrap=False)
 
 
+def _check_whole(scalar: Scalar, legend: dict[str, str], typer: Typer) -> None:
+    """Refuse a drawing on the line of its key whose rest is a comment to YAML, where `#` is a character of drawings."""
+    if scalar.style != "plain" or "#" not in legend:
+        return
+    text = scalar.span.source.text
+    end = text.find("\n", scalar.span.end)
+    end = end if end >= 0 else len(text)
+    rest = text[scalar.span.end : end]
+    if rest.lstrip().startswith("#"):
+        start = scalar.span.end + rest.index("#")
+        whole = text[scalar.span.start : end].strip()
+        raise typer.fail(
+            "PD110", "a drawing that stops at a comment", Span(scalar.span.source, start, scalar.span.end + len(rest.rstrip())),
+            "a comment, to YAML", (f'put quotes around the drawing: "{whole}"', "or draw it on the next lines, below `|`"),
+        )  # fmt: skip
+
+
 def _rows(scalar: Scalar, legend: dict[str, str], typer: Typer, *, wildcard: bool) -> tuple[str, ...]:
+    _check_whole(scalar, legend, typer)
     rows = tuple("".join(line.split()) for line in scalar.text.splitlines() if line.strip())
     if not rows or len({len(row) for row in rows}) != 1 or max(len(rows), len(rows[0])) > MAX_SIDE:
         raise typer.fail(

@@ -193,7 +193,7 @@ class Typer(Coercer):
                 f"`{syntax.text}` stands without `mod`",
                 syntax.span,
                 "endless by itself",
-                (f"write `{syntax.text} mod 2`",),
+                (f"write `{syntax.text} mod 2`: rules are the same everywhere and always, up to a pattern",),
             )
         if syntax.text in KERNEL_SHAPES and syntax.text not in KERNELS:
             label, cure = "its radius is missing", (f"write `{syntax.text}(3)`",)

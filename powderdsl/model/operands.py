@@ -5,6 +5,7 @@ Compile-time operands (sets, places, numbers) vanish before the checked model; `
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -101,7 +102,7 @@ def describe(operand: Operand) -> str:
     match operand:
         case Expr():
             return {"int": "a whole number", "flag": "a condition", "element": "an element", "direction": "a direction",
-                    "chance": "a chance", "draw": "a random draw", "real": "a number", "vec2": "a vector"}.get(operand.kind.name, "a number")  # fmt: skip
+                    "chance": "a chance", "draw": "a random draw", "real": "a real number", "vec2": "a vector"}.get(operand.kind.name, "a number")  # fmt: skip
         case SetOf():
             return "an element" if operand.name else "a set of elements"
         case Place():
@@ -246,12 +247,13 @@ class Coercer:
         if isinstance(value, Number):
             if value.value.denominator != 1:
                 raise self.fail(
-                    "PD401", "expected a whole number", span, f"{float(value.value):g} is not whole"
-                )
+                    "PD401", "expected a whole number", span, f"{float(value.value):g} is not whole",
+                    ("write a whole number; a field may also be declared as `real(LOW..HIGH)`",),
+                )  # fmt: skip
             return constant(value, span)
         if value.kind.name == "int":
             return value
-        raise self.wrong(value, "a whole number", span)
+        raise self.wrong(value, "a whole number", span, *_whole_helps(value, span))
 
     def chance(self, operand: Operand, span: Span) -> Expr:
         """A probability: a constant within 0..1, or a property, parameter or field that is one."""
@@ -340,6 +342,26 @@ class Coercer:
                 f"the limit is {MAX_MAGNITUDE:,}",
             )
         return value
+
+
+def _whole_helps(value: Expr, span: Span) -> tuple[str, ...]:
+    """What to write instead of a real number where a whole one is wanted."""
+    if value.kind.name != "real":
+        return ()
+    declared = "or declare what takes it as `real(LOW..HIGH)`"
+    whole = all(arg.op in ("to_real", "const") for arg in value.args)
+    if value.op == "div" and whole and span.text.count("/") == 1:
+        left, _, right = span.text.partition("/")
+        return (f"whole division rounds down: `{left.strip()} div {right.strip()}`", declared)
+    factor = next((arg.value for arg in value.args if arg.op == "const"), None)
+    if value.op == "mul" and whole and isinstance(factor, (int, float)) and span.text.count("*") == 1:
+        number = next(
+            part.strip() for part in span.text.split("*") if not re.fullmatch(r"[-\d.eE%\s]+", part)
+        )
+        ratio = Fraction(factor).limit_denominator(1000)
+        times = "" if ratio.numerator == 1 else f" * {ratio.numerator}"
+        return (f"whole numbers stay whole: `{number}{times} div {ratio.denominator}`", declared)
+    return ("`a div b` divides whole numbers and rounds down", declared)
 
 
 def constant(number: Number, span: Span | None = None) -> Expr:

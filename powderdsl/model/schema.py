@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.diagnostics.printable import look_alikes, shown_character, spelled
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
 
 
@@ -137,6 +138,16 @@ SECTIONS = ("text", "mapping", "words", "list", "statements", "any")
 PREFIXES = {"pass": ("for ", "repeat "), "block": ("for ", "repeat ")}
 """Keys that are read as lines: `for side in (left, right)`, `repeat 2`."""
 
+_MEANT = {
+    "rules": "do",
+    "rule": "do",
+    "steps": "passes",
+    "types": "elements",
+    "state": "fields",
+    "constants": "params",
+}
+"""Keys that people expect, and what they are called here."""
+
 HOMES = ("pack", "pass", "element", "task", "agent", "reward", "split")
 """Mappings to which a key may belong that stands in another one."""
 
@@ -235,6 +246,14 @@ class Reader:
         """The cure for an unknown key: what it should be called, where it belongs, or that it is a rule."""
         if any(sign in word for sign in ("->", ":=", " swaps ", " moves ", "swap ")):
             return ("YAML takes text before `: ` for a key: quote the rule",)
+        if word in ("repeat", "for") and PREFIXES.get(context):
+            return (
+                "say how often: `repeat 3:`"
+                if word == "repeat"
+                else "say over what: `for side in (left, right):`",
+            )
+        if word in _MEANT and _MEANT[word] in self.keys[context]:
+            return (f"did you mean `{_MEANT[word]}`?",)
         close = suggest(word, self.keys[context], f"keys of {what}")
         if close and close[0].startswith("did"):
             return close
@@ -269,6 +288,14 @@ class Reader:
         """Whether a scalar can be a name; reports if not."""
         if NAME.match(key.text) and len(key.text) <= MAX_NAME:
             return True
+        odd = look_alikes(key.text)
+        if odd:
+            listed = ", ".join(shown_character(char) for char in odd)
+            self.reporter.error(
+                "PD111", f"`{spelled(key.text[:MAX_NAME])}` cannot name {what}", key.span,
+                "not all of it is plain ASCII", helps=[f"type these again: {listed}"],
+            )  # fmt: skip
+            return False
         clean = re.sub(r"[^A-Za-z0-9_]+", "_", key.text).strip("_")[:MAX_NAME]
         helps = [f"write `{clean}`"] if NAME.match(clean) else []
         self.reporter.error(

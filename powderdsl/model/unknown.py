@@ -8,6 +8,37 @@ from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import FUNCTIONS
 from powderdsl.model.symbols import Symbols
 
+ELSEWHERE = {
+    "up": "write `above`",
+    "north": "write `above`",
+    "top": "write `above`",
+    "down": "write `below`",
+    "south": "write `below`",
+    "bottom": "write `below`",
+    "west": "write `left`",
+    "east": "write `right`",
+    "self": "a rule speaks of its own cell already: leave it out, or write `here`",
+    "this": "a rule speaks of its own cell already: leave it out, or write `here`",
+    "true": "write `yes`",
+    "false": "write `no`",
+    "none": "name the element that stands for nothing, such as `empty`",
+    "nothing": "name the element that stands for nothing, such as `empty`",
+    "air": "name the element that stands for nothing, such as `empty`",
+    "neighbors": "count them: `count(SET)`, `count(SET in ring)`",
+    "neighbours": "count them: `count(SET)`, `count(SET in ring)`",
+    "random": "say `with chance 5%` at the end of the rule, or compare a stream: `luck < 5%`",
+    "rand": "say `with chance 5%` at the end of the rule, or compare a stream: `luck < 5%`",
+    "probability": "say `with chance 5%` at the end of the rule",
+    "floor": "`a div b` divides whole numbers and rounds down",
+    "round": "`a div b` divides whole numbers and rounds down",
+    "ceil": "`a div b` divides whole numbers and rounds down: `(a + b - 1) div b` rounds up",
+    "int": "`a div b` divides whole numbers and rounds down",
+    "sqrt": "there are no roots; `length(VEC2)` is the length of a vector",
+    "pow": "powers are written out: `x * x`",
+    "distance": "`length(VEC2)` is the length of a vector",
+}
+"""Words of other languages that nothing here has, and what to write."""
+
 MAX_PLACES = 4
 """Places of one name that are shown besides the first."""
 
@@ -44,6 +75,8 @@ class UnknownNames:
         elsewhere = [qualified for qualified in self.symbols.params if qualified.endswith(f".{name}")]
         if elsewhere:
             return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)
+        if not after_dot and name.lower() in ELSEWHERE:
+            return (ELSEWHERE[name.lower()],)
         known = self.symbols.names(after_dot=after_dot)
         close = suggest(name, known if after_dot else [*known, *known_here, *FUNCTIONS])
         if close and close[0].startswith("did"):

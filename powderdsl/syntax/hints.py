@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Set
 from difflib import get_close_matches
 
@@ -101,11 +102,45 @@ _WORDS = {
 }
 """Words that people write, and what the language says instead."""
 
+_LOOK_ALIKES = {
+    **dict.fromkeys("\u00ad\u200b\u200c\u200d\u2060\ufeff\u200e\u200f", ""),
+    **dict.fromkeys("\u00a0\u2002\u2003\u2009\u202f\u3000", " "),
+    "\u2013": "-",
+    "\u2014": "-",
+    "\u2010": "-",
+    "\u2011": "-",
+    "\u2212": "-",
+    "\u2026": "..",
+    "\u037e": ";",
+    "\u2018": "'",
+    "\u2019": "'",
+    "\u201d": '"',
+    "\u201e": '"',
+}
+"""Characters that look like others, or like nothing, and what is meant."""
+
+_CONFUSED = dict(
+    zip(
+        "\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0456\u0458\u0455\u0410\u0412\u0415\u041a\u041c\u041d\u041e\u0420\u0421\u0422\u0425"
+        "\u03bf\u03b1\u03bd\u0391\u0392\u0395\u0397\u0399\u039a\u039c\u039d\u039f\u03a1\u03a4\u03a7\u0131",
+        "aeopcyxijsABEKMHOPCTXoavABEHIKMNOPTXi",
+        strict=True,
+    )
+)
+"""Letters of other scripts that look like ASCII ones: Cyrillic, Greek, and an i without its dot."""
+
 CUT = "inside `{…}` and `[…]` YAML ends a value at a comma: quote it, or give it a line of its own"
 
 
 def character_help(text: str, position: int, begin: int) -> str:
     """The cure for a character that no rule contains, or an empty string. The line starts at `begin`."""
+    cure = _LOOK_ALIKES.get(text[position])
+    if cure is None and not text[position].isascii():
+        plain = unicodedata.normalize("NFKC", text[position])
+        cure = _CONFUSED.get(text[position]) or (plain if plain.isascii() and plain.isprintable() else None)
+    if cure is not None:
+        wanted = "a plain blank" if cure == " " else f"`{cure}`" if cure else ""
+        return f"it only looks like {wanted}: type {wanted}" if wanted else "it has no shape: remove it"
     before = text[begin:position]
     asks = re.search(r"\b(if|where|chance)\b", before) is not None
     if text[position] == "=" and text[position : position + 2] == "=>" and asks:
@@ -135,6 +170,11 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
         return CUT
     if re.search(r"\n\s*-\s", before):
         return "an item of a list starts with `- `: this one, or the one before it, lacks it"
+    if token.isidentifier() and "\n" in before and not before[before.rfind("\n") :].strip():
+        return "each rule of a list starts with `- `; a rule that continues on the next line does so with `if`, `and`, …"
+    meant = _phrase_help(token, before)
+    if meant:
+        return meant
     if token in (":=", "+=", "-="):
         return "only a field of this cell, or of a neighbour, can be assigned"
     if "ELSE" in accepted and re.search(r"\bthen\b", before):
@@ -174,6 +214,38 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
         return f"write `{instead}`"
     close = get_close_matches(token.lower(), sorted(keywords - {token}), n=1, cutoff=0.7)
     return f"did you mean `{close[0]}`?" if close else ""
+
+
+_AFTER_PLACES = ("is", "in", "and", "or", "if", "mod", "div", "not", "leaving", "then", "with", "where")
+
+
+def _phrase_help(token: str, before: str) -> str:
+    """The cure for a turn of phrase that other languages have."""
+    last = re.search(r"([A-Za-z_]+)\s*\Z", before)
+    word = last[1] if last else ""
+    if word in ("count", "sum") and token.isidentifier():
+        return f"write `{word}({token})`"
+    if word in ("above", "below", "left", "right", "here") and token.isidentifier():
+        return "" if token in _WORDS or token in _AFTER_PLACES else f"write `{word} is {token}`"
+    if word == "swaps" and token == "with":
+        return "write `swaps PLACE`, without `with`"
+    if word == "set" and before.strip() == "set" and token.isidentifier():
+        return f"write `{token} := VALUE where …`"
+    if token == "." and re.search(r"(^|[\s(<>=+*/-])\Z", before):
+        return "a number has a digit before its point: `0.5`"
+    if token in "+-" and token and before.rstrip().endswith(token):
+        return (
+            f"write `{word or 'field'} {token}= 1`".replace("field", re.sub(r"\W", "", before))
+            if re.fullmatch(r"\w+[+-]", before.strip())
+            else ""
+        )
+    if token == "*" and before.endswith("*"):
+        return "powers are written out: `x * x`"
+    if not token and re.search(r"\bmoves\s+\S+\Z", before.rstrip()):
+        return "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
+    if not token and before.rstrip().endswith(".."):
+        return "a range has two ends: `0..99`"
+    return ""
 
 
 def expected_words(accepted: Set[str]) -> str:

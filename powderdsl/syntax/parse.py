@@ -11,6 +11,7 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedTok
 from lark.utils import TextSlice
 
 from powderdsl.diagnostics import Reporter, Source, Span
+from powderdsl.diagnostics.printable import shown_character
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.hints import character_help, expected_words, token_help, was_cut
 from powderdsl.syntax.yaml_tree import Scalar
@@ -122,7 +123,7 @@ def _report_syntax_error(
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
         cure = character_help(text, start, begin)
         reporter.error(
-            "PD201", f"unexpected character `{text[start]}`", Span(source, start, start + 1), "not part of a rule",
+            "PD201", f"unexpected character {shown_character(text[start])}", Span(source, start, start + 1), "not part of a rule",
             helps=[cure] if cure else [],
         )  # fmt: skip
         return

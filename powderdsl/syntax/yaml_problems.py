@@ -6,6 +6,7 @@ usually did there.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ import yaml
 from powderdsl.diagnostics import Label, Reporter, Source, Span
 
 QUOTE = "put quotes around the whole value"
+_ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
 COMMENT = "YAML takes a `#` after a space for a comment"
 
 
@@ -49,6 +51,10 @@ class Place:
         """The text of the line before the place."""
         return self.text[self.text.rfind("\n", 0, self.at) + 1 : self.at]
 
+    def before_of(self, at: int) -> str:
+        """The text of the line before another place."""
+        return self.text[self.text.rfind("\n", 0, at) + 1 : at]
+
     @property
     def same_line(self) -> bool:
         return "\n" not in self.text[self.since : self.at]
@@ -57,6 +63,15 @@ class Place:
         # At the end of the file there is nothing to underline but what stands last.
         start = min(start, max(len(self.text.rstrip()) - 1, 0))
         return Span(self.source, start, start + max(length, 1))
+
+    def quoted(self, at: int) -> str:
+        """The cure for the value on the line of a place: the same line with quotes."""
+        begin, end = self.text.rfind("\n", 0, at) + 1, self.text.find("\n", at)
+        found = _ENTRY.match(self.text[begin : end if end >= 0 else len(self.text)])
+        if found is None or found.start("value") > at - begin:
+            return QUOTE
+        quote = "'" if '"' in found["value"] else '"'
+        return f"put quotes around it: {found['key']}: {quote}{found['value']}{quote}"
 
     def rest(self, start: int) -> Span:
         """From `start` to the end of its line."""
@@ -150,6 +165,17 @@ def _unclosed(place: Place) -> Problem:
             Label(place.span(place.since), "opened here"),
         )  # fmt: skip
     opened = place.span(place.since)
+    if place.at >= len(place.text.rstrip()) or not place.same_line:
+        line = place.rest(place.since).text
+        cure = place.quoted(place.since)
+        if (
+            closer not in line
+            and re.search(r"\b(given|expect): \Z", place.before_of(place.since))
+            and cure != QUOTE
+        ):
+            return Problem(
+                f"a `{opener}` that is never closed", opened, "not closed", f"write the `{closer}`, or {cure}"
+            )
     if place.same_line and place.at < len(place.text):
         return Problem(
             f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, Label(opened, "opened here")
@@ -185,7 +211,7 @@ def _bad_start(place: Place) -> Problem:
         f"a value cannot start with `{place.char}`",
         place.span(place.at),
         "has a meaning of its own in YAML",
-        QUOTE,
+        place.quoted(place.at),
     )
 
 
@@ -218,15 +244,20 @@ def _no_colon(place: Place) -> Problem:
 
 
 def _list_beside_key(place: Place) -> Problem:
+    cure = place.quoted(place.at)
     return Problem(
         "a list on the line of its key",
         place.span(place.at),
         "a list starts on the next line",
-        "put `- …` on a line of its own",
+        "put `- …` on a line of its own" + ("" if cure == QUOTE else f"; if it is no list, {cure}"),
     )
 
 
 def _nothing(place: Place) -> Problem:
+    last = Place(place.source, min(place.at, len(place.text.rstrip())), 0)
+    line = Place(place.source, last.at, last.at - len(last.before))
+    if "{" in last.before and _comment(line) is not None:
+        return _unclosed(Place(place.source, last.at, line.since + last.before.rindex("{")))
     if place.char in ("}", "]"):
         return Problem(
             f"a `{place.char}` that closes nothing",
@@ -240,8 +271,9 @@ def _nothing(place: Place) -> Problem:
 
 def _block_header(place: Place) -> Problem:
     char = place.text[place.since : place.since + 1]
+    cure = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
     return Problem(
-        f"text after `{char}`", place.rest(place.at), f"`{char}` starts a block on the next lines", QUOTE
+        f"text after `{char}`", place.rest(place.at), f"`{char}` starts a block on the next lines", cure
     )
 
 
@@ -263,12 +295,22 @@ def _directive(place: Place) -> Problem:
 def _start_of_value(place: Place) -> Problem:
     since = place.span(place.since)
     return Problem(
-        f"a value cannot start with `{since.text}`", since, "has a meaning of its own in YAML", QUOTE
+        f"a value cannot start with `{since.text}`",
+        since,
+        "has a meaning of its own in YAML",
+        place.quoted(place.since),
+    )
+
+
+def _complex_key(place: Place) -> Problem:
+    return Problem(
+        "a value cannot start with `?`", place.span(place.at), "begins a key, to YAML", place.quoted(place.at)
     )
 
 
 _ROWS: tuple[tuple[tuple[str, ...], Callable[[Place], Problem]], ...] = (
     (("mapping values are not allowed",), _second_colon),
+    (("mapping keys are not allowed",), _complex_key),
     (("found a tab character",), _tab),
     (("cannot start any token",), _bad_start),
     (("expected ',' or '}'", "expected ',' or ']'"), _unclosed),

@@ -148,8 +148,12 @@ class _Builder:
             self._forbid(
                 event, f"the anchor `&{event.anchor}`", "write the value out: rule files have no anchors"
             )
-        if event.tag is not None and event.tag != "!":
-            self._forbid(event, f"the tag `{event.tag}`", "remove it: rule files are plain data")
+        if event.tag is not None:
+            self._forbid(
+                event,
+                f"the tag `{event.tag}`",
+                "remove it: rule files are plain data; a value that starts with `!` needs quotes",
+            )
         if isinstance(event, yaml.ScalarEvent):
             return self._scalar(event)
         if isinstance(event, yaml.SequenceStartEvent):

@@ -16,6 +16,7 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedTok
 from lark.utils import TextSlice
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
+from powderdsl.diagnostics.printable import shown_character
 from powderdsl.syntax.hints import CUT, was_cut
 from powderdsl.worlds.raster import MAX_COORDINATE
 from powderdsl.worlds.scene.amounts import Amount, number
@@ -334,7 +335,10 @@ def _report_syntax(error: UnexpectedInput, statement: Span, reporter: Reporter) 
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
         char = source.text[start]
         reporter.error(
-            "PD605", f"unexpected character `{char}`", Span(source, start, start + 1), helps=_usage(statement)
+            "PD605",
+            f"unexpected character {shown_character(char)}",
+            Span(source, start, start + 1),
+            helps=_usage(statement),
         )
         return
     assert isinstance(error, UnexpectedToken)
