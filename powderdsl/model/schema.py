@@ -162,6 +162,13 @@ def first_line(node: Node) -> Span:
     return Span(span.source, span.start, max(min(span.end, end if end >= 0 else span.end), span.start + 1))
 
 
+def before_comment(key: Scalar) -> bool:
+    """Whether nothing but a comment stands after a key on its line."""
+    text = key.span.source.text
+    end = text.find("\n", key.span.end)
+    return text[key.span.end : end if end >= 0 else len(text)].lstrip(": ").startswith("#")
+
+
 class Reader:
     """Reads located YAML by a table of keys, reporting what does not fit."""
 
@@ -198,7 +205,9 @@ class Reader:
             empty = isinstance(value, Scalar) and value.style == "plain" and not value.text
             if row and isinstance(value, Scalar) and empty and (row.required or row.shape in VALUES):
                 self._no_value(key, value, row)
-            elif row and empty and row.shape in SECTIONS:
+            elif (
+                row and empty and row.shape in SECTIONS and not (row.shape == "text" and before_comment(key))
+            ):
                 self.reporter.report(
                     "PD113", f"`{key.text}` is empty", key.span, "nothing stands after it",
                     helps=[f"`{key.text}`: {row.about}", "remove it, or indent what belongs to it"],
