@@ -228,6 +228,14 @@ def mutations() -> str:
     return table(("pack", "mistake", "noticed by"), rows)
 
 
+def mutation_operators() -> str:
+    from powderdsl.mutation.mutants import OPERATORS
+
+    return table(
+        ("mistake", "what is written instead"), ((f"`{n}`", about) for n, about in OPERATORS.items())
+    )
+
+
 def mutation_testing() -> str:
     """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
     from powderdsl.mutation.tally import COUNTED, by_hand_share, noticed_share
@@ -257,6 +265,7 @@ def mutation_testing() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "mutations": mutations,
+    "mutation operators": mutation_operators,
     "mutation testing": mutation_testing,
     "directions": directions,
     "direction sets": direction_sets,

@@ -141,7 +141,7 @@ def _reads(node: Node, at: Offset) -> list[tuple[Node, Offset]]:
 
 
 def _is_free(node: Node) -> bool:
-    """Whether a node that is no real number is a variable of its own: it depends on some, or on a parameter."""
+    """Whether a node that is not a real number is a variable of its own: it depends on some, or on a parameter."""
     if node.op in ("param", "inside", "draw", "sqrt"):
         return node.op != "inside"
     if node.op == "below":

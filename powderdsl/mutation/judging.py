@@ -35,7 +35,7 @@ PAIRED = 6
 class Verdict:
     """What became of a mutant.
 
-    `status` is ``killed``, ``survived``, ``equivalent`` (proven) or ``invalid`` (no rule file); `by` is one of NOTICED
+    `status` is ``killed``, ``survived``, ``equivalent`` (proven) or ``invalid`` (not a rule file); `by` is one of NOTICED
     or how it was proven; `detail` is a code, an invariant's words or a test's name.
     """
 

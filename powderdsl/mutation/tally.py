@@ -9,7 +9,7 @@ from powderdsl.mutation.judging import NOTICED
 from powderdsl.mutation.mutation_run import Outcome
 
 COUNTED = ("mutants", "equivalent", "killed", *NOTICED, "survived")
-"""Keys of a tally. `killed` is the sum of what noticed them; texts that are no rule files are not counted."""
+"""Keys of a tally. `killed` is the sum of what noticed them; texts that are not rule files are not counted."""
 
 
 def tally(outcomes: Iterable[Outcome]) -> dict[str, int]:

@@ -133,11 +133,11 @@ def _legend(
     loaded. Elements of packs that this one does not need may be absent: the test then waits.
     """
     needed = _closure(packs, pack)
-    chosen = {decl.name.text: decl.glyph for one in packs for decl in one.elements}
+    chosen = {f"{one.name.text}.{decl.name.text}": decl.glyph for one in packs for decl in one.elements}
     glyphs: dict[int, str] = {}
     legend = []
     for element in there:
-        if chosen.get(element.name) and element.pack in needed and element.glyph not in glyphs.values():
+        if chosen.get(element.qualified) and element.pack in needed and element.glyph not in glyphs.values():
             glyphs[element.id] = element.glyph
     for element in there:
         if element.id in glyphs:
@@ -145,7 +145,7 @@ def _legend(
         taken = {
             *glyphs.values(),
             "?",
-            *(e.glyph for e in ruleset.elements if e.pack in needed and chosen[e.name]),
+            *(e.glyph for e in ruleset.elements if e.pack in needed and chosen.get(e.qualified)),
         }
         wanted = [element.glyph, *element.name, *element.name.upper(), *LETTERS]
         glyph = next(one for one in wanted if one not in taken and one not in "\"'\\#")
@@ -179,7 +179,7 @@ def with_tests(source: Source, tests: Sequence[GeneratedTest]) -> str:
     if node is None:
         return text + "tests:\n" + "".join(_indented(test.text, 2) for test in tests)
     if not isinstance(node, YamlSequence) or source.text[node.span.start] == "[":
-        raise ValueError(f"{source.name}: `tests:` is no list with a line for each test")
+        raise ValueError(f"{source.name}: `tests:` is not a list with a line for each test")
     first = source.text.rfind("\n", 0, node.span.start) + 1
     indent = len(source.text[first : node.span.start]) - len(source.text[first : node.span.start].lstrip(" "))
     # The list ends before the next key of the file, or at its end; blank lines and comments between stay below it.

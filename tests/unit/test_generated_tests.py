@@ -1,0 +1,87 @@
+"""Tests that the tool writes into packs: where they go in a file, and that all else stays."""
+
+from __future__ import annotations
+
+import pytest
+
+from powderdsl.diagnostics import Source
+from powderdsl.mutation.distinguishing import distinguish
+from powderdsl.mutation.original import Original
+from powderdsl.mutation.written import GeneratedTest, with_tests, written_test
+from powderdsl.pack_tests import run_examples
+from powderdsl.simulator import compile
+from powderdsl.testing.cases import load_text
+
+NEW = GeneratedTest("p", "generated x", "- generated x:\n    given: a\n    expect: a\n")
+HEAD = 'pack: p\nelements: {a: {id: 0, color: "#101010", glyph: a}}\n'
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (HEAD, HEAD + "tests:\n  - generated x:\n      given: a\n      expect: a\n"),
+        (
+            HEAD + "tests:\n- one:  # zero columns in\n    given: a\n    expect: a",
+            HEAD
+            + "tests:\n- one:  # zero columns in\n    given: a\n    expect: a\n"
+            + "- generated x:\n    given: a\n    expect: a\n",
+        ),
+        (
+            "tests:\n    - one:\n        given: a\n        expect: a\n\n# about the pack\n" + HEAD,
+            "tests:\n    - one:\n        given: a\n        expect: a\n"
+            "    - generated x:\n        given: a\n        expect: a\n\n# about the pack\n" + HEAD,
+        ),
+        (
+            HEAD + "tests:\n  - one:\n      given: |\n        a\n      expect: |\n        a\n\n",
+            HEAD
+            + "tests:\n  - one:\n      given: |\n        a\n      expect: |\n        a\n"
+            + "  - generated x:\n      given: a\n      expect: a\n\n",
+        ),
+    ],
+)
+def test_a_test_is_added_at_the_end_of_the_tests(before, after):
+    assert with_tests(Source("p.yaml", before), [NEW]) == after
+    assert [one.name for one in load_text(after).tests][-1] == "generated x"
+
+
+def test_a_list_in_brackets_cannot_be_added_to():
+    with pytest.raises(ValueError, match="is not a list"):
+        with_tests(Source("p.yaml", HEAD + "tests: [{one: {given: a, expect: a}}]\n"), [NEW])
+
+
+FIELDS = """\
+pack: count
+elements:
+  off: {id: 0, color: "#101010"}
+  on: {id: 1, color: "#202020"}
+fields:
+  charge: {type: 0..9, at: place}
+  flow: {type: vec2(-9..9), at: place}
+passes:
+  one:
+    do:
+      - charge += 2 where on
+      - flow := flow + vector(0.5, 1) where on
+      - off -> on if charge == 9 and flow.row > 3
+"""
+
+
+@pytest.mark.parametrize("mistake", ["field", "vector", "start"])
+def test_fields_are_drawn_where_elements_do_not_tell(tmp_path, mistake):
+    old, new = {
+        "field": ("charge += 2", "charge += 3"),
+        "vector": ("vector(0.5, 1)", "vector(0.5, 2)"),
+        "start": ("flow.row > 3", "flow.row < 3"),
+    }[mistake]
+    path = tmp_path / "count.yaml"
+    path.write_text(FIELDS)
+    original = Original.of(str(path))
+    mutant = original.mutants()[0]
+    changed = compile(load_text(FIELDS.replace(old, new)), backend="planes")
+    found = distinguish(original.sim, changed)
+    assert found is not None
+    text = written_test(mutant, found, original.sim, original.packs).text
+    assert "fields:" in text if mistake == "start" else "expect_fields:" in text
+    body = "tests:\n" + "".join(f"  {line}\n" for line in text.splitlines())
+    assert run_examples(load_text(FIELDS + body))[0].passed
+    assert not run_examples(load_text(FIELDS.replace(old, new) + body))[0].passed
