@@ -1,0 +1,135 @@
+"""Files from strangers: whatever is in them, a command ends soon, in little memory, says what is wrong, and writes nowhere else."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.hostile.damage_kinds import KINDS, Kind, make_valid
+
+SECONDS, MEGABYTES = 5.0, 300.0
+"""Processor time of a command, and memory beyond that for a valid file of the kind."""
+SMOKE = 2
+"""Files of each kind in `make test`."""
+RAW = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]|\xc2[\x80-\x9f]|\xe2\x80[\xaa-\xae]|\xe2\x81[\xa6-\xa9]")
+
+
+def process(*words: str, cwd: Path) -> None:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(cwd / "own")}
+    command = [sys.executable, "-m", "powderdsl", *words]
+    run = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a valid file of each kind."""
+    folder = tmp_path_factory.mktemp("valid") / "files"
+    make_valid(folder, lambda *words: process(*words, cwd=folder))
+    return folder
+
+
+def run_all(seeds: Mapping[str, range], valid: Path, place: Path) -> Iterator[dict[str, Any]]:
+    """What came of the files of each kind's seeds, in a process that has imported everything and trains nothing itself."""
+    script = "import sys; from tests.hostile.worker import work; work(*sys.argv[1:])"
+    jobs = [f"{name}|{one.start}|{one.stop}" for name, one in seeds.items()]
+    root = Path(__file__).resolve().parents[2]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)}
+    words = [sys.executable, "-c", script, str(valid), str(place), *jobs]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, env=environment, cwd=root, text=True) as running:
+        assert running.stdout is not None
+        for line in running.stdout:
+            yield json.loads(line)
+    assert running.returncode == 0
+
+
+def problems(found: dict[str, Any]) -> list[str]:
+    """What a command did that it must not do."""
+    output = bytes.fromhex(found["output"])
+    told = []
+    if found["hung"]:
+        told.append("hangs")
+    if found["status"] not in (0, 1, 2):
+        told.append(f"ends with {found['status']}")
+    if b"Traceback (most recent call last)" in output or re.search(rb"^error\[PD901\]", output, re.MULTILINE):
+        told.append("reports a mistake of ours")
+    if found["seconds"] - found["usual_seconds"] > SECONDS:
+        told.append(f"takes {found['seconds']:.1f} s")
+    if found["megabytes"] - found["usual_megabytes"] > MEGABYTES:
+        told.append(f"takes {found['megabytes'] - found['usual_megabytes']:.0f} MB more than usual")
+    if RAW.search(output):
+        told.append(f"prints {RAW.findall(output)[:3]}")
+    if found["escaped"]:
+        told.append(f"writes outside: {found['escaped']}")
+    return told
+
+
+def test_a_few_hostile_files(valid: Path, tmp_path: Path) -> None:
+    check({kind.name: range(SMOKE) for kind in KINDS}, valid, tmp_path)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_many_hostile_files(kind: Kind, valid: Path, tmp_path: Path) -> None:
+    check({kind.name: range(100, 100 + kind.many)}, valid, tmp_path)
+
+
+def check(seeds: Mapping[str, range], valid: Path, place: Path) -> None:
+    wrong: list[str] = []
+    statuses: Counter[int] = Counter()
+    slowest = largest = 0.0
+    for found in run_all(seeds, valid, place):
+        statuses[found["status"]] += 1
+        slowest = max(slowest, found["seconds"] - found["usual_seconds"])
+        largest = max(largest, found["megabytes"] - found["usual_megabytes"])
+        told = problems(found)
+        if told:
+            output = bytes.fromhex(found["output"]).decode("utf-8", "replace")
+            wrong.append(
+                f"{found['kind']} {found['seed']} ({found['how']}): {'; '.join(told)}\n{output[-600:]}"
+            )
+    assert sum(statuses.values()) == sum(map(len, seeds.values()))
+    codes = ", ".join(f"{code}: {count}" for code, count in sorted(statuses.items()))
+    print(f"{', '.join(seeds)}: exit codes {codes}, at most {slowest:.1f} s and {largest:.0f} MB more")
+    shutil.rmtree(place, ignore_errors=True)
+    assert not wrong, "\n\n".join(wrong[:20])
+
+
+def test_each_fault_is_told() -> None:
+    good = {
+        "status": 2,
+        "output": b"error[PD101]: x\n".hex(),
+        "seconds": 1.0,
+        "usual_seconds": 0.5,
+        "megabytes": 400.0,
+        "usual_megabytes": 300.0,
+        "hung": False,
+        "escaped": [],
+    }
+    assert problems(good) == []
+    faults: list[dict[str, Any]] = [
+        {"hung": True},
+        {"status": 70},
+        {"status": -11},
+        {"status": 130},
+        {"output": b"Traceback (most recent call last):\n".hex()},
+        {"output": b"x\nerror[PD901]: a mistake\n".hex()},
+        {"output": b"\x1b[2J".hex()},
+        {"output": "\x9b".encode().hex()},
+        {"output": "\u202e".encode().hex()},
+        {"seconds": 6.0},
+        {"megabytes": 601.0},
+        {"escaped": ["outside/victim.json"]},
+    ]
+    for fault in faults:
+        assert len(problems(good | fault)) == 1, fault

@@ -1,0 +1,145 @@
+"""Archives of arrays and checkpoints are known by what they claim before any of it takes memory."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import resource
+import struct
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import powderdsl
+from powderdsl.diagnostics import CompileError
+from powderdsl.runs.checkpoints import latest_checkpoint, save_checkpoint
+from powderdsl.worlds.archives import BadArchive, open_archive
+from powderdsl.worlds.raster import MAX_CELLS
+
+
+def codes(path: Path) -> list[str]:
+    sim = powderdsl.compile("core", backend="reference")
+    with pytest.raises(CompileError) as caught:
+        powderdsl.load_world(path, sim)
+    return [one.code for one in caught.value.diagnostics]
+
+
+def test_a_small_file_with_a_large_world_is_not_unpacked(tmp_path):
+    sim = powderdsl.compile("core", backend="reference")
+    powderdsl.save(sim.world(np.zeros((1, 4, 4), np.uint8)), tmp_path / "w.npz")
+    with np.load(tmp_path / "w.npz") as data:
+        arrays = dict(data)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    side = 30_000
+    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': (1, {side}, {side}), }}".encode()
+    header += b" " * (-(len(header) + 11) % 64) + b"\n"
+    with zipfile.ZipFile(tmp_path / "w.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, value in arrays.items():
+            with archive.open(f"{name}.npy", "w") as member:
+                if name != "slot_element":
+                    np.lib.format.write_array(member, value)
+                    continue
+                member.write(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header)
+                for _ in range(side):
+                    member.write(bytes(side))
+    assert (tmp_path / "w.npz").stat().st_size < 2_000_000
+    assert codes(tmp_path / "w.npz") == ["PD607"]
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
+
+
+def test_worlds_that_could_not_be_loaded_are_not_saved(tmp_path):
+    sim = powderdsl.compile("core", backend="reference")
+    world = sim.world(np.zeros((1, 4, 4), np.uint8))
+    large = {name: value.expand(MAX_CELLS // 16 + 1, *value.shape[1:]) for name, value in world.state.items()}
+    many = powderdsl.World(sim, large, world.seed, world.index, world.step)
+    with pytest.raises(CompileError, match="PD607"):
+        powderdsl.save(many, tmp_path / "w.npz")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("member", ["x.npy", "y.npy"])
+def test_what_is_no_array_of_numbers(member, tmp_path):
+    for value in (np.array([None]), np.zeros(2, [("a", "i4")]), np.zeros(2, "S3"), np.array([1j])):
+        np.savez(tmp_path / "a.npz", **{member.removesuffix(".npy"): value})
+        with pytest.raises(BadArchive), open_archive(tmp_path / "a.npz"):
+            pass
+
+
+def test_a_long_list_of_contents_is_not_read(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for number in range(300):
+            archive.writestr(f"{number}.npy", b"")
+    with pytest.raises(BadArchive, match="more than 256"), open_archive(tmp_path / "a.npz"):
+        pass
+
+
+# Checkpoints
+
+
+def good() -> dict[str, object]:
+    weights = OrderedDict(a=torch.arange(6).reshape(2, 3), b=torch.ones(4)[1:3])
+    return {"model": weights, "recent": [1.0, None, "x", (1, True)], "rng": torch.zeros(8, dtype=torch.uint8)}
+
+
+def test_what_training_saves_is_read(tmp_path):
+    save_checkpoint(tmp_path, 3, good())
+    found = latest_checkpoint(tmp_path)
+    assert found is not None
+    assert found.state["recent"] == [1.0, None, "x", (1, True)]
+    assert torch.equal(found.state["model"]["b"], torch.ones(2))
+
+
+def crafted(folder: Path, data: bytes) -> None:
+    (folder / f"{3:012d}-{hashlib.sha256(data).hexdigest()[:16]}.pt").write_bytes(data)
+
+
+def saved(value: object, **how: object) -> bytes:
+    out = io.BytesIO()
+    torch.save(value, out, **how)  # type: ignore[arg-type]
+    return out.getvalue()
+
+
+def with_pickle(pickle: bytes) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(saved(good()))) as old, zipfile.ZipFile(out, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, pickle if name.endswith("data.pkl") else old.read(name))
+    return out.getvalue()
+
+
+CRAFTED = {
+    "empty": b"",
+    "no archive": b"x" * 100,
+    "another format of torch's": saved(good(), _use_new_zipfile_serialization=False),
+    "a tensor that repeats itself": saved(torch.zeros(1).expand(10**9)),
+    "a sparse tensor": saved(torch.zeros(3).to_sparse()),
+    "one list twice": saved([[1]] * 2),
+    "a call": with_pickle(b"\x80\x02cposix\nsystem\nX\x04\0\0\0true\x85R."),
+    "much memory": with_pickle(b"\x80\x02cbuiltins\nbytearray\nJ\xff\xff\xff\x7f\x85R."),
+    "a memo of 2^31 values": with_pickle(b"\x80\x02}r\xff\xff\xff\x7fh\x01."),
+    "deep nesting": with_pickle(b"\x80\x02)" + b"\x85" * 100_000 + b"."),
+    "cut off": with_pickle(b"\x80\x02}("),
+    "nothing": with_pickle(b""),
+}
+
+
+@pytest.mark.parametrize("name", CRAFTED)
+def test_a_crafted_checkpoint_is_refused(name, tmp_path):
+    crafted(tmp_path, CRAFTED[name])
+    with pytest.raises(CompileError) as caught:
+        latest_checkpoint(tmp_path)
+    assert [one.code for one in caught.value.diagnostics] == ["PD620"]
+
+
+def test_a_storage_has_the_bytes_that_it_says(tmp_path):
+    data = saved(torch.zeros(7, dtype=torch.uint8))
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        text = archive.read("archive/data.pkl")
+    assert text.count(b"K\x07") == 2
+    crafted(tmp_path, with_pickle(text.replace(b"K\x07", b"J\xff\xff\xff\x7f")))
+    with pytest.raises(CompileError, match="bytes that it says"):
+        latest_checkpoint(tmp_path)
