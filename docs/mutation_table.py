@@ -21,7 +21,7 @@ DOCS = Path(__file__).resolve().parent
 RESULTS = DOCS / "mutation.json"
 
 EXAMPLES = {
-    "core+docs/examples/beetle.yaml": ("beetle",),
+    "core+water+docs/examples/beetle.yaml": ("beetle",),
     "core+docs/examples/electricity.yaml": ("electricity",),
     "core+water+docs/examples/salt.yaml": ("salt",),
     "powderworld+docs/examples/steam.yaml": ("steam",),
