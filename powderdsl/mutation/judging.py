@@ -126,9 +126,10 @@ class _Mutated:
 def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | None, bool]:
     """An invariant of the mutant that some world breaks, and whether any world ended otherwise than before.
 
-    Only such worlds are asked about the invariants.
+    Only such worlds are asked about the invariants, unless elements have other properties or tags than before.
     """
     ruleset = sim.ruleset
+    alike = _declared(ruleset) == _declared(original.ruleset)
     broken = original_breaks(original)
     kept = [one for number, one in enumerate(ruleset.invariants) if number not in broken]
     single = [one for one in kept if not is_paired(one.claim)]
@@ -138,13 +139,22 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
             states, _ = run_sample(sim, batch.sample, batch.steps)
             differs = differing(batch.states, states)
             any_differs |= bool(differs.any())
-            found = _broken_in(batch, original, sim, single, states, differs)
+            asked = differs if alike else np.ones_like(differs)
+            found = _broken_in(batch, original, sim, single, states, asked)
             if found is not None:
                 return found, True
             if any_differs and not single:
                 break
     found = next((one for one in kept if is_paired(one.claim) and _is_broken(one, original, sim)), None)
     return found, any_differs or found is not None
+
+
+def _declared(ruleset: Ruleset) -> tuple[object, ...]:
+    """What conditions read of elements and no world holds."""
+    return (
+        [(prop.name, prop.values) for prop in ruleset.properties],
+        [(element.name, element.tags) for element in ruleset.elements],
+    )
 
 
 def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool:
