@@ -152,8 +152,7 @@ RESERVED = (
     frozenset(DIRECTIONS)
     | frozenset(DIRECTION_SETS)
     | frozenset(KERNELS)
-    | frozenset(KERNEL_SHAPES)
     | frozenset(FUNCTIONS)
     | frozenset(COORDINATES)
 )
-"""Words that no definition may take."""
+"""Words that no definition may take. Shapes such as `diamond(3)` have their radius with them: elements may have their names."""

@@ -195,7 +195,8 @@ class Typer(Coercer):
                 "endless by itself",
                 (f"write `{syntax.text} mod 2`: rules are the same everywhere and always, up to a pattern",),
             )
-        if syntax.text in KERNEL_SHAPES and syntax.text not in KERNELS:
+        shape = syntax.text in KERNEL_SHAPES and syntax.text not in KERNELS
+        if shape and self.find(syntax.text, syntax.span, scope) is None:
             label, cure = "its radius is missing", (f"write `{syntax.text}(3)`",)
             raise self.fail("PD406", f"`{syntax.text}` needs a radius", syntax.span, label, cure)
         if syntax.text in FUNCTIONS:

@@ -257,3 +257,9 @@ def test_names_after_a_dot_may_be_absent() -> None:
     rules, notes = load_with_diagnostics("core", "one.yaml", mine)
     buzz = next(one for one in rules.passes if one.name == "buzz")
     assert [len(moment.rules) for moment in buzz.moments] == [1, 1]
+
+
+def test_shapes_of_kernels_are_names_like_others() -> None:
+    gem = pack("gem", '  diamond: {color: "#AAFFFF"}', "passes:\n"
+               "  grow: {do: empty -> diamond if count(diamond in diamond(2)) > 3}\n")  # fmt: skip
+    assert powderdsl.load("core", gem).element("diamond")
