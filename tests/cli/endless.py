@@ -71,7 +71,7 @@ COMMANDS = {
         2,  # by then the compiler fails
     ),
     "record": Endless(
-        ("record", "dig.yaml", "--out", "data", "--episodes", "900000", "--shard", "3", "--backend", "dense"),
+        ("record", "dig.yaml", "--out", "data", "--episodes", "150000", "--shard", "3", "--backend", "dense"),
         "data/shard-*",
         ("run", "life", *SMALL, "--steps", "3", "--out", "data/x.npz"),
     ),
