@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-from powderdsl.datasets.manifest import MAX_EPISODES, MAX_SHARD_BYTES, Recipe, episode_bytes
+from powderdsl.datasets.manifest import MAX_EPISODES, MAX_SHARD_BYTES, MAX_SHARDS, Recipe, episode_bytes
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.tasks.task import BLOW, NO_CHANGE
@@ -74,6 +74,7 @@ def _shard_size(recipe: Recipe, given: int | None) -> int:
         size = USUAL_SHARD
         while size > 1 and size * each > USUAL_SHARD_BYTES:
             size //= 2
+        size = max(size, -(-recipe.episodes // MAX_SHARDS))
     else:
         check_count("shard", given, MAX_EPISODES)
         size = given
@@ -81,5 +82,10 @@ def _shard_size(recipe: Recipe, given: int | None) -> int:
         raise ValueError(
             f"a shard of {size} episodes may take {size * each:,} bytes, more than {MAX_SHARD_BYTES:,}: "
             "record fewer episodes a shard, or shorter ones with max_episode_steps"
+        )
+    if -(-recipe.episodes // size) > MAX_SHARDS:
+        raise ValueError(
+            f"{recipe.episodes:,} episodes in shards of {size} are more than {MAX_SHARDS:,} shards: "
+            f"record at least {-(-recipe.episodes // MAX_SHARDS)} episodes a shard"
         )
     return size

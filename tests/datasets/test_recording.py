@@ -13,7 +13,8 @@ from filelock import FileLock
 from torch import Tensor
 
 from powderdsl.datasets import Dataset, record
-from powderdsl.datasets.manifest import read_manifest
+from powderdsl.datasets.manifest import MAX_SHARDS, read_manifest
+from powderdsl.datasets.recipes import recipe_of
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
 from powderdsl.envs.acting import action_keys, random_policy
@@ -240,3 +241,12 @@ def test_bad_arguments_are_refused(
     with pytest.raises((ValueError, TypeError), match=words):
         record(small, **given)
     assert files(tmp_path) == {}
+
+
+def test_more_shards_than_a_dataset_may_have_are_refused_before_anything_is_written(
+    small: TaskProgram, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match="record at least 2 episodes a shard"):
+        record(small, "random", tmp_path / "data", episodes=MAX_SHARDS + 1, shard=1)
+    assert not (tmp_path / "data").exists()
+    assert recipe_of(TensorEnv(small, 1), episodes=600 * MAX_SHARDS).shards <= MAX_SHARDS
