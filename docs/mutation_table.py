@@ -24,7 +24,7 @@ EXAMPLES = {
     "core+water+docs/examples/beetle.yaml": ("beetle",),
     "core+docs/examples/electricity.yaml": ("electricity",),
     "core+water+docs/examples/salt.yaml": ("salt",),
-    "powderworld+docs/examples/steam.yaml": ("steam",),
+    "core+water+fire+lava+docs/examples/steam.yaml": ("steam",),
 }
 """Compositions of the examples, and which of their packs are mutated."""
 
