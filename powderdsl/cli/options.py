@@ -27,7 +27,7 @@ MAX_SIDE = 1 << 24
 def layout_options(about: str, *more: tuple[str, str]) -> Callable[[Decorated], Decorated]:
     """`--json` as every command has it, passed on as `layout`: ``text``, ``json``, or one of `more` (flag, help).
 
-    `--format LAYOUT` means the same; it was the spelling of some commands, and is no longer shown.
+    `--format LAYOUT` means the same; it was the spelling of some commands, and is hidden now.
     """
     flags = (("json", about), *more)
 

@@ -50,7 +50,7 @@ class Places:
         for axis in study.axes:
             self.set_by |= {name: axis.name for values in axis.sets.values() for name in values}
         self.wrong: set[str] = set()
-        """Steps with mistakes: what follows from those is no news."""
+        """Steps with mistakes: consequences of those are not reported."""
 
     def known(self, names: set[str]) -> bool:
         """Whether all names have values; others are reported by whoever reads the file."""
@@ -71,7 +71,7 @@ class Places:
                     yield found
 
     def words(self, step: Step, values: Values) -> dict[str, list[Word]]:
-        """The words of a step's options, and of ``on`` where that is no step."""
+        """The words of a step's options, and of ``on`` where that is not a step."""
         texts = dict(step.options)
         if step.on is not None and not step.on_step:
             texts["on"] = (step.on,)

@@ -66,7 +66,7 @@ def _checked(ruleset: Ruleset, packs: Iterable[str], reporter: Reporter) -> Rule
 
 
 def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
-    """The model without one pack and those that need it; None if the rest is no ruleset."""
+    """The model without one pack and those that need it; None if the rest is not a ruleset."""
     assert ruleset.declared is not None
     gone = {pack}
     for _ in ruleset.declared.packs:

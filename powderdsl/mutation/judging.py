@@ -171,7 +171,7 @@ def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool
 
 @lru_cache(maxsize=4)
 def original_breaks(original: Original) -> frozenset[int]:
-    """Places of invariants that the original itself breaks: what more packs change is no news of a mutant."""
+    """Places of invariants that the original itself breaks: what more packs change says nothing about a mutant."""
     found = set()
     for number, one in enumerate(original.ruleset.invariants):
         if is_paired(one.claim):

@@ -33,7 +33,7 @@ GENERATED = "generated "
 
 
 class Invalid(Exception):
-    """A text that is no rule file: a mistake of spelling, not of meaning."""
+    """A text that is not a rule file: a mistake of spelling, not of meaning."""
 
 
 def is_generated(example: Example) -> bool:

@@ -34,7 +34,7 @@ class Work:
     rules: int
     left: int
     side_multiple: int = 1
-    """Worlds whose sides are no multiples of it are not tried: the rules do not allow them."""
+    """Worlds whose sides are not multiples of it are not tried: the rules do not allow them."""
 
     @classmethod
     def of(cls, ruleset: Ruleset, left: int = WORK) -> Work:

@@ -64,7 +64,7 @@ def checked(data: bytes) -> io.BytesIO:
     """A checkpoint with the same contents and nothing else, for `torch.load`.
 
     Raises:
-        Exception: whatever is wrong with it: it is no archive, or holds what no training saves.
+        Exception: whatever is wrong with it: it is not an archive, or holds what no training saves.
     """
     file = io.BytesIO(data)
     check_directory(file, MAX_RECORDS, 1 << 24)

@@ -18,7 +18,7 @@ from tests.cli.commands import powderdsl as command
 
 
 def irregular(folder: Path, suffix: str) -> dict[str, tuple[Path, str]]:
-    """Things that are no files, by what they are, with the words that say so."""
+    """Things that are not files, by what they are, with the words that say so."""
     os.mkfifo(folder / f"pipe{suffix}")
     (folder / f"folder{suffix}").mkdir()
     (folder / f"link{suffix}").symlink_to("/dev/zero")
