@@ -60,7 +60,20 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
             "PD109", f"the test `{decl.name}` has no start world", decl.scalar.span, "`given` is missing"
         )
     given = _rows(decl.given, legend, typer, wildcard=False)
-    if any(side % composition.side_multiple for side in (len(given), len(given[0]))):
+    sides = (len(given), len(given[0]))
+    if any(side % composition.side_multiple for side in sides):
+        known = composition.names.needs[pack]
+        own = lcm(*(one.side_multiple for one in composition.packs if one.name.text in known))
+        if not any(side % own for side in sides):  # a pack that this one does not know asks for other worlds
+            typer.reporter.report(
+                "PD506",
+                "this test is asleep: its world has sides that these rules do not allow",
+                decl.scalar.span,
+                "left out",
+                notes=[f"a loaded pack asks for sides that are multiples of {composition.side_multiple}"],
+                helps=["it wakes up without the pack that says `side_multiple`"],
+            )
+            raise Asleep("side_multiple")
         raise typer.fail(
             "PD110",
             f"a world of {len(given)}×{len(given[0])} cells",

@@ -3,38 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import islice
 
 from powderdsl.model.operands import TRUE, conjunction, disjunction, look
 from powderdsl.model.types import FLAG, Expr
 
 
+MAX_PARTS = 64
+"""Parts of a condition that follows from a value; of a longer one nothing is kept, which is true of it too."""
+
+
 def lasting(lets: Mapping[str, Expr]) -> dict[str, Expr]:
-    """The flags among some values, as they can be looked through later.
+    """The flags among some values, in the order in which they were fixed, as they can be looked through later.
 
     Each is itself, as something unknown, and the condition on coordinates that follows from it.
     """
-    found = {}
+    found: dict[str, Expr] = {}
+    follow: dict[str, Expr] = {}
     for name, value in lets.items():
-        if value.kind == FLAG:
-            asked = _follows(value, lets)
-            if asked != TRUE:
-                found[name] = conjunction([Expr("let", FLAG, value=f"{name} before"), asked])
+        if value.kind != FLAG:
+            continue
+        asked = _follows(value, follow)
+        if asked != TRUE and sum(1 for _ in islice(asked.walk(), MAX_PARTS + 1)) <= MAX_PARTS:
+            follow[name] = asked
+            found[name] = conjunction([Expr("let", FLAG, value=f"{name} before"), asked])
     return found
 
 
-def _follows(expr: Expr, lets: Mapping[str, Expr]) -> Expr:
-    """A condition on coordinates alone that holds wherever the expression does."""
+def _follows(expr: Expr, follow: Mapping[str, Expr]) -> Expr:
+    """A condition on coordinates alone that holds wherever the expression does. `follow` has those of earlier values."""
     if all(node.op in _COORDINATES for node in expr.walk()):
         return expr
     match expr.op:
         case "and":
-            return conjunction([_follows(arg, lets) for arg in expr.args])
+            return conjunction([*dict.fromkeys(_follows(arg, follow) for arg in expr.args)])
         case "or":
-            return disjunction([_follows(arg, lets) for arg in expr.args])
+            return disjunction([*dict.fromkeys(_follows(arg, follow) for arg in expr.args)])
         case "look":
-            return look(_follows(expr.args[0], lets), expr.value)
-        case "let" if expr.value in lets:
-            return _follows(lets[str(expr.value)], lets)
+            return look(_follows(expr.args[0], follow), expr.value)
+        case "let":
+            return follow.get(str(expr.value), TRUE)
     return TRUE
 
 
