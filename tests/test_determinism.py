@@ -171,7 +171,9 @@ MEETINGS = CLASHES.replace(", nothing, more", "").replace(", nonsense", "").repl
 
 def test_check_prints_the_same_under_all_hash_seeds(tmp_path: Path) -> None:
     names = []
-    for name, text in {"gain": GAIN, "clashes": CLASHES, "words": WORDS, "meetings": MEETINGS}.items():
+    nameless = CLASHES.replace(", nothing, more", "")  # where needed packs lack, nothing else is reported
+    files = {"gain": GAIN, "clashes": CLASHES, "names": nameless, "words": WORDS, "meetings": MEETINGS}
+    for name, text in files.items():
         (tmp_path / f"{name}.yaml").write_text(text, encoding="utf-8")
         names.append(f"core+{name}.yaml")
     printed = checks([*names, "powderworld-x-y-z-core"], tmp_path, "--quick", "--ledger")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from math import lcm
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.claim_scopes import words_of

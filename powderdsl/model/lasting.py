@@ -8,7 +8,6 @@ from itertools import islice
 from powderdsl.model.operands import TRUE, conjunction, disjunction, look
 from powderdsl.model.types import FLAG, Expr
 
-
 MAX_PARTS = 64
 """Parts of a condition that follows from a value; of a longer one nothing is kept, which is true of it too."""
 

@@ -95,7 +95,9 @@ class Phrases:
 
     def _seen(self, name: str) -> str:
         """A value, here or at a neighbour."""
-        return f"{self.place()}.{name}" if self.choices.maybe(35) else name
+        if not self.choices.maybe(35):
+            return name
+        return f"{self.place()}.{name}" + ("?" if self.choices.maybe(10) else "")
 
     def _named(self, kind: str) -> str | None:
         """A field, property, let or scratch field of a kind, here or at a neighbour."""

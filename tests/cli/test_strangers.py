@@ -173,3 +173,22 @@ def test_two_packs_with_one_id_and_one_that_has_no_room(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "PD623" in result.stderr
     assert "--slots 16" in result.stderr
+
+
+def test_a_pack_that_asks_for_even_sides_is_added_to_packs_with_odd_tests() -> None:
+    Path("even.yaml").write_text(
+        ELEMENT.replace("slime", "even").replace("needs: core", "needs: core\nside_multiple: 2")
+    )
+    shown = run("check", "core+even.yaml", "--quick", "--notes")
+    assert "this test is asleep: its world has sides that these rules do not allow" in shown
+
+
+def test_values_that_ask_each_other_twice_take_no_time() -> None:
+    lets = "".join(
+        f"      v{n}: (v{n - 1} and above is empty) or (v{n - 1} and below is empty)\n" for n in range(1, 60)
+    )
+    Path("deep.yaml").write_text(
+        "pack: deep\nneeds: core\nelements: {bee: {color: '#112233'}}\npasses:\n  p:\n    let:\n"
+        f"      v0: row mod 2 == 0 and here is bee\n{lets}    do: bee -> empty if v59\n    then: empty -> bee if v58\n"
+    )
+    run("check", "core+deep.yaml", "--quick")

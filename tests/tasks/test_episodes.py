@@ -177,7 +177,7 @@ EXPRESSIONS = {
     "1 if count(lava) > count(ice) else -1": lambda v: 1 if (v.ids == 10).sum() > (v.ids == 6).sum() else -1,
     "min(count(sand), count(gas), 300)": lambda v: min((v.ids == 2).sum(), (v.ids == 4).sum(), 300),
     "min(count(sand), 9) + max(-3, -taken) + abs(left - 60)": lambda v: min((v.ids == 2).sum(), 9) - v.taken + abs(4 - v.taken),
-    "(count(sand) mod 7) / (count(sand) * 0) + 2 * -taken": lambda v: -2 * v.taken,
+    "(count(sand) mod 7) / max(0, taken - 99) + 2 * -taken": lambda v: -2 * v.taken,
     "(3 - taken) div 2 + taken div 0": lambda v: (3 - v.taken) // 2,
     "1 if 1 <= taken < 3 and not (count(sand) == count(sand) + 1) or no else 5": lambda v: 1 if v.taken < 3 else 5,
 }  # fmt: skip
