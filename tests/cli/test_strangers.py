@@ -177,7 +177,7 @@ def test_two_packs_with_one_id_and_one_that_has_no_room(tmp_path: Path) -> None:
 
 def test_a_pack_that_asks_for_even_sides_is_added_to_packs_with_odd_tests() -> None:
     Path("even.yaml").write_text(
-        ELEMENT.replace("slime", "even").replace("needs: core", "needs: core\nside_multiple: 2")
+        ELEMENT.replace("slime", "seven").replace("needs: core", "needs: core\nside_multiple: 2")
     )
     shown = run("check", "core+even.yaml", "--quick", "--notes")
     assert "this test is asleep: its world has sides that these rules do not allow" in shown
