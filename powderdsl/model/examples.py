@@ -64,10 +64,8 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
     sides = (len(given), len(given[0]))
     if any(side % composition.side_multiple for side in sides):
         known = composition.names.needs[pack]
-        asked = lcm(*(one.side_multiple for one in composition.packs if one.name.text in known))
-        if not any(
-            side % asked for side in sides
-        ):  # a pack that this one does not know asks for other worlds
+        least = lcm(*(one.side_multiple for one in composition.packs if one.name.text in known))
+        if not any(side % least for side in sides):  # a pack unknown to this one asks for other worlds
             typer.reporter.report(
                 "PD506",
                 "this test is asleep: its world has sides that these rules do not allow",
