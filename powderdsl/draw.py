@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.model.types import Element
+from powderdsl.model.types import ColorRamp, Element
 
 Array = Any
 """A NumPy array or a torch tensor. Torch is imported only once a tensor is given."""
@@ -36,20 +38,97 @@ def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
     return table
 
 
-def rgb(ids: Array, colors: Colors, motion: Array | None = None) -> Any:
+@dataclass(frozen=True, eq=False)
+class Ramp:
+    """The colors of the element `id` by the values of a field: `colors[n]` where n of `starts` are reached.
+
+    `starts` ascend, int32 [n] or float32 [n] as the field; `colors` is uint8 [n + 1, 3]. A picture only compares
+    values, so it is the same on every machine.
+    """
+
+    id: int
+    field: str
+    starts: NDArray[Any]
+    colors: NDArray[np.uint8]
+
+
+def ramps(elements: Sequence[Element]) -> tuple[Ramp, ...]:
+    """The ramps of the elements that have a ramp, by id."""
+    found = [(element.id, element.ramp) for element in elements if element.ramp is not None]
+    return tuple(
+        Ramp(number, ramp.field, *_steps(ramp)) for number, ramp in sorted(found, key=lambda one: one[0])
+    )
+
+
+@lru_cache(maxsize=256)
+def _steps(ramp: ColorRamp) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """The values at which the color of a ramp changes, and the colors before, between and behind them."""
+    dtype = np.float32 if ramp.real else np.int32
+    ends = [_components(color) for color in (ramp.start, ramp.end)]
+    parts = [np.array(_first_values(new - old, ramp), dtype) for old, new in zip(*ends, strict=True)]
+    starts = np.unique(np.concatenate(parts)).astype(dtype)
+    colors = np.empty((len(starts) + 1, 3), dtype=np.uint8)
+    for channel, (old, new) in enumerate(zip(*ends, strict=True)):
+        reached = np.searchsorted(parts[channel], starts, side="right")
+        colors[:, channel] = old + (1 if new > old else -1) * np.concatenate([[0], reached])
+    return starts, colors
+
+
+def _first_values(change: int, ramp: ColorRamp) -> list[int | np.float32]:
+    """The first values, as the field can hold them, at which a channel has changed by 1, 2, … to `change`.
+
+    In proportion that is so far along the range: (j - 1/2) / |change|. What falls by more than a half is rounded down.
+    """
+    found: list[int | np.float32] = []
+    for j in range(1, abs(change) + 1):
+        whole = 2 * abs(change)
+        place = ramp.lo * whole + (ramp.hi - ramp.lo) * (2 * j - 1)  # of `whole` parts
+        if not ramp.real:
+            found.append(-(-place // whole) if change > 0 else place // whole + 1)
+            continue
+        value = np.float32(place / whole)
+        while not _reached(value, place, whole, change > 0):
+            value = np.float32(np.nextafter(value, np.float32(np.inf)))
+        while _reached(
+            before := np.float32(np.nextafter(value, -np.float32(np.inf))), place, whole, change > 0
+        ):
+            value = before
+        found.append(value)
+    return found
+
+
+def _reached(value: np.float32, place: int, whole: int, rises: bool) -> bool:
+    above, below = float(value).as_integer_ratio()
+    return above * whole >= place * below if rises else above * whole > place * below
+
+
+def rgb(
+    ids: Array,
+    colors: Colors,
+    motion: Array | None = None,
+    *,
+    ramps: Sequence[Ramp] = (),
+    fields: Mapping[str, Array] | None = None,
+) -> Any:
     """Pictures uint8 [..., H, W, 3] of ids [..., H, W] (any integers), of the same kind, on the same device.
 
+    With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name.
     With `motion`, float [..., 2, H, W], cells are tinted towards MOTION_COLOR by clamp(|v|/2, 0, 0.5).
-    Raises ValueError for ids without a colour and shapes that do not fit, TypeError for ids of another type.
+    Raises ValueError for ids without a colour, fields that are missing and shapes that do not fit, TypeError for ids
+    of another type.
     """
     table = _table(colors)
     tensor = _is_tensor(ids)
     if not tensor:
         ids = np.asarray(ids)
     _check(ids, motion, len(table), tensor)
+    ramped = [(ramp, _values(ramp, fields or {}, ids, tensor)) for ramp in ramps]
     if tensor:
-        return _rgb_torch(ids, table, motion)
+        return _rgb_torch(ids, table, motion, ramped)
     image = table[ids]
+    for ramp, values in ramped:
+        cells = ids == ramp.id
+        image[cells] = ramp.colors[np.searchsorted(ramp.starts, values[cells], side="right")]
     if motion is None:
         return image
     speed = np.hypot(*np.moveaxis(np.asarray(motion, dtype=np.float32), -3, 0))
@@ -58,10 +137,14 @@ def rgb(ids: Array, colors: Colors, motion: Array | None = None) -> Any:
     return (image + (motion - image) * weight + 0.5).astype(np.uint8)
 
 
-def _rgb_torch(ids: Any, table: NDArray[np.uint8], motion: Any) -> Any:
+def _rgb_torch(ids: Any, table: NDArray[np.uint8], motion: Any, ramped: Sequence[tuple[Ramp, Any]]) -> Any:
     import torch
 
     image = torch.as_tensor(table, device=ids.device)[ids.long()]
+    for ramp, values in ramped:
+        starts, colors = (torch.from_numpy(part).to(ids.device) for part in (ramp.starts, ramp.colors))
+        reached = torch.bucketize(values.to(starts.dtype), starts, right=True)
+        image = torch.where((ids == ramp.id)[..., None], colors[reached], image)
     if motion is None:
         return image
     weight = (torch.hypot(*motion.float().unbind(-3)) / 2).clamp(0, MAX_TINT).nan_to_num()[..., None]
@@ -146,6 +229,16 @@ def _check(ids: Any, motion: Any, colors: int, tensor: bool) -> None:
     expected = (*ids.shape[:-2], 2, *ids.shape[-2:])
     if tuple(motion.shape) != expected:
         raise ValueError(f"motion must have shape {expected}, not {tuple(motion.shape)}")
+
+
+def _values(ramp: Ramp, fields: Mapping[str, Array], ids: Any, tensor: bool) -> Any:
+    """The values of a ramp's field, of the kind of the ids."""
+    if ramp.field not in fields:
+        raise ValueError(f"the color of element {ramp.id} follows the field {ramp.field}, which is missing")
+    values = fields[ramp.field] if tensor else np.asarray(fields[ramp.field]).astype(ramp.starts.dtype)
+    if tuple(values.shape) != tuple(ids.shape):
+        raise ValueError(f"{ramp.field} must have shape {tuple(ids.shape)}, not {tuple(values.shape)}")
+    return values
 
 
 def _table(colors: Colors) -> NDArray[np.uint8]:

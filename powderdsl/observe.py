@@ -12,18 +12,20 @@ from torch import Tensor
 from powderdsl.backends.torch_views import (
     Channel,
     PlaneName,
+    RampTable,
     State,
     code_values,
     shape_of,
     write_channels,
     write_codes,
     write_planes,
+    write_ramp,
     write_rgb,
     write_slot,
 )
 from powderdsl.backends.torch_words import word_count
 from powderdsl.diagnostics import suggest
-from powderdsl.draw import palette
+from powderdsl.draw import palette, ramps
 from powderdsl.ir.gates import width as width_of
 from powderdsl.ir.lower import plane_type
 from powderdsl.ir.ops import Type
@@ -72,10 +74,12 @@ class Observer:
         return out
 
     def rgb(self, state: State, out: Any = None) -> Tensor:
-        """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colours."""
+        """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields."""
         out = self._buffer(out, (*shape_of(state), 3), torch.uint8)
         with torch.no_grad():
             write_rgb(state, self._palette, out)
+            for ramp in self._ramps:
+                write_ramp(state, ramp, out)
         return out
 
     def matrix(self, state: State, out: Any = None) -> Tensor:
@@ -188,6 +192,16 @@ class Observer:
         table = torch.zeros(256, 4, dtype=torch.uint8)
         table[: len(colors), :3] = colors
         return table.to(self.device)
+
+    @cached_property
+    def _ramps(self) -> tuple[RampTable, ...]:
+        found = []
+        for ramp in ramps(self.ruleset.elements):
+            colors = torch.zeros(len(ramp.colors), 4, dtype=torch.uint8)
+            colors[:, :3] = torch.from_numpy(ramp.colors)
+            starts = torch.from_numpy(ramp.starts).to(self.device)
+            found.append(RampTable(ramp.id, ramp.field, starts, colors.to(self.device)))
+        return tuple(found)
 
     @cached_property
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, TextIO
 
 from powderdsl.diagnostics.printable import printable, unguarded
-from powderdsl.draw import palette, rgb, to_numpy
+from powderdsl.draw import palette, ramps, rgb, to_numpy
 from powderdsl.model.types import Element
 from powderdsl.worlds.ascii import write_ascii
 
@@ -62,7 +62,7 @@ class LiveView:
         self.elements = elements
         self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
         self.colour = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
-        self._colors = palette(elements)
+        self._colors, self._ramps = palette(elements), ramps(elements)
         self._height = 0
 
     def __enter__(self) -> LiveView:
@@ -77,16 +77,23 @@ class LiveView:
         if self.in_place:
             self._write(_RESET + _SHOW_CURSOR)
 
-    def show(self, ids: Any, motion: Any = None, caption: str = "") -> None:
-        """Draw ids [H, W], array or tensor, tinted by `motion`, float [2, H, W]; `caption` stands below."""
+    def show(
+        self, ids: Any, motion: Any = None, caption: str = "", fields: Mapping[str, Any] | None = None
+    ) -> None:
+        """Draw ids [H, W], array or tensor, tinted by `motion`, float [2, H, W]; `caption` stands below.
+
+        `fields` has the fields that colors follow, [H, W] each, by name.
+        """
         ids = to_numpy(ids)
+        shown = {name: to_numpy(value) for name, value in (fields or {}).items()}
         motion = None if motion is None else to_numpy(motion)
         if self.in_place:
             step = self._thinning(*ids.shape)
             ids = ids[::step, ::step]
             motion = None if motion is None else motion[:, ::step, ::step]
+            shown = {name: value[::step, ::step] for name, value in shown.items()}
         if self.colour:
-            text = render_frame(rgb(ids, self._colors, motion))
+            text = render_frame(rgb(ids, self._colors, motion, ramps=self._ramps, fields=shown))
         else:
             text = write_ascii(ids, self.elements).rstrip("\n")
         caption = printable(caption)

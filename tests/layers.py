@@ -38,7 +38,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "simulator": (*_COMPILER, "programs", "observe", "state_checks"),
     "provenance": (*_MODEL, "simulator"),
     "tracing": (*_MODEL, "reference", "provenance", "simulator"),  # explains by what the oracle does
-    "worlds": (*_MODEL, "scratch"),
+    "worlds": (*_MODEL, "scratch", "draw"),
     "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
     "media": (*_SCREEN[: _SCREEN.index("media")], "interrupts"),
     "terminal": _SCREEN[: _SCREEN.index("terminal")],

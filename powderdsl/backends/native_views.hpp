@@ -107,6 +107,51 @@ API void pd_rgb(const void* batch, int slot, int bits, const u32* palette, uint8
   }
 }
 
+// A field of reals of a world.
+static void store_real(const Grid& g, const Field* f, int lane, float* out) {
+  for (int y = 0; y < g.height; y++, out += g.width) {
+    size_t row = (size_t)lane * g.height + y;
+    if (f->live[row]) memcpy(out, f->data + row * g.stride + HALO, sizeof(float) * g.width);
+    else memset(out, 0, sizeof(float) * g.width);
+  }
+}
+
+// Cells of the element `id` in pictures, in the color of their field: row k of `colors` for values that reach k of the
+// ascending `starts`.
+template <class T, class Values>
+ALWAYS void ramp_world(const Planes& ids, int id, int lane, const Grid& g, const T* starts, int count, const u32* colors, uint8_t* out, Values values_of) {
+  each_run(g, [&](int i, int cell, int cells) {
+    uint8_t found[64];
+    cells_of(ids, lane, i, found);
+    if (!memchr(found, id, cells)) return;
+    const T* values = values_of(i, cell);
+    for (int x = 0; x < cells; x++)
+      if (found[x] == id) memcpy(out + 3 * (size_t)(cell + x), colors + (std::upper_bound(starts, starts + count, values[x]) - starts), 3);
+  });
+}
+API void pd_ramp(const void* batch, int slot, int bits, int id, int is_real, int field, int field_bits, int negative, int count,
+                  const void* starts, const u32* colors, uint8_t* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  const Grid& g = b.g;
+  std::vector<float> row(is_real ? (size_t)g.height * g.width : 0);
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    const Group& group = b.groups[lane / LANES];
+    Planes ids = planes_of(group, slot, bits, 0);
+    uint8_t* out = data + b.at(lane, apart, 3 * g.width);
+    if (is_real) {
+      store_real(g, group.real[field], lane % LANES, row.data());
+      ramp_world(ids, id, lane % LANES, g, (const float*)starts, count, colors, out, [&](int, int cell) { return row.data() + cell; });
+    } else {
+      Planes values = planes_of(group, field, field_bits, negative);
+      int32_t part[64];
+      ramp_world(ids, id, lane % LANES, g, (const int32_t*)starts, count, colors, out, [&](int i, int) {
+        cells_of(values, lane % LANES, i, (u32*)part);
+        return (const int32_t*)part;
+      });
+    }
+  }
+}
+
 // Channels of float32.
 struct Channel {
   int kind;  // 0 nothing, 1 cells of a number, 2 what a table says of a number, 3 a number, 4 a real
@@ -117,13 +162,6 @@ ALWAYS void put_floats(float* out, u64 word, int count) {  // flags as 0 and 1
   float part[64], *to = count == 64 ? out : part;
   for (int x = 0; x < 64; x += CHUNK) *(Fu*)(to + x) = (Fu)blend(word >> x & 0xffff, splatf(1), splatf(0));
   if (count < 64) memcpy(out, part, sizeof(float) * count);
-}
-static void store_real(const Grid& g, const Field* f, int lane, float* out) {
-  for (int y = 0; y < g.height; y++, out += g.width) {
-    size_t row = (size_t)lane * g.height + y;
-    if (f->live[row]) memcpy(out, f->data + row * g.stride + HALO, sizeof(float) * g.width);
-    else memset(out, 0, sizeof(float) * g.width);
-  }
 }
 static void store_channel(const Batch& b, const Channel& c, const float* tables, int number, float* out) {
   const Group& group = b.groups[number / LANES];

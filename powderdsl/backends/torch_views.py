@@ -64,6 +64,34 @@ def write_rgb(state: State, palette: Tensor, out: Tensor) -> None:
         out.copy_(palette[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
 
 
+@dataclass(frozen=True)
+class RampTable:
+    """The colors of the element `id` by a slot: `colors` uint8 [n + 1, 4], of which row k is that of values that reach
+    k of `starts`, int32 [n] or float32 [n]."""
+
+    id: int
+    slot: str
+    starts: Tensor
+    colors: Tensor
+
+
+def write_ramp(state: State, ramp: RampTable, out: Tensor) -> None:
+    """The cells of a ramp's element in pictures uint8 [B, H, W, 3]; others stay."""
+    if isinstance(state, PackedState):
+        program = state.program
+        slot, bits, _ = program.planes_of("element")
+        real = ramp.starts.dtype == torch.float32
+        field = (program.layout.reals[ramp.slot], 0, False) if real else program.planes_of(ramp.slot)
+        program.library.pd_ramp(
+            state.handle, slot, bits, ramp.id, int(real), field[0], field[1], int(field[2]), len(ramp.starts),
+            address(ramp.starts), address(ramp.colors), address(out), out.stride(0),
+        )  # fmt: skip
+        return
+    reached = torch.bucketize(state[ramp.slot].to(ramp.starts.dtype), ramp.starts, right=True)
+    cells = (state["element"] == ramp.id)[..., None]
+    torch.where(cells, ramp.colors[:, :3][reached], out, out=out)
+
+
 def write_channels(state: State, channels: Sequence[Channel], tables: Tensor, out: Tensor) -> None:
     """Channels float32 [B, C, H, W]. `tables` is float32 [n, 256]."""
     if isinstance(state, PackedState):

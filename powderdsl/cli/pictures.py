@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.draw import contact_sheet, palette, rgb, scale, to_numpy
+from powderdsl.draw import contact_sheet, palette, ramps, rgb, scale, to_numpy
 
 if TYPE_CHECKING:
     from powderdsl.simulator import World
@@ -32,14 +32,22 @@ def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8
     if longest * factor > MAX_SIDE:
         raise BadInput(f"a picture of {longest * factor:,} pixels a side: choose a smaller --scale or --size")
     few = world.select(slice(0, shown))
-    images = to_numpy(scale(rgb(few.ids, palette(few.sim.ruleset.elements), motion_of(few)), factor))
+    elements = few.sim.ruleset.elements
+    image = rgb(few.ids, palette(elements), motion_of(few), ramps=ramps(elements), fields=shown_fields(few))
+    images = to_numpy(scale(image, factor))
     return images[0] if shown == 1 else contact_sheet(images, columns=columns)
 
 
-def first_world(world: World) -> tuple[Any, Any]:
-    """The ids [H, W] and the motion [2, H, W] (or None) of the first world of a batch."""
+def first_world(world: World) -> dict[str, Any]:
+    """The first world of a batch, as `LiveView.show` takes it: `ids` [H, W], `motion` [2, H, W] or None, `fields`."""
     motion = motion_of(world)
-    return world.ids[0], None if motion is None else motion[0]
+    fields = {name: values[0] for name, values in shown_fields(world).items()}
+    return {"ids": world.ids[0], "motion": None if motion is None else motion[0], "fields": fields}
+
+
+def shown_fields(world: World) -> dict[str, Any]:
+    """The fields that colors follow, [B, H, W] each, by name."""
+    return {ramp.field: world[ramp.field] for ramp in ramps(world.sim.ruleset.elements)}
 
 
 def motion_of(world: World) -> Any:

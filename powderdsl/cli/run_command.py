@@ -171,7 +171,7 @@ class _Run:
             self._consume(self._with_progress(self._worlds()))
         if self.plan.out is None and not self.plan.watch:
             with LiveView(self.sim.ruleset.elements) as view:
-                view.show(*first_world(self.world))
+                view.show(**first_world(self.world))
         return self.world
 
     def _worlds(self) -> Iterator[int]:
@@ -223,7 +223,7 @@ class _Run:
         due = time.perf_counter()
         for step in moments:
             caption = f"{self.sim.ruleset.name}  step {step} of {self.plan.steps}"
-            self.view.show(*first_world(self.world), caption=caption)
+            self.view.show(**first_world(self.world), caption=caption)
             if self.view.in_place:
                 due = max(due + 1 / self.plan.fps, time.perf_counter())
                 time.sleep(max(due - time.perf_counter(), 0))

@@ -17,7 +17,7 @@ from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.reactions import reactions
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
-from powderdsl.model.types import Element, Param, Pass, Property, Ruleset, Value
+from powderdsl.model.types import ColorRamp, Element, Param, Pass, Property, Ruleset, Value
 from powderdsl.tasks.task_names import is_task
 
 
@@ -85,18 +85,29 @@ def _text(ruleset: Ruleset, colour: bool) -> Iterator[str]:
         yield from table(rows)
 
 
-def _swatch(element: Element, colour: bool) -> str:
+def _swatch(color: str, colour: bool) -> str:
     if not colour:
-        return element.color
-    red, green, blue = bytes.fromhex(element.color[1:])
-    return Painted(f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {element.color}")
+        return color
+    red, green, blue = bytes.fromhex(color[1:])
+    return Painted(f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {color}")
+
+
+def _color(element: Element, colour: bool) -> str:
+    """Its color, and both ends of its ramp with what this follows."""
+    text, ramp = _swatch(element.color, colour), element.ramp
+    if ramp is None:
+        return text
+    start, end = _swatch(ramp.start, colour), _swatch(ramp.end, colour)
+    text = f"{text}; {start} -> {end} by {ramp.field} {ramp.lo}..{ramp.hi}"
+    return Painted(text) if colour else text
 
 
 def _element_rows(ruleset: Ruleset, colour: bool) -> list[list[str]]:
     rows = [["id", "element", "pack", "glyph", "colour", *(p.name for p in ruleset.properties), "tags"]]
     for element in ruleset.elements:
         values = [_property_text(ruleset, prop, element) for prop in ruleset.properties]
-        head = [str(element.id), element.name, element.pack, element.glyph, _swatch(element, colour)]
+        shown = _color(element, colour)
+        head = [str(element.id), element.name, element.pack, element.glyph, shown]
         rows.append([*head, *values, " ".join(sorted(element.tags))])
     return rows
 
@@ -179,11 +190,18 @@ def _element_data(ruleset: Ruleset, element: Element) -> dict[str, Any]:
         "pack": element.pack,
         "glyph": element.glyph,
         "color": element.color,
+        "color_by": _ramp_data(element.ramp),
         "about": element.about,
         "tags": sorted(element.tags),
         "properties": {prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
         "where": place_of(element.span),
     }
+
+
+def _ramp_data(ramp: ColorRamp | None) -> dict[str, Any] | None:
+    if ramp is None:
+        return None
+    return {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": [ramp.lo, ramp.hi]}
 
 
 def _pass_data(one: Pass) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
 from powderdsl.cli.plain_table import table
-from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, rgb, scale
+from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
 from powderdsl.tasks.shipped_tasks import check_split, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task
 
@@ -126,12 +126,15 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
 
     program = compile_task(task, split=split, backend="dense")
     episodes = program.start(torch.arange(seeds))
+    start, elements = episodes.world, task.ruleset.elements
+    fields = {ramp.field: start[ramp.field].numpy() for ramp in ramps(elements)}
+    drawn = rgb(start.ids.numpy(), palette(elements), ramps=ramps(elements), fields=fields)
     columns = int(np.ceil(np.sqrt(seeds)))
     longest = max(task.size) * columns
     factor = max(2, min(8, 2 * USUAL_SIDE // longest))
     if longest * factor > MAX_SIDE:
         raise BadInput(f"a picture of {longest * factor:,} pixels a side: show fewer --seeds")
-    images = scale(rgb(episodes.world.ids.numpy(), palette(task.ruleset.elements)), factor)
+    images = scale(drawn, factor)
     for number, (name, masks) in enumerate(episodes.regions.items()):
         del name
         color = OUTLINES[number % len(OUTLINES)]

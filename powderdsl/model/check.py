@@ -25,6 +25,7 @@ from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
 from powderdsl.model.optional_names import report_misspelt
 from powderdsl.model.palette import Palette
 from powderdsl.model.property_words import not_a_value
+from powderdsl.model.ramps import element_ramps
 from powderdsl.model.satisfy import Facts
 from powderdsl.model.scope import Scope
 from powderdsl.model.symbols import (
@@ -40,6 +41,7 @@ from powderdsl.model.symbols import (
 from powderdsl.model.types import (
     CHANCE,
     FLAG,
+    ColorRamp,
     Declared,
     Element,
     Kernel,
@@ -99,12 +101,15 @@ def check(
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(composition, typer)
     invariants = check_invariants(composition, typer, partial(_typer_of, packs))
+    ramps = element_ramps(typer)
     typer.unknown.report()
     reporter.raise_if_errors()
     report_contested(composition, reporter)
     report_misspelt(packs, ruleset, elsewhere, reporter)
 
-    elements = tuple(_tagged(element, composition) for element in composition.elements.values())
+    elements = tuple(
+        _tagged(element, composition, ramps.get(name)) for name, element in composition.elements.items()
+    )
     passes = tuple(elaborated.passes)
     facts = _facts(symbols)
     stored = overridden_ids(passes, sorted(elaborated.overridden), facts)
@@ -286,6 +291,7 @@ def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Spa
                             *composition.fields,
                             "id",
                             "color",
+                            "color_by",
                             "glyph",
                             "about",
                             "tags",
@@ -394,8 +400,9 @@ def _sets(typer: Typer) -> None:
     typer.used.clear()
 
 
-def _tagged(element: Element, composition: Composition) -> Element:
-    return replace(element, tags=frozenset(tag for tag, ids in composition.tags.items() if element.id in ids))
+def _tagged(element: Element, composition: Composition, ramp: ColorRamp | None) -> Element:
+    tags = frozenset(tag for tag, ids in composition.tags.items() if element.id in ids)
+    return replace(element, tags=tags, ramp=ramp)
 
 
 def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tuple[Stream, ...]:

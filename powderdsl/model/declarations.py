@@ -24,6 +24,17 @@ class TypedDecl:
 
 
 @dataclass(frozen=True)
+class RampDecl:
+    """How an element's color follows a field, as written. `start` is None for the element's own color."""
+
+    key: Scalar
+    field: Scalar
+    start: str | None
+    end: str
+    over: Syntax | None
+
+
+@dataclass(frozen=True)
 class ElementDecl:
     name: Scalar
     id: int | None
@@ -34,6 +45,7 @@ class ElementDecl:
     tags: tuple[Scalar, ...]
     values: tuple[tuple[Scalar, Syntax], ...]
     override: bool
+    ramp: RampDecl | None = None
 
 
 @dataclass(frozen=True)
@@ -41,6 +53,7 @@ class AlsoDecl:
     element: Scalar
     tags: tuple[Scalar, ...]
     values: tuple[tuple[Scalar, Syntax], ...]
+    ramp: RampDecl | None = None
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from powderdsl.model.declarations import (
     TypedDecl,
 )
 from powderdsl.model.kernel_rows import kernel_rows
+from powderdsl.model.ramp_keys import color_of, read_ramp
 from powderdsl.model.schema import KEYS, Reader, first_line
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
@@ -267,13 +268,6 @@ class _PackReader(Reader):
 
     def element(self, key: Scalar, node: Node) -> ElementDecl:
         entries = self.mapping(node, "element", f"the element `{key.text}`")
-        color = self.scalar(entries, "color")
-        if color is not None and not re.fullmatch(r"#[0-9A-Fa-f]{6}", color.text):
-            helps = ['six hexadecimal digits in quotes: color: "#RRGGBB"']
-            self.reporter.error(
-                "PD110", f"`{color.text}` is not a colour", color.span, 'expected "#RRGGBB"', helps=helps
-            )
-            color = None
         glyph = self.scalar(entries, "glyph")
         if glyph is not None and not (
             len(glyph.text) == 1 and "!" <= glyph.text <= "~" and glyph.text != "?"
@@ -290,21 +284,21 @@ class _PackReader(Reader):
             key,
             self.number(entries, "id", 0, 255),
             self.scalar(entries, "id"),
-            color.text.upper() if color else "#000000",
+            color_of(self, entries, "color") or "#000000",
             glyph.text if glyph else "",
             self.text(entries, "about"),
             self.words(entries.get("tags", (None, None))[1]),
             self.open_values(entries, "element"),
             self.choice(entries, "override", ("yes", "no", "true", "false")) in ("yes", "true"),
+            ramp=read_ramp(self, entries, f"`{key.text}`"),
         )
 
     def also(self, key: Scalar, node: Node) -> AlsoDecl:
         if isinstance(node, (Sequence, Scalar)):
             return AlsoDecl(key, self.words(node), ())
         entries = self.mapping(node, "also", f"`{key.text}`")
-        return AlsoDecl(
-            key, self.words(entries.get("tags", (None, None))[1]), self.open_values(entries, "also")
-        )
+        tags, values = self.words(entries.get("tags", (None, None))[1]), self.open_values(entries, "also")
+        return AlsoDecl(key, tags, values, read_ramp(self, entries, f"`{key.text}`"))
 
     def pass_(self, key: Scalar, node: Node) -> PassDecl:
         entries = self.mapping(node, "pass", f"the pass `{key.text}`")

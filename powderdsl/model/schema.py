@@ -95,12 +95,22 @@ KEYS: dict[str, dict[str, Key]] = {
     "element": {
         "id": Key("number", "the number it asks for, 0 to 255; a free one otherwise"),
         "color": Key("word", 'its colour, quoted: "#RRGGBB"', True),
+        "color_by": Key("mapping", "how its color follows a field"),
         "glyph": Key("word", "one character for ASCII art; the first free letter of its name otherwise"),
         "about": Key("text", "what it is, in a sentence"),
         "tags": Key("words", "the tags it carries"),
         "override": Key("flag", "yes: replaces an element of another pack"),
     },
-    "also": {"tags": Key("words", "tags to add")},
+    "also": {
+        "tags": Key("words", "tags to add"),
+        "color_by": Key("mapping", "how its color follows a field"),
+    },
+    "color_by": {
+        "field": Key("word", "the field that the color follows", True),
+        "from": Key("word", "the color at the low end of the range, quoted; the element's own by default"),
+        "to": Key("word", 'the color at the high end of the range, quoted: "#RRGGBB"', True),
+        "over": Key("line", "the range, LOW..HIGH; all values of the field by default"),
+    },
     "pass": {
         "about": Key("text", "what it does, in a sentence"),
         "after": Key("words", "passes that come before it"),
@@ -148,7 +158,7 @@ _MEANT = {
 }
 """Keys that people expect, and what they are called here."""
 
-HOMES = ("pack", "pass", "element", "task", "agent", "reward", "split")
+HOMES = ("pack", "pass", "element", "task", "agent", "reward", "split", "color_by")
 """Mappings to which a key may belong that stands in another one."""
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")

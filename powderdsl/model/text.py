@@ -10,6 +10,7 @@ from powderdsl.model.builtins import DIRECTIONS, OCTANTS
 from powderdsl.model.operands import TRUE
 from powderdsl.model.types import (
     Assign,
+    Element,
     Expr,
     Field,
     Kernel,
@@ -124,6 +125,12 @@ def show_expr(ruleset: Ruleset, expr: Expr) -> str:
     return _Printer(ruleset).expr(expr)
 
 
+def ramp_text(element: Element) -> str:
+    """How its color follows a field, after a blank; nothing where it does not."""
+    ramp = element.ramp
+    return f" {ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}" if ramp else ""
+
+
 class _Printer:
     """Prints one ruleset; remembers the kernels it met, to name and list them."""
 
@@ -141,7 +148,8 @@ class _Printer:
         yield f"matrix {' '.join(channel.name or '-' for channel in rules.matrix)}"
         for element in rules.elements:
             tags = f" tags {' '.join(sorted(element.tags))}" if element.tags else ""
-            head = f"element {element.id} {element.qualified} {element.glyph} {element.color}{tags}"
+            color = f"{element.color}{ramp_text(element)}"
+            head = f"element {element.id} {element.qualified} {element.glyph} {color}{tags}"
             yield self.placed(head, element.span)
         for prop in rules.properties:
             values = ", ".join(

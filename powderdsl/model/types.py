@@ -117,6 +117,21 @@ OPS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
+class ColorRamp:
+    """An element's color by the value of a field: `start` up to `lo`, `end` from `hi`, between them in proportion.
+
+    Each of red, green and blue is rounded to the nearest integer, halves up. `real`: the field's values are float32.
+    """
+
+    field: str
+    start: str
+    end: str
+    lo: int
+    hi: int
+    real: bool = False
+
+
+@dataclass(frozen=True)
 class Element:
     """An element. `id` is its number in worlds of this ruleset; `glyph` is one ASCII character.
 
@@ -133,6 +148,8 @@ class Element:
     span: Span = field(compare=False, repr=False)
     word: str = field(default="", repr=False)
     """Its name in its own file, where that is another."""
+    ramp: ColorRamp | None = field(default=None, metadata=UNMEANING)
+    """How its color follows a field; without one it is `color` everywhere."""
 
     @property
     def qualified(self) -> str:

@@ -76,7 +76,10 @@ def _report_lets(block: Block, reporter: Reporter) -> None:
 
 
 def _pack_words(pack: PackDecl) -> Iterator[str]:
-    """Every name in a pack's rules, sets, invariants and tests."""
+    """Every name in a pack's rules, sets, invariants, tests and color ramps."""
+    for ramp in (*(one.ramp for one in pack.elements), *(one.ramp for one in pack.also)):
+        if ramp is not None:
+            yield ramp.field.text.removesuffix("?").rpartition(".")[2]
     for pass_ in pack.passes:
         yield from _block_words(pass_.block)
     for lines in (

@@ -20,7 +20,7 @@ from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_ya
 
 SYMMETRIES = ("mirror", "rotations", "all")
 POLICIES = ("drop_both", "first_wins")
-UNCHANGED = ("id", "color", "glyph", "about")
+UNCHANGED = ("id", "color", "color_by", "glyph", "about")
 """Keys of an element that say nothing of what it does."""
 
 
@@ -227,7 +227,7 @@ class _FileChanges:
             entry = (*path, (node, number))
             if key.text == "tags":
                 yield from self._tags(value, entry)
-            else:
+            elif key.text not in UNCHANGED:
                 yield from self._value(key.text.removesuffix("?"), value, entry)
 
     # Passes

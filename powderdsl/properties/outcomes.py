@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from powderdsl.diagnostics import Span
-from powderdsl.draw import palette, rgb, scale, to_numpy
+from powderdsl.draw import palette, ramps, rgb, scale, to_numpy
 from powderdsl.model.field_words import direction_word
 from powderdsl.model.restrict import Difference
 from powderdsl.model.state import slots
@@ -52,7 +52,8 @@ class Counterexample:
     """A small world that breaks a property after some steps.
 
     `before` and `after` are ids [H, W] at the start and after the last step, `cell` is where it is broken.
-    `culprits` are the lines of rules without which the last step would not have broken it.
+    `culprits` are the lines of rules without which the last step would not have broken it. `shown` are the fields
+    [H, W] that colors follow, by name, before and after.
     """
 
     sample: Sample
@@ -61,6 +62,7 @@ class Counterexample:
     after: Array
     cell: tuple[int, int]
     culprits: tuple[Span, ...]
+    shown: tuple[Mapping[str, Array], Mapping[str, Array]]
 
 
 @dataclass(frozen=True)
@@ -159,9 +161,12 @@ def picture(found: Counterexample, ruleset: Ruleset) -> Array:
     """Before and after side by side, uint8 [H', W', 3]."""
     from powderdsl.draw import contact_sheet
 
-    colors = palette(ruleset.elements)
+    colors, ramped = palette(ruleset.elements), ramps(ruleset.elements)
     factor = max(1, min(32, 512 // max(found.before.shape)))
-    images = [to_numpy(scale(rgb(ids, colors), factor)) for ids in (found.before, found.after)]
+    images = [
+        to_numpy(scale(rgb(ids, colors, ramps=ramped, fields=fields), factor))
+        for ids, fields in zip((found.before, found.after), found.shown, strict=True)
+    ]
     return contact_sheet(images, columns=2, gap=8)
 
 

@@ -8,6 +8,7 @@ from time import monotonic
 
 import numpy as np
 
+from powderdsl.draw import ramps
 from powderdsl.ledgers.book import Ledger, NotProven, Proven
 from powderdsl.ledgers.book import ledger as make_ledger
 from powderdsl.ledgers.changes import RuleLine
@@ -254,6 +255,8 @@ def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Countere
     """A world that breaks a claim, and the rules that did it."""
     cell = breaks(claim, runner, small, steps).cell[0]
     states = runner.states(small, steps)
+    names = {ramp.field for ramp in ramps(runner.ruleset.elements)}
+    before, after = ({name: state[name][0] for name in sorted(names)} for state in (states[0], states[-1]))
     return Counterexample(
         small,
         steps,
@@ -261,6 +264,7 @@ def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Countere
         states[-1]["element"][0],
         (int(cell[0]), int(cell[1])),
         culprits(claim, runner.ruleset, small, steps),
+        (before, after),
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, rgb, scale
+from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
 from powderdsl.envs.acting import Policy
 from powderdsl.rl.policy_evaluation import Played, play
 from powderdsl.simulator import World
@@ -29,11 +29,13 @@ PAPER = (30, 30, 30)
 
 @dataclass(frozen=True)
 class Scene:
-    """One moment of all worlds: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None; `actions` int64 [B, 5]
-    or None before the first and where nobody acts; `returns` float64 [B] before them; `over` bool [B]."""
+    """One moment of all worlds: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None, `fields` [B, H, W] each,
+    those that colors follow; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns` float64
+    [B] before them; `over` bool [B]."""
 
     ids: NDArray[np.uint8]
     motion: NDArray[np.float32] | None
+    fields: dict[str, NDArray[Any]]
     actions: Tensor | None
     returns: Tensor
     over: Tensor
@@ -45,7 +47,7 @@ class Recorder:
     def __init__(self, count: int) -> None:
         self.regions: dict[str, NDArray[np.bool_]] = {}
         self.scenes: list[Scene] = []
-        self._pending: list[tuple[Any, Any]] = []
+        self._pending: list[tuple[Any, Any, Any]] = []
         self._returns = torch.zeros(count, dtype=torch.float64)
         self._over = torch.zeros(count, dtype=torch.bool)
 
@@ -59,14 +61,18 @@ class Recorder:
         """The worlds after an action, or a step."""
         vectors = [item.name for item in world.sim.ruleset.fields if item.kind.name == "vec2"]
         motion = world[vectors[0]].cpu().numpy().copy() if vectors else None
-        self._pending.append((world.ids.cpu().numpy().copy(), motion))
+        names = {ramp.field for ramp in ramps(world.sim.ruleset.elements)}
+        fields = {name: world[name].cpu().numpy().copy() for name in sorted(names)}
+        self._pending.append((world.ids.cpu().numpy().copy(), motion, fields))
 
     def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
         """What was seen since the last call belongs to these actions; the last scene of them shows the new returns."""
-        for number, (ids, motion) in enumerate(self._pending):
+        for number, (ids, motion, fields) in enumerate(self._pending):
             last = number == len(self._pending) - 1
             now = (returns, over) if last else (self._returns, self._over)
-            self.scenes.append(Scene(ids, motion, actions, now[0].cpu().clone(), now[1].cpu().clone()))
+            self.scenes.append(
+                Scene(ids, motion, fields, actions, now[0].cpu().clone(), now[1].cpu().clone())
+            )
         self._pending.clear()
         self._returns, self._over = returns.clone(), over.clone()
 
@@ -120,7 +126,9 @@ def _tile(
 ) -> NDArray[np.uint8]:
     """One world, uint8 [H·factor + LINE, W·factor, 3]."""
     motion = None if scene.motion is None else scene.motion[world]
-    picture = np.array(scale(rgb(scene.ids[world], colors, motion), factor))
+    fields = {name: values[world] for name, values in scene.fields.items()}
+    ramped = ramps(task.ruleset.elements)
+    picture = np.array(scale(rgb(scene.ids[world], colors, motion, ramps=ramped, fields=fields), factor))
     for number, masks in enumerate(recorder.regions.values()):
         outline(picture, masks[world % len(masks)], factor, OUTLINES[number % len(OUTLINES)])
     words = ""

@@ -41,7 +41,7 @@ NOT_RUN = {
         "invariants",
         "side_multiple",
     },  # how packs meet is decided before the IR
-    "element": {"glyph", "about", "override"},
+    "element": {"glyph", "about", "override", "color_by"},
     **{context: {"about"} for context in ("property", "field", "stream", "param", "pass")},
 }
 """Keys that say nothing about what a step does."""

@@ -56,7 +56,10 @@ def strips(
 
 
 def sheet(found: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.uint8]:
-    """Strips one below the other, uint8 [H', W', 3]: start, truth, prediction, error. A cell has `factor`² pixels."""
+    """Strips one below the other, uint8 [H', W', 3]: start, truth, prediction, error. A cell has `factor`² pixels.
+
+    Colors do not follow fields here: networks predict elements alone.
+    """
     known = palette(rules.elements)
     colors = np.zeros((256, 3), dtype=np.uint8)
     colors[: len(known)] = known  # a network may predict slots that the rules leave vacant: black

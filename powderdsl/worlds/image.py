@@ -14,6 +14,7 @@ from PIL import Image
 
 from powderdsl.bounded_files import open_regular
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
+from powderdsl.draw import ramps
 from powderdsl.model.types import Element
 from powderdsl.worlds.files import failure
 from powderdsl.worlds.raster import MAX_CELLS
@@ -31,6 +32,8 @@ _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
     """The ids uint8 [H, W] of a PNG file, as `media.write_png` writes of `draw.rgb`. Raises CompileError.
 
+    Colors of a ramp mean its element; the values of its field are not read.
+
     PD609 names every pixel colour that is no element's (and the nearest element), PD607 a picture of too many
     pixels, which is not decoded, PD602 a file that is no PNG, PD101 one that cannot be read.
     """
@@ -40,12 +43,15 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
     owners: dict[int, list[Element]] = {}
     for element in elements:
         owners.setdefault(_pack(element.color), []).append(element)
+    for color, ramped in _ramp_colors(elements).items():
+        owners.setdefault(color, ramped)  # what is an element's own color says nothing of ramps
     ids, known = np.zeros(packed.shape, np.uint8), np.zeros(packed.shape, np.bool_)
-    for color, owned in owners.items():
-        if len(owned) == 1:
-            where = packed == color
-            ids[where] = owned[0].id
-            known |= where
+    clear = {color: owned[0].id for color, owned in sorted(owners.items()) if len(owned) == 1}
+    colors, meant = np.array([*clear], dtype=np.uint32), np.array([*clear.values()], dtype=np.uint8)
+    for row, line in enumerate(packed if clear else ()):
+        place = np.searchsorted(colors, line).clip(max=len(colors) - 1)
+        known[row] = colors[place] == line
+        ids[row] = np.where(known[row], meant[place], 0)
     if not known.all():
         raise CompileError(_wrong_colors(path, packed, known, owners))
     return ids
@@ -70,6 +76,16 @@ def _wrong_colors(
         for color, (place, count) in listed[:MAX_REPORTED]
     ]
     return result if len(found) <= MAX_REPORTED else [*result, _many_colors(path, len(found))]
+
+
+def _ramp_colors(elements: Sequence[Element]) -> dict[int, list[Element]]:
+    """The colors of ramps, with the elements that may have them."""
+    found: dict[int, list[Element]] = {}
+    by_id = {element.id: element for element in elements}
+    for ramp in ramps(elements):
+        for color in dict.fromkeys(_pack("#" + bytes(row).hex()) for row in ramp.colors):
+            found.setdefault(color, []).append(by_id[ramp.id])
+    return found
 
 
 def _pack(color: str) -> int:

@@ -165,3 +165,40 @@ def test_a_film_is_written(run: RunFolder, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     with Image.open(run.path / "watch.gif") as image:
         assert image.n_frames == 1 + 4 * (1 + 2) + 3  # type: ignore[attr-defined]
+
+
+def test_films_show_fields(tmp_path: Path) -> None:
+    """Where the color of an element follows a field, films show it after each step."""
+    (tmp_path / "stove.yaml").write_text(
+        "pack: stove\nneeds: core\nfields: {heat: {type: 0..9, at: place}}\n"
+        'elements: {stove: {density: 5, color: "#303030", color_by: {field: heat, to: "#FF3000"}}}\n'
+        "passes: {burn: {do: heat += 1 where stove}}\n"
+    )
+    (tmp_path / "task.yaml").write_text(
+        "task: warm\nrules: core+stove.yaml\nsize: [8, 8]\nfill: stove\n"
+        "agent: {may: [wall, nothing], bins: 2, brush: 4, actions: 1, steps_per_action: 2}\nreward: {each: placed}\n"
+    )
+    _, pictures = film(
+        compile_task(str(tmp_path / "task.yaml"), backend="planes"), None, torch.arange(1), factor=1
+    )
+    reds = [int(frame[4, 4, 0]) for frame in pictures]
+    assert reds == [48, 48, 71, 94]  # the start, the action, two steps
+
+
+def test_start_worlds_of_a_task_show_fields(tmp_path: Path) -> None:
+    from tests.cli.commands import powderdsl
+
+    (tmp_path / "stove.yaml").write_text(
+        "pack: stove\nneeds: core\nfields: {heat: {type: 0..9, at: element, stove: 9}}\n"
+        'elements: {stove: {density: 5, color: "#303030", color_by: {field: heat, to: "#FF3000"}}}\n'
+        "passes: {burn: {do: heat -= 1 where stove}}\n"
+    )
+    (tmp_path / "task.yaml").write_text(
+        "task: warm\nrules: core+stove.yaml\nsize: [8, 8]\nfill: stove\n"
+        "agent: {may: [wall, nothing], bins: 2, brush: 4, actions: 1, steps_per_action: 2}\nreward: {each: placed}\n"
+    )
+    out = tmp_path / "sheet.png"
+    result = powderdsl("show", str(tmp_path / "task.yaml"), "--seeds", "1", "--out", str(out))
+    assert result.exit_code == 0, result.output
+    with Image.open(out) as image:
+        assert image.convert("RGB").getpixel((9, 9)) == (255, 48, 0)

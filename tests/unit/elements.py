@@ -14,6 +14,7 @@ class Element:
     id: int
     color: str
     glyph: str
+    ramp: None = None
 
     @property
     def qualified(self) -> str:

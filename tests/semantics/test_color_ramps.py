@@ -1,0 +1,350 @@
+"""Colors that follow fields: each way of drawing against a slow one that takes exact fractions, cell by cell."""
+
+from __future__ import annotations
+
+import io
+from fractions import Fraction
+from functools import cache
+from math import floor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import powderdsl
+from powderdsl.draw import palette, ramps, rgb
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.terminal import LiveView, render_frame
+from powderdsl.testing.cases import load_text, random_start
+from powderdsl.testing.choices import Choices
+from tests.cli.commands import powderdsl as run_command
+from tests.compilers import skip_without_compiler
+
+BACKENDS = ["reference", "dense", "planes", "native"]
+SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
+
+KILN = """\
+pack: kiln
+fields:
+  heat: {type: 0..255, at: place}
+  glow: {type: real(-3..5), at: element}
+  depth: {type: -100000..200000, default: -100000, at: place}
+  wet: {type: flag, default: yes, at: place}
+  tilt: {type: -7..6, at: element, of: vane}
+elements:
+  air: {id: 0, color: "#102030", color_by: {field: heat, to: "#ff8000"}}
+  iron: {id: 1, color: "#102030", color_by: {field: glow, from: "#FF8040", to: "#00A0FF", over: -1..2}}
+  rock: {id: 2, color: "#808080", color_by: {field: depth, from: "#FF8040", to: "#00A0FF"}}
+  sponge: {id: 5, color: "#808080", color_by: {field: wet, to: "#0000FF"}}
+  vane: {id: 6, color: "#808080", color_by: {field: tilt, from: "#000000", to: "#FFFFFF", over: -3..3}}
+  brick: {id: 9, color: "#123456"}
+streams: [coin]
+passes:
+  burn:
+    do:
+      - heat += 3 where coin < 20%
+      - glow += 0.1 where coin > 70%
+      - depth -= 1000 where coin > 50%
+      - wet := coin > 30%
+      - tilt += 1 where vane and coin < 50%
+"""
+
+
+@cache
+def kiln() -> Ruleset:
+    return load_text(KILN)
+
+
+def slow(ruleset: Ruleset, ids: np.ndarray, read) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """Pictures uint8 [..., 3]: what docs/language.md says, word by word."""
+    picture = np.zeros((*ids.shape, 3), np.uint8)
+    by_id = {element.id: element for element in ruleset.elements}
+    for cell in np.ndindex(ids.shape):
+        element = by_id[int(ids[cell])]
+        if element.ramp is None:
+            picture[cell] = list(bytes.fromhex(element.color[1:]))
+            continue
+        ramp = element.ramp
+        value = min(max(Fraction(float(read(ramp.field)[cell])), Fraction(ramp.lo)), Fraction(ramp.hi))
+        part = (value - ramp.lo) / (ramp.hi - ramp.lo)
+        ends = zip(bytes.fromhex(ramp.start[1:]), bytes.fromhex(ramp.end[1:]), strict=True)
+        picture[cell] = [floor(start + (end - start) * part + Fraction(1, 2)) for start, end in ends]
+    return picture
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pictures_of_worlds(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
+    skip_without_compiler(backend)
+    sim = powderdsl.compile(kiln(), backend=backend)
+    for number, (height, width) in enumerate(SIZES):
+        world = random_start(sim.ruleset, Choices.seeded(number), (3, height, width)).world(sim)
+        for now in (world, sim.step(world, steps=2)):
+            drawn = now.rgb()
+            wanted = slow(sim.ruleset, now.ids.numpy(), lambda name, now=now: now[name].numpy())
+            assert np.array_equal(drawn.numpy(), wanted), (height, width)
+            buffer = torch.full((5, *drawn.shape[1:]), 77, dtype=torch.uint8)
+            now.rgb(buffer[1:4])
+            assert torch.equal(buffer[1:4], drawn)
+            assert bool((buffer[0] == 77).all() & (buffer[4] == 77).all())
+
+
+@pytest.mark.parametrize("backend", ["native"])
+def test_large_worlds_in_strips(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
+    """Packed worlds that lie in strips are drawn as those that do not."""
+    skip_without_compiler(backend)
+    ruleset = kiln()
+    native, dense = (powderdsl.compile(ruleset, backend=one) for one in (backend, "dense"))
+    start = random_start(ruleset, Choices.seeded(1), (1, 128, 256))
+    assert torch.equal(native.step(start.world(native)).rgb(), dense.step(start.world(dense)).rgb())
+
+
+@pytest.mark.parametrize("kind", ["array", "tensor"])
+def test_pictures_of_arrays(kind: str, torch) -> None:  # type: ignore[no-untyped-def]
+    sim = powderdsl.compile(kiln(), backend="reference")
+    world = random_start(sim.ruleset, Choices.seeded(7), (2, 9, 40)).world(sim)
+    fields = {name: world[name].numpy() for name in ("heat", "glow", "depth", "wet", "tilt")}
+    wanted = slow(kiln(), world.ids.numpy(), fields.__getitem__)
+    ids, given = world.ids, dict(fields)
+    if kind == "array":
+        ids = ids.numpy()
+    else:
+        given = {name: torch.from_numpy(value) for name, value in fields.items()}
+    elements = kiln().elements
+    image = rgb(ids, palette(elements), ramps=ramps(elements), fields=given)
+    assert np.array_equal(np.asarray(image), wanted)
+    with pytest.raises(ValueError, match="follows the field heat, which is missing"):
+        rgb(ids, palette(elements), ramps=ramps(elements))
+    with pytest.raises(ValueError, match="heat must have shape"):
+        rgb(ids, palette(elements), ramps=ramps(elements), fields={**given, "heat": given["heat"][:1]})
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "lo", "hi"),
+    [
+        ("#000000", "#FF0102", 0, 1),
+        ("#FF00FF", "#00FF00", -5, 6),
+        ("#000000", "#FFFFFF", 0, 510),
+        ("#FFFFFF", "#000000", 0, 510),
+        ("#102030", "#102030", 0, 9),
+        ("#010203", "#FEFDFC", -1_000_000, 1_000_000),
+    ],
+)
+def test_floats_change_color_at_the_next_float(start: str, end: str, lo: int, hi: int) -> None:
+    """At each value where a color begins, and one float before it: no rounding decides."""
+    ruleset = load_text(
+        f"pack: lamp\nfields: {{power: {{type: real({lo}..{hi}), at: place}}}}\n"
+        f'elements: {{bulb: {{color: "#FFFFFF", color_by: {{field: power, from: "{start}", to: "{end}"}}}}}}\n'
+    )
+    (ramp,) = ramps(ruleset.elements)
+    values = np.concatenate(
+        [ramp.starts, np.nextafter(ramp.starts, np.float32(-np.inf)), np.float32([lo, hi])]
+    )
+    ids, values = np.zeros((1, len(values)), np.uint8), values.astype(np.float32)[None]
+    image = rgb(ids, palette(ruleset.elements), ramps=[ramp], fields={"power": values})
+    assert np.array_equal(image, slow(ruleset, ids, {"power": values}.__getitem__))
+
+
+def test_colors_have_no_meaning() -> None:
+    plain = load_text(
+        "\n".join(
+            line.partition(", color_by")[0] + "}" if ", color_by" in line else line
+            for line in KILN.split("\n")
+        )
+    )
+    assert all(element.ramp is None for element in plain.elements)
+    assert ramps(plain.elements) == ()
+    assert fingerprint(plain) == fingerprint(kiln())
+
+
+# Commands
+
+
+class Terminal(io.StringIO):
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_shows_ramps(torch, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    from powderdsl.cli.pictures import first_world
+
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    sim = powderdsl.compile(kiln(), backend="reference")
+    world = random_start(sim.ruleset, Choices.seeded(2), (2, 6, 20)).world(sim)
+    stream = Terminal()
+    with LiveView(kiln().elements, stream) as view:
+        view.show(**first_world(world))
+    for line in render_frame(world.rgb()[0]).split("\n"):
+        assert line in stream.getvalue()
+
+
+STOVE = """\
+pack: stove
+needs: core
+fields: {heat: {type: 0..9, at: place}}
+elements:
+  stove: {density: 5, color: "#303030", color_by: {field: heat, to: "#FF3000"}}
+passes:
+  burn:
+    do: heat += 1 where stove
+"""
+
+
+@pytest.fixture
+def stove(tmp_path: Path, monkeypatch) -> Path:  # type: ignore[no-untyped-def]
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "stove.yaml"
+    path.write_text(STOVE)
+    (tmp_path / "start.txt").write_text("s s\ns .\n")
+    return path
+
+
+def pixels(path: Path) -> set[tuple[int, ...]]:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return {tuple(pixel) for row in np.asarray(image.convert("RGB")).tolist() for pixel in row}
+
+
+def test_pictures_of_commands(stove: Path) -> None:
+    ran = run_command(
+        "run",
+        "core+stove.yaml",
+        "--world",
+        "start.txt",
+        "--steps",
+        "3",
+        "--backend",
+        "dense",
+        "--out",
+        "a.png",
+        "--scale",
+        "1",
+    )
+    assert ran.exit_code == 0, ran.output
+    hot = tuple(
+        floor(a + (b - a) * Fraction(3, 9) + Fraction(1, 2))
+        for a, b in zip((48, 48, 48), (255, 48, 0), strict=True)
+    )
+    assert hot in pixels(Path("a.png"))
+    assert (
+        run_command(
+            "run",
+            "core+stove.yaml",
+            "--world",
+            "start.txt",
+            "--steps",
+            "3",
+            "--backend",
+            "dense",
+            "--out",
+            "a.npz",
+        ).exit_code
+        == 0
+    )
+    drawn = run_command("render", "a.npz", "--rules", "core+stove.yaml", "--out", "b.png", "--scale", "1")
+    assert drawn.exit_code == 0, drawn.output
+    assert pixels(Path("b.png")) == pixels(Path("a.png"))
+    film = run_command(
+        "run",
+        "core+stove.yaml",
+        "--world",
+        "start.txt",
+        "--steps",
+        "3",
+        "--backend",
+        "dense",
+        "--out",
+        "a.gif",
+        "--scale",
+        "1",
+    )
+    assert film.exit_code == 0, film.output
+    again = run_command("run", "core+stove.yaml", "--world", "b.png", "--steps", "0", "--out", "c.npz")
+    assert again.exit_code == 0, again.output  # a color of a ramp means its element
+    from powderdsl.worlds.store import load_world
+
+    sim = powderdsl.compile("core+stove.yaml", backend="reference")
+
+    assert np.array_equal(*(load_world(one, sim).ids.numpy() for one in ("c.npz", "a.npz")))
+
+
+def test_show_prints_ramps(stove: Path) -> None:
+    text = run_command("show", "core+stove.yaml").stdout
+    assert "#303030; #303030 -> #FF3000 by heat 0..9" in text
+    import json
+
+    data = {
+        one["name"]: one
+        for one in json.loads(run_command("show", "core+stove.yaml", "--json").stdout)["elements"]
+    }
+    assert data["stove"]["color_by"] == {"field": "heat", "from": "#303030", "to": "#FF3000", "over": [0, 9]}
+    assert data["wall"]["color_by"] is None
+    assert (
+        "#303030 #303030 -> #FF3000 by heat 0..9"
+        in run_command("compile", "core+stove.yaml", "--emit", "model").stdout
+    )
+
+
+def test_a_counterexample_is_drawn_with_ramps(stove: Path) -> None:
+    stove.write_text(
+        STOVE.replace("do: heat += 1 where stove", "do: [heat += 1 where stove, stove -> empty if heat == 4]")
+        + "invariants: count(stove) is constant\n"
+    )
+    result = run_command("test", "core+stove.yaml", "--no-keep", "--picture", "broken.png")
+    assert result.exit_code == 1, result.output
+    red = {pixel[0] for pixel in pixels(Path("broken.png")) if pixel[1] == 48}
+    assert red & {floor(48 + 207 * Fraction(heat, 9) + Fraction(1, 2)) for heat in range(1, 10)}
+
+
+# Packs
+
+
+def test_other_packs_color_elements(stove: Path) -> None:
+    Path("thermal.yaml").write_text(
+        'pack: thermal\nneeds: [core, stove]\nalso:\n  wall: {color_by: {field: stove.heat, to: "#FF0000", over: 2..5}}\n'
+        '  stove: {color_by: {field: heat, to: "#00FF00"}}\n  oven?: {color_by: {field: heat, to: "#00FF00"}}\n'
+        '  empty: {color_by: {field: moisture?, to: "#0000FF"}}\n'
+    )
+    ruleset, found = powderdsl.compiler.load_with_diagnostics("core+stove.yaml+thermal.yaml")
+    ramps = {element.name: element.ramp for element in ruleset.elements}
+    assert ramps["wall"] is not None
+    assert (ramps["wall"].field, ramps["wall"].lo, ramps["wall"].hi) == ("heat", 2, 5)
+    assert ramps["stove"] is not None
+    assert ramps["stove"].end == "#00FF00"
+    assert ramps["empty"] is None
+    assert [one.code for one in found if one.code.startswith("PD3")] == ["PD317"]
+
+
+def test_strangers_contest_a_ramp(stove: Path) -> None:
+    for name in ("one", "two"):
+        color = {"one": "#0000FF", "two": "#00FF00"}[name]
+        Path(f"{name}.yaml").write_text(
+            f'pack: {name}\nneeds: [core, stove]\nalso: {{wall: {{color_by: {{field: heat, to: "{color}"}}}}}}\n'
+        )
+    ruleset, found = powderdsl.compiler.load_with_diagnostics("core+stove.yaml+one.yaml+two.yaml")
+    wall = ruleset.element("wall")
+    assert wall is not None
+    assert wall.ramp is not None
+    assert wall.ramp.end == "#00FF00"
+    (warning,) = [one for one in found if one.code == "PD316"]
+    assert "two.yaml" in str(warning.primary.span.source.name)
+
+
+def test_a_field_that_a_color_follows_is_used() -> None:
+    _, found = powderdsl.compiler.load_with_diagnostics(
+        _written(KILN.replace("      - wet := coin > 30%\n", ""))
+    )
+    assert "PD507" not in [one.code for one in found]
+
+
+@cache
+def _written(text: str) -> Path:
+    import tempfile
+
+    path = Path(tempfile.mkdtemp()) / "kiln.yaml"
+    path.write_text(text)
+    return path
