@@ -1,7 +1,8 @@
 """Counts which mutants of the shipped packs and examples are noticed, for the table in docs/testing.md.
 
 `python docs/mutation_table.py` judges all of them (minutes) and writes docs/mutation.json and the table;
-`python docs/mutation_table.py life steam` only those of some packs. `--jobs N` sets the number of processes.
+`python docs/mutation_table.py life water` only those of some compositions or packs; the others' counts stay. What has
+been counted is written after each pack. `--jobs N` sets the number of processes.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import json
 import os
 import sys
 import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +26,7 @@ RESULTS = DOCS / "mutation.json"
 EXAMPLES = {
     "core+water+docs/examples/beetle.yaml": ("beetle",),
     "core+docs/examples/electricity.yaml": ("electricity",),
-    "core+water+docs/examples/salt.yaml": ("salt",),
+    "core+sand+water+docs/examples/salt.yaml": ("salt",),
     "core+water+fire+lava+docs/examples/steam.yaml": ("steam",),
 }
 """Compositions of the examples, and which of their packs are mutated."""
@@ -34,40 +37,71 @@ def compositions() -> dict[str, tuple[str, ...]]:
     return {**dict.fromkeys(shipped_tests(), ()), **EXAMPLES}
 
 
-def count(rules: str, packs: tuple[str, ...], jobs: int, worlds: bool = False) -> dict[str, Any]:
-    """The tallies of a composition's packs. `worlds`: also look for worlds that show survivors, which takes longer."""
-    from powderdsl.mutation.mutation_run import run_campaign
+Counts = dict[str, dict[str, int]]
+"""Tallies by pack."""
+
+
+def packs_of(rules: str) -> list[str]:
+    """The packs of a composition that are mutated, in their order."""
+    from powderdsl.mutation.original import Original
+
+    only = compositions()[rules]
+    return list(dict.fromkeys(mutant.pack for mutant in Original.of(rules).mutants(frozenset(only))))
+
+
+def count(rules: str, packs: Sequence[str], jobs: int, worlds: bool = False) -> Iterator[Counts]:
+    """Tallies of some packs of a composition, each as soon as all of its mutants are judged.
+
+    `worlds`: also look for worlds that show survivors, which takes longer.
+    """
+    from powderdsl.mutation.mutation_run import Outcome, run_campaign
     from powderdsl.mutation.original import Original
     from powderdsl.mutation.tally import tally
 
     mutants = Original.of(rules).mutants(frozenset(packs))
-    began = time.monotonic()
-    found = []
-    for outcome in run_campaign(rules, packs, list(range(len(mutants))), jobs, 0, worlds):
-        found.append(outcome)
+    left = Counter(mutant.pack for mutant in mutants)
+    found: dict[str, list[Outcome]] = {pack: [] for pack in packs}
+    for outcome in run_campaign(rules, tuple(packs), list(range(len(mutants))), jobs, 0, worlds):
+        pack = mutants[outcome.number].pack
+        found[pack].append(outcome)
+        left[pack] -= 1
         if sys.stderr.isatty():
-            print(f"\r{rules}: {len(found)} of {len(mutants)}", end="", file=sys.stderr, flush=True)
-    seconds = round(time.monotonic() - began)
-    names = dict.fromkeys(mutant.pack for mutant in mutants)
-    tallies = {name: tally(one for one in found if mutants[one.number].pack == name) for name in names}
-    return {"packs": tallies, "seconds": seconds}
+            print(f"\r{rules}: {left.total()} left", end=" ", file=sys.stderr, flush=True)
+        if not left[pack]:
+            yield {pack: tally(found[pack])}
+
+
+def record(measured: dict[str, Any], rules: str, counts: Counts) -> dict[str, Any]:
+    """What has been measured with some more counts, in the order of the compositions and of their packs."""
+    known = {**measured.get(rules, {}).get("packs", {}), **counts}
+    ordered = {pack: known[pack] for pack in packs_of(rules) if pack in known}
+    merged = {**measured, rules: {"packs": ordered}}
+    return {name: merged[name] for name in compositions() if name in merged}
 
 
 def main(arguments: list[str]) -> int:
-    """Judge, write the counts, write the table."""
+    """Judge, write the counts after each pack, write the table."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
     jobs = os.cpu_count() or 1
     if "--jobs" in arguments:
         place = arguments.index("--jobs")
         jobs = int(arguments[place + 1])
         arguments = arguments[:place] + arguments[place + 2 :]
+    known = {rules: packs_of(rules) for rules in compositions()}
+    unknown = set(arguments) - set(known) - {pack for packs in known.values() for pack in packs}
+    if unknown:
+        print(f"neither a composition nor a pack: {', '.join(sorted(unknown))}", file=sys.stderr)
+        return 2
     measured = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
-    for rules, packs in compositions().items():
-        if not arguments or rules in arguments or set(packs) & set(arguments):
-            measured[rules] = count(rules, packs, jobs)
-            print(f"{rules}: {measured[rules]['seconds']} s", flush=True)
-            ordered = {name: measured[name] for name in compositions() if name in measured}
-            RESULTS.write_text(json.dumps(ordered, indent=1) + "\n", "utf-8")
+    for rules, packs in known.items():
+        asked = [pack for pack in packs if not arguments or rules in arguments or pack in arguments]
+        if not asked:
+            continue
+        began = time.monotonic()
+        for counts in count(rules, asked, jobs):
+            measured = record(measured, rules, counts)
+            RESULTS.write_text(json.dumps(measured, indent=1) + "\n", "utf-8")
+        print(f"{rules}: {time.monotonic() - began:.0f} s", flush=True)
     import generate
 
     return generate.main([])

@@ -23,8 +23,11 @@ Variable = tuple[Hashable, ...]
 MAX_CASES = 1 << 21
 """Assignments that are tried for one question."""
 
-MAX_WORK = 400_000_000
-"""Assignments times nodes that are evaluated for one mutant."""
+MAX_WORK = 1_000_000_000
+"""Assignments times nodes that are evaluated for one mutant. Proofs end by work, so they are the same on any machine."""
+
+VISIT = 200
+"""Work for a node that is looked at to find the variables, whether the question is decided or not."""
 
 MAX_DEPTH = 600
 
@@ -93,20 +96,24 @@ class Comparison:
         return self._holds(flag, lambda value: bool(value.all()))
 
     def _holds(self, flag: Node, question: Callable[[Array], bool]) -> bool:
-        try:
-            case = _Cases.of((flag,), self.cells, self)
-            return question(case.value(flag, (0, 0))[case.valid])
-        except (Undecided, RecursionError):
-            return False
+        return self._decided((flag,), lambda case: question(case.value(flag, (0, 0))[case.valid]))
 
     def _tried(self, a: Node, b: Node) -> bool:
         if REAL in (a.type, b.type):
             return False
-        try:
-            case = _Cases.of((a, b), self.cells, self)
-            return bool((case.value(a, (0, 0)) == case.value(b, (0, 0)))[case.valid].all())
-        except (Undecided, RecursionError):
-            return False
+        return self._decided(
+            (a, b),
+            lambda case: bool((case.value(a, (0, 0)) == case.value(b, (0, 0)))[case.valid].all()),
+        )
+
+    def _decided(self, roots: tuple[Node, ...], question: Callable[[_Cases], bool]) -> bool:
+        """What holds in every case. Where there are too many, what others around are counted is any number."""
+        for counted in (False, True):
+            try:
+                return question(_Cases.of(roots, self.cells, self, counted))
+            except (Undecided, RecursionError):
+                continue
+        return False
 
     def spend(self, work: int) -> None:
         self.left -= work
@@ -160,11 +167,17 @@ class _Cases:
     valid: Array
     work: Comparison
     size: int
+    counted: bool
     _values: dict[tuple[int, Offset], Array] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, roots: tuple[Node, ...], cells: Cells, work: Comparison) -> _Cases:
-        """Find the variables and lay out the cases. Raises Undecided if there are too many."""
+    def of(cls, roots: tuple[Node, ...], cells: Cells, work: Comparison, counted: bool) -> _Cases:
+        """Find the variables and lay out the cases. Raises Undecided if there are too many.
+
+        Args:
+            counted: take what a count finds in other cells for a variable of its own. More cases than there are can
+                only refute.
+        """
         seen: set[tuple[int, Offset]] = set()
         uses: dict[Variable, set[Hashable]] = {}
         inputs: dict[Variable, Node] = {}
@@ -181,6 +194,7 @@ class _Cases:
             if (node.index, at) in seen:
                 continue
             seen.add((node.index, at))
+            work.spend(VISIT)
             if len(seen) > 20_000:
                 raise Undecided
             if node.type == REAL:
@@ -199,6 +213,8 @@ class _Cases:
                     inputs[("draw", node.attr[0], at)] = node
                 case "shift" if not node.attr[2]:
                     inputs[("inside", at, node.attr[:2])] = node
+                case "count" if counted:
+                    inputs[_others(node, at)] = node
                 case "count" if not node.attr[1]:
                     for dy, dx, _ in node.attr[0]:
                         if (dy, dx) != (0, 0):
@@ -206,6 +222,8 @@ class _Cases:
             if node.op == "below":
                 continue
             for part, place in _reads(node, at):
+                if counted and node.op == "count" and place != at:
+                    continue
                 asked: Hashable = "value"
                 if node.op in ("in_set", "table"):
                     asked = (node.op, node.attr)
@@ -224,7 +242,7 @@ class _Cases:
         for name, values in domains.items():
             table[name] = np.asarray(values, np.int32)[number // stride % len(values)]
             stride *= len(values)
-        return cls(table, ordered, moduli, _valid(table, cells, size), work, size)
+        return cls(table, ordered, moduli, _valid(table, cells, size), work, size, counted)
 
     def value(self, node: Node, at: Offset) -> Array:
         """The node's value at a place, in each case."""
@@ -261,6 +279,9 @@ class _Cases:
     def _count(self, node: Node, at: Offset) -> Array:
         weights, wraps = node.attr
         total = np.zeros(self.size, np.int32)
+        if self.counted:
+            total += self.variables[_others(node, at)]
+            weights = tuple(weight for weight in weights if weight[:2] == (0, 0))
         for dy, dx, weight in weights:
             held = self.value(node.args[0], _plus(at, (dy, dx)))
             if not wraps and (dy, dx) != (0, 0):
@@ -271,6 +292,12 @@ class _Cases:
     def shifted(self, node: Node, at: Offset, value: Array) -> Array:
         """What is seen at a neighbor: nothing beyond the edge, unless it wraps."""
         return value if node.attr[2] else value * self.variables[("inside", at, node.attr[:2])]
+
+
+def _others(node: Node, at: Offset) -> Variable:
+    """What a count finds in other cells, as a variable: the same one where only the cell itself makes a difference."""
+    weights, wraps = node.attr
+    return "counted", node.args[0].index, wraps, tuple(sorted(w for w in weights if w[:2] != (0, 0))), at
 
 
 def _at(node: Node, at: Offset) -> Offset:
@@ -296,6 +323,14 @@ def _domain(
             return list(range(moduli[str(name[1])]))
         case "draw":
             return list(range(len(thresholds[str(name[1])]) + 1))
+        case "counted":
+            low, high = node.args[0].type.lo, node.args[0].type.hi
+            weights = [weight for dy, dx, weight in node.attr[0] if (dy, dx) != (0, 0)]
+            ends = [(min(0, w * low, w * high), max(0, w * low, w * high)) for w in weights]
+            least, most = sum(end[0] for end in ends), sum(end[1] for end in ends)
+            if most - least > 300:
+                raise Undecided
+            return list(range(least, most + 1))
         case "free":
             if node.type.hi - node.type.lo > 300:
                 raise Undecided

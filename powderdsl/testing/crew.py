@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
@@ -50,13 +51,14 @@ class _Worker:
 
 
 def work_through(
-    tasks: deque[Any], work: Work, jobs: int, limit: float, recycle: int = 200
+    tasks: deque[Any], work: Work, jobs: int, limit: float = math.inf, recycle: int = 200
 ) -> Iterator[Done | Lost]:
     """Results in the order in which they come. Tasks that the caller appends meanwhile are done too.
 
     Args:
         work: runs in `jobs` fresh processes; one is replaced after `recycle` tasks, so that it cannot grow for ever.
-        limit: seconds that a task may take.
+        limit: seconds that a task may take on the wall clock. Without one, outcomes do not depend on how busy the
+            machine is; tasks must then end by themselves.
     """
     workers: list[_Worker] = []
     try:

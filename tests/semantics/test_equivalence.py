@@ -61,6 +61,18 @@ SAME = {
         "let: {wet: damp > 2}\ndo: soil -> moss if wet",
         "let: {wet: damp > 2}\ndo: soil -> moss if damp > 2 or wet",
     ),
+    "a condition beside a count of more than can be tried": (
+        "do: soil -> moss if count(damp > 4 and age == 1) > 2 and weight < 2",
+        "do: soil -> moss if count(damp > 4 and age == 1) > 2",
+    ),
+    "the cell itself is not what is counted, of more than can be tried": (
+        "do: soil -> moss if count(damp > 4 and age == 1) == 2",
+        "do: soil -> moss if count((damp > 4 and age == 1) in ring) == 2",
+    ),
+    "rules whose counts exclude each other": (
+        "do:\n  - soil -> moss if count(damp > age) in 1..3\n  - soil -> rock if count(damp > age) > 3",
+        "do:\n  - soil -> rock if count(damp > age) > 3\n  - soil -> moss if count(damp > age) in 1..3",
+    ),
     "swaps under weights": (
         "do: swap below if weight > below.weight and weight == 2",
         "do: swap below if weight == 2 > below.weight",
@@ -71,6 +83,14 @@ OTHER = {
     "the cell itself is counted": (
         "do: moss -> soil if count(moss in ring) == 2",
         "do: moss -> soil if count(moss) == 2",
+    ),
+    "the cell itself is counted, among more than can be tried": (
+        "do: moss -> soil if count((damp > 4 and age == 1) in ring) == 2",
+        "do: moss -> soil if count(damp > 4 and age == 1) == 2",
+    ),
+    "a count of more than can be tried": (
+        "do: moss -> soil if count(damp > 4 and age == 1) == 2",
+        "do: moss -> soil if count(damp > 4 and age == 2) == 2",
     ),
     "one moment or two": ("do: soil -> moss\nthen: moss -> rock", "do:\n  - soil -> moss\n  - moss -> rock"),
     "edges": ("do: soil -> moss if left is rock", "do: soil -> moss if left is rock and inside(left)"),

@@ -1,0 +1,56 @@
+"""What notices a mutant, and that neither a clock nor the number of processes has a part in it."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from powderdsl.mutation.judging import broken_invariant
+from powderdsl.mutation.mutation_run import run_campaign
+from powderdsl.mutation.original import Original
+from powderdsl.simulator import compile
+from powderdsl.testing import crew
+from powderdsl.testing.cases import load_text
+
+ROCK = """\
+pack: rocks
+elements:
+  soil: {id: 0, color: "#101010"}
+  rock: {id: 1, color: "#202020", weight: 3, tags: hard}
+  seed: {id: 2, color: "#303030"}
+tags: {hard: stays whole}
+properties: {weight: 0..7}
+passes:
+  harden:
+    do: soil -> rock if left is seed
+invariants:
+  - never (rock and weight < 2)
+  - never (rock and not hard)
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "claim"),
+    [
+        ("weight: 3", "weight: 1", "never (rock and weight < 2)"),
+        (", tags: hard", "", "never (rock and not hard)"),
+    ],
+)
+def test_invariants_about_properties_and_tags_are_asked_where_no_world_differs(tmp_path, right, wrong, claim):
+    path = tmp_path / "rocks.yaml"
+    path.write_text(ROCK)
+    mutant = load_text(ROCK.replace(right, wrong))
+    broken, _ = broken_invariant(Original.of(str(path)), compile(mutant, backend="planes"))
+    assert broken is not None
+    assert broken.span.text == claim
+
+
+def test_a_slow_machine_and_several_processes_change_no_outcome(monkeypatch):
+    numbers = [0, 7, 14, 21, 28]
+    alone = {one.number: one for one in run_campaign("wireworld", (), numbers, jobs=1, seed=0)}
+    hours = itertools.count(0, 3600)
+    monkeypatch.setattr(crew.time, "monotonic", lambda: next(hours))
+    together = {one.number: one for one in run_campaign("wireworld", (), numbers, jobs=2, seed=0)}
+    assert together == alone
+    assert {one.verdict.status for one in alone.values()} - {"survived"}
