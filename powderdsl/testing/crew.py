@@ -57,7 +57,7 @@ def work_through(
 
     Args:
         work: runs in `jobs` fresh processes; one is replaced after `recycle` tasks, so that it cannot grow for ever.
-        limit: seconds that a task may take on the wall clock. Without one, outcomes do not depend on how busy the
+        limit: seconds that a task may take, busy or not. Without one, outcomes do not depend on how busy the
             machine is; tasks must then end by themselves.
     """
     workers: list[_Worker] = []
