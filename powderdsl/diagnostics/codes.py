@@ -91,6 +91,7 @@ _ROWS = (
     ("PD514", "rule-overruled", _WARNING),
     ("PD515", "scope-outgrown", _NOTE),
     ("PD516", "write-lost", _WARNING),
+    ("PD517", "conflict-with-added-pack", _WARNING),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),

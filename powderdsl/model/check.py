@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
+from powderdsl.model.added_conflicts import AddedPacks
 from powderdsl.model.compose import Composition, compose
 from powderdsl.model.constants import constant_of
 from powderdsl.model.contested import given_values, report_contested
@@ -89,12 +90,15 @@ def check(
     reporter: Reporter,
     palette: Palette | None = None,
     elsewhere: Callable[[], Mapping[str, str]] = dict,
+    *,
+    alone: bool = False,
 ) -> Ruleset:
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter.
 
     Args:
         palette: ids that were recorded earlier, see `model/palette.py`.
         elsewhere: words that packs define which are not loaded, with the pack.
+        alone: no pack counts as added to others: rules that meet are errors.
     """
     typer, given = resolve_names(packs, ruleset, reporter, palette)
     symbols, composition = typer.symbols, typer.symbols.composition
@@ -119,7 +123,13 @@ def check(
     ids = {name: element.id for name, element in composition.elements.items()}
     check_assigned(examples, ids, symbols.properties, reporter)
     facts = _facts(symbols)
-    check_logic(passes, facts, elaborated, reporter)
+    passes = check_logic(
+        passes,
+        facts,
+        elaborated,
+        reporter,
+        None if alone else AddedPacks(composition, partial(_alone, packs)),
+    )
     report_unused(composition, typer, produced_ids(passes, facts))
     matrix = matrix_channels(composition, symbols, passes, reporter)
     reporter.raise_if_errors()
@@ -153,6 +163,11 @@ def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None
         return resolve_names([pack for pack in packs if pack.name.text in names], None, Reporter())[0]
     except CompileError:
         return None
+
+
+def _alone(packs: Sequence[PackDecl], names: tuple[str, ...], reporter: Reporter) -> Ruleset:
+    """The model of some of these packs by themselves. Raises CompileError."""
+    return check([pack for pack in packs if pack.name.text in names], None, reporter, alone=True)
 
 
 def _facts(symbols: Symbols) -> Facts:

@@ -9,6 +9,7 @@ from math import lcm
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.added_conflicts import AddedPacks, may_settle, report_added
 from powderdsl.model.apart import Glances
 from powderdsl.model.budget import BUDGET, MAX_QUESTION, Budget
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 HERE: Offset = (0, 0)
 
+ASSIGN = "two rules may assign"
+
 ALL_MOMENTS = 3
 """Work for the conflicts of all moments together, as a multiple of that for one."""
 
@@ -47,6 +50,11 @@ class Conflict:
     second: Span
     notes: tuple[str, ...]
     helps: tuple[str, ...]
+
+    @property
+    def claims(self) -> tuple[Span, Span]:
+        """What the two rules claim: the second is where it is reported."""
+        return claim(self.first), claim(self.second)
 
     def report(self, labels: list[str], example: str, reporter: Reporter) -> None:
         """Report it once, whatever the number of rounds that have it. `example` is for the first of them."""
@@ -70,18 +78,36 @@ def claim(span: Span) -> Span:
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
 
 
-def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, reporter: Reporter) -> None:
-    """Report conflicts (errors), rules that never fire or do nothing (warnings), and those that sleep (notes)."""
+@dataclass
+class _Found:
+    """A conflict as it was met first, with an example, and where it was met: passes and moments by number."""
+
+    example: dict[Offset, int]
+    labels: list[str]
+    places: list[tuple[int, int]]
+
+
+def check_logic(
+    passes: tuple[Pass, ...],
+    facts: Facts,
+    elaborated: Elaborated,
+    reporter: Reporter,
+    added: AddedPacks | None = None,
+) -> tuple[Pass, ...]:
+    """Report conflicts (errors), rules that never fire or do nothing (warnings), and those that sleep (notes).
+
+    Conflicts that come from `added` packs alone are settled: the passes that are returned say how.
+    """
     relaxed = facts.relaxed()
     silent: dict[Span, list[tuple[Expr, dict[str, Expr]]]] = {}
     alive: dict[Span, bool] = {}
     useful: dict[Span, bool] = {}
-    conflicts: dict[Conflict, tuple[str, list[str]]] = {}
+    conflicts: dict[Conflict, _Found] = {}
     work: list[tuple[int, int, Pass]] = []
     left = ALL_MOMENTS * BUDGET
-    for pass_ in passes:
+    for at, pass_ in enumerate(passes):
         earlier: dict[str, Expr] = {}
-        for moment in pass_.moments:
+        for number, moment in enumerate(pass_.moments):
             lets = earlier | {let.name: let.value for let in moment.lets}
             earlier = lasting(lets)
             live = []
@@ -96,14 +122,15 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
             if moment.policy == "prove":
                 given = min(BUDGET, left)
                 asked = replace(facts, budget=Budget(given))
-                for conflict, words in _check_moment(live, asked, lets):
-                    conflicts.setdefault(conflict, (words, []))[1].append(moment.label)
+                for conflict, found in _check_moment(live, asked, lets):
+                    known = conflicts.setdefault(conflict, _Found(found, [], []))
+                    known.labels.append(moment.label)
+                    known.places.append((at, number))
                 work.append((given - asked.budget.left, len(live), pass_))
                 left -= work[-1][0]
     if _too_much(work, reporter):
-        return
-    for conflict, (words, labels) in conflicts.items():
-        conflict.report(labels, words, reporter)
+        return passes
+    passes = _report_conflicts(conflicts, passes, facts, added, reporter)
     for span, fires in alive.items():
         if not fires and span in elaborated.asleep:
             _report_sleep(f"`{elaborated.asleep[span]}` is not loaded", span, reporter)
@@ -126,6 +153,44 @@ def check_logic(passes: tuple[Pass, ...], facts: Facts, elaborated: Elaborated, 
                 "PD509", "this rule changes nothing", span, "the cell already is what it becomes",
                 helps=["remove it, or name another element after `->`"],
             )  # fmt: skip
+    return passes
+
+
+def _report_conflicts(
+    conflicts: dict[Conflict, _Found],
+    passes: tuple[Pass, ...],
+    facts: Facts,
+    added: AddedPacks | None,
+    reporter: Reporter,
+) -> tuple[Pass, ...]:
+    """Report conflicts; the passes with those settled that added packs bring about."""
+    settled: set[tuple[int, int]] = set()
+    for conflict, found in conflicts.items():
+        words = _in_words(facts, found.example)
+        pass_ = passes[found.places[0][0]]
+        place, ids = conflict.claims[1], list(found.example.values())
+        causes = added.causes(pass_.pack, place, ids or facts.ids) if added else ()
+        if not causes:
+            conflict.report(found.labels, words, reporter)
+            continue
+        assigns = conflict.message.startswith(ASSIGN)
+        settles = assigns or all(may_settle(passes[at].moments[number]) for at, number in found.places)
+        if settles and not assigns:
+            settled.update(found.places)
+        notes = [words] if words else []
+        report_added(conflict.code, conflict.claims, notes, causes, pass_.name, settles, assigns, reporter)
+    return tuple(
+        replace(
+            pass_,
+            moments=tuple(
+                replace(moment, policy="first_wins") if (at, number) in settled else moment
+                for number, moment in enumerate(pass_.moments)
+            ),
+        )
+        if any(one == at for one, _ in settled)
+        else pass_
+        for at, pass_ in enumerate(passes)
+    )
 
 
 def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
@@ -165,7 +230,9 @@ def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
     return True
 
 
-def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Iterator[tuple[Conflict, str]]:
+def _check_moment(
+    rules: list[Rule], facts: Facts, lets: dict[str, Expr]
+) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
     """The conflicts of one moment, with an example: for each rule the first one, maybe itself, that it meets."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
     glances = Glances([rule.mask for rule in movers], facts, lets)
@@ -178,14 +245,14 @@ def _check_moment(rules: list[Rule], facts: Facts, lets: dict[str, Expr]) -> Ite
             if answer:
                 yield (
                     _parity(_conflict(first, second), question, facts, lets),
-                    _in_words(facts, question, lets),
+                    example(facts, question, lets),
                 )
                 break
             if answer is None and undecided is None:
                 undecided = first
         else:
             if undecided is not None and not facts.budget.is_exhausted:
-                yield _undecided(_conflict(undecided, second)), ""
+                yield _undecided(_conflict(undecided, second)), {}
     plain: list[tuple[Assign, Expr | None]] = [
         (rule, rule.mask) for rule in rules if isinstance(rule, Assign)
     ]
@@ -217,7 +284,7 @@ def _meet(
 
 def _check_assigns(
     assigns: list[tuple[Assign, Expr | None]], facts: Facts, lets: dict[str, Expr]
-) -> Iterator[tuple[Conflict, str]]:
+) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
     """Two `:=` of one field must not meet in a cell with different values."""
     sets = [(assign, mask) for assign, mask in assigns if assign.op == ":=" and mask is not None]
     glances = Glances([mask for _, mask in sets], facts, lets)
@@ -231,21 +298,21 @@ def _check_assigns(
             question = ((first, HERE), (second, shift))
             answer = decide(facts, question, lets)
             if answer is not False and not facts.budget.is_exhausted:
-                message = f"two rules may assign `{a.field}` of one cell in the same moment"
+                message = f"{ASSIGN} `{a.field}` of one cell in the same moment"
                 conflict = Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
                 if answer:
-                    yield conflict, _in_words(facts, question, lets)
+                    yield conflict, example(facts, question, lets)
                 else:
-                    yield _undecided(conflict), ""
+                    yield _undecided(conflict), {}
                 break
 
 
 _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the left", (0, 1): "on the right"}
 
 
-def _in_words(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr]) -> str:
-    """What may stand where the conditions hold together, such as `x` here and `y` below."""
-    found = sorted(example(facts, conditions, lets).items())
+def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
+    """What may stand where two rules meet, such as `x` here and `y` below."""
+    found = sorted(elements.items())
     if not 0 < len(found) <= 4:
         return ""
     places = [

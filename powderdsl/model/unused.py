@@ -53,7 +53,7 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     them for others.
     """
     names = composition.names
-    words = {names.of(pack.name.text, word) for pack in composition.packs for word in _pack_words(pack)}
+    words = {names.of(pack.name.text, word) for pack in composition.packs for word in pack_words(pack)}
     for ruleset in composition.ruleset.lineage if composition.ruleset else ():
         words |= {word for line in ruleset.invariants for word in words_of(line)}
         words |= {scalar.text.removesuffix("?").partition(".")[0] for scalar in ruleset.matrix}
@@ -75,7 +75,7 @@ def _report_lets(block: Block, reporter: Reporter) -> None:
         _report_lets(inner, reporter)
 
 
-def _pack_words(pack: PackDecl) -> Iterator[str]:
+def pack_words(pack: PackDecl) -> Iterator[str]:
     """Every name in a pack's rules, sets, invariants, tests and color ramps."""
     for ramp in (*(one.ramp for one in pack.elements), *(one.ramp for one in pack.also)):
         if ramp is not None:

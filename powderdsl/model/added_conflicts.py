@@ -1,0 +1,168 @@
+"""Rules of one pack that meet only because of packs that somebody added: what becomes of them, and whose tags do it.
+
+The author of the rules could not know of the added packs, and who adds them cannot change the rules. So the rule that
+stands first holds, as with `conflicts: first_wins`, where that changes nothing for the packs that the author knew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from powderdsl.diagnostics import CompileError, Label, Reporter, Span
+from powderdsl.model.compose import Composition
+from powderdsl.model.types import Moment, Move, Transform
+from powderdsl.model.unused import pack_words
+
+CODES = ("PD501", "PD502")
+
+CheckAlone = Callable[[tuple[str, ...], Reporter], object]
+"""Checks some of the packs alone. Raises CompileError."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What an added pack does to an element: `tag` is a tag that it gives, or empty for the element itself."""
+
+    pack: str
+    element: str
+    tag: str
+    span: Span
+
+
+@dataclass
+class AddedPacks:
+    """Which packs were added to which, in the eyes of their authors."""
+
+    composition: Composition
+    check_alone: CheckAlone
+    _conflicts: dict[tuple[str, ...], frozenset[Span] | None] = field(default_factory=dict)
+
+    def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Given, ...]:
+        """What added packs do to some elements, if without them the rules of `pack` do not meet; else nothing.
+
+        Args:
+            place: where the conflict is reported. ids: elements with which the rules meet.
+        """
+        composition = self.composition
+        decl = next(one for one in composition.packs if one.name.text == pack)
+        words = frozenset(pack_words(decl))
+        scope = composition.scopes.of_pack(pack, sorted(words))
+        added = [one for one in composition.packs if one.name.text not in scope]
+        if not added:
+            return ()
+        known = self._conflicts_alone(scope)
+        if known is None or place in known:
+            return ()
+        names = {element.id: name for name, element in composition.elements.items()}
+        elements = [names[number] for number in dict.fromkeys(ids) if number in names]
+        return tuple(given for one in elements for given in self._given(one, scope, words))
+
+    def _conflicts_alone(self, scope: tuple[str, ...]) -> frozenset[Span] | None:
+        """Where rules of some packs alone meet; None if something else is wrong with them."""
+        if scope not in self._conflicts:
+            reporter = Reporter()
+            try:
+                self.check_alone(scope, reporter)
+            except CompileError as error:
+                found = error.diagnostics
+                wrong = [one for one in found if one.severity.value == "error" and one.code not in CODES]
+                places = frozenset(one.primary.span for one in found if one.primary.span is not None)
+                self._conflicts[scope] = None if wrong else places
+            else:
+                self._conflicts[scope] = frozenset()
+        return self._conflicts[scope]
+
+    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> Iterator[Given]:
+        """The tags that packs outside a scope give an element, of those that stand in some words; else the element."""
+        composition = self.composition
+        named = composition.element_decls[element]
+        listed = [(named.pack, named.decl.tags)]
+        for pack in composition.packs:
+            own = pack.name.text
+            listed += [
+                (own, also.tags)
+                for also in pack.also
+                if composition.element(also.element.text.removesuffix("?"), own) == element
+            ]
+        found = [
+            Given(pack, element, tag, scalar.span)
+            for pack, tags in listed
+            if pack not in scope
+            for scalar in tags
+            if (tag := composition.names.of(pack, scalar.text.removesuffix("?"))).rpartition(".")[2] in words
+        ]
+        if not found and named.pack not in scope:
+            found = [Given(named.pack, element, "", named.decl.name.span)]
+        yield from found
+
+
+def may_settle(moment: Moment) -> bool:
+    """Whether `first_wins` changes nothing where no two rules meet.
+
+    Moves may go where another one leaves, and transforms into one element may all have their effects: under the policy
+    they may not.
+    """
+    targets = [rule.target for rule in moment.rules if isinstance(rule, Transform)]
+    effects = [rule.target for rule in moment.rules if isinstance(rule, Transform) and rule.effects]
+    return all(targets.count(one) == 1 for one in effects) and not any(
+        isinstance(rule, Move) for rule in moment.rules
+    )
+
+
+def report_added(
+    code: str, rules: Sequence[Span], notes: Sequence[str], causes: Sequence[Given], pass_name: str, settled: bool,
+    assigns: bool, reporter: Reporter,
+) -> None:  # fmt: skip
+    """Report rules that meet because of added packs, at what these do: a warning where the conflict is settled.
+
+    Args:
+        rules: what the rules claim. assigns: whether they assign a field.
+    """
+    by_element: Mapping[str, list[Given]] = {
+        one.element: [given for given in causes if given.element == one.element] for one in causes
+    }
+    first, *more = causes
+    tags = [one.tag for one in by_element[first.element] if one.tag]
+    listed = " and ".join(
+        filter(None, [", ".join(f"`{tag}`" for tag in tags[:-1]), *(f"`{tag}`" for tag in tags[-1:])])
+    )
+    what = (
+        f"gives `{first.element}` the tag{'s' if len(tags) > 1 else ''} {listed}"
+        if tags
+        else f"adds `{first.element}`"
+    )
+    message = f"`{first.pack}` {what}: two rules of `{pass_name}` may claim one cell with it"
+    secondary = [
+        *(Label(one.span, "and this" if one.tag else "this element too") for one in more),
+        *(Label(span, "claims the cell" if number == 0 else "claims it too") for number, span in enumerate(dict.fromkeys(rules))),
+    ]  # fmt: skip
+    if tags:
+        alternatives = " or ".join(f"`{tag}`" for tag in tags)
+        helps = [
+            f"leave out {alternatives} here, if `{first.element}` need not be {'all of them' if len(tags) > 1 else 'that'}"
+        ]
+    else:
+        helps = [
+            f"give `{first.element}` other properties, so that it does not fulfil the conditions of both rules"
+        ]
+    if settled:
+        holds = (
+            "the assignment that stands last holds"
+            if assigns
+            else "the rule that stands first holds, as with `conflicts: first_wins`"
+        )
+        reporter.report(
+            "PD517",
+            message,
+            first.span,
+            "because of this",
+            secondary=secondary,
+            notes=[*notes, holds],
+            helps=helps,
+        )
+        return
+    helps.append(f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`")
+    reporter.error(
+        code, message, first.span, "because of this", secondary=secondary, notes=notes, helps=helps
+    )

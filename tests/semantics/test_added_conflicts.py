@@ -1,0 +1,145 @@
+"""Rules that meet only because of an added pack: the first one holds, and the pack's own line is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import powderdsl
+from powderdsl.compiler import load_with_diagnostics
+from powderdsl.diagnostics import CompileError, Diagnostic
+from powderdsl.model.types import Ruleset
+from powderdsl.testing.cases import random_start
+from powderdsl.testing.choices import Choices
+from tests.compilers import skip_without_compiler
+
+TREES = """\
+pack: trees
+tags: {wet: turns to mud, hot: turns to ash, loose: changes places}
+fields: {age: {type: 0..9, at: element}}
+elements:
+  air: {id: 0, color: "#FFFFFF", glyph: "."}
+  mud: {id: 1, color: "#806040"}
+  ash: {id: 2, color: "#606060"}
+  pond: {id: 3, color: "#3060A0", tags: wet}
+  coal: {id: 4, color: "#303030", tags: [hot, loose]}
+"""
+CHANGE = """\
+passes:
+  change:
+    do:
+      - wet -> mud if above is air
+      - hot -> ash if above is air
+"""
+GEYSER = """\
+pack: geyser
+needs: trees
+elements:
+  geyser: {color: "#A0C0FF", tags: [wet, hot]}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def load(passes: str, added: str, trees: str = TREES) -> tuple[Ruleset, list[Diagnostic]]:
+    Path("trees.yaml").write_text(trees + passes)
+    Path("added.yaml").write_text(added)
+    ruleset, found = load_with_diagnostics("trees.yaml+added.yaml")
+    return ruleset, [one for one in found if one.code == "PD517"]
+
+
+def refused(passes: str, added: str, trees: str = TREES) -> tuple[Diagnostic, ...]:
+    with pytest.raises(CompileError) as caught:
+        load(passes, added, trees)
+    return caught.value.diagnostics
+
+
+def under_caret(one: Diagnostic) -> tuple[str, str]:
+    span = one.primary.span
+    assert span is not None
+    return Path(span.source.name).name, span.text
+
+
+@pytest.mark.parametrize("backend", ["reference", "dense", "planes", "native"])
+def test_the_rule_that_stands_first_holds(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
+    skip_without_compiler(backend)
+    ruleset, (warning,) = load(CHANGE, GEYSER)
+    assert under_caret(warning) == ("added.yaml", "wet")
+    assert [label.span.text for label in warning.secondary if label.span] == [
+        "hot",
+        "wet -> mud",
+        "hot -> ash",
+    ]
+    sim = powderdsl.compile(ruleset, backend=backend)
+    geyser = ruleset.element("geyser")
+    assert geyser is not None
+    world = sim.world([[[0, 0, 0], [geyser.id, 3, 4]]])
+    assert sim.step(world).ids[0, 1].tolist() == [1, 1, 2]
+
+
+def test_other_worlds_run_as_before(torch) -> None:  # type: ignore[no-untyped-def]
+    """Where none of the added pack's elements stand, a step is that of the packs alone."""
+    swaps = CHANGE.replace(
+        "hot -> ash if above is air", "loose swaps below if below is (air, wet) and not (wet or above is wet)"
+    )
+    for passes in (CHANGE, swaps):
+        ruleset, found = load(passes, GEYSER.replace("hot", "hot, loose"))
+        alone = powderdsl.load("trees.yaml")
+        one, other = (powderdsl.compile(rules, backend="reference") for rules in (ruleset, alone))
+        start = random_start(alone, Choices.seeded(3), (8, 20, 20))
+        ids = np.asarray(start.world(other).ids)
+        pair = [sim.step(sim.world(ids, seed=5), steps=4).ids for sim in (one, other)]
+        assert torch.equal(*pair)
+        assert found or passes is swaps
+
+
+def test_a_tag_for_an_element_of_the_pack_itself() -> None:
+    ruleset, (warning,) = load(CHANGE, "pack: kiln\nneeds: trees\nalso:\n  pond: hot\n")
+    assert under_caret(warning) == ("added.yaml", "hot")
+    assert "`kiln` gives `pond` the tag `hot`" in warning.message
+    assert any("leave out `hot`" in one for one in warning.helps)
+    assert ruleset.passes[0].moments[0].policy == "first_wins"
+
+
+def test_of_two_assignments_the_last_holds(torch) -> None:  # type: ignore[no-untyped-def]
+    passes = "passes:\n  count:\n    do:\n      - age := 3 where wet\n      - age := 5 where hot\n"
+    ruleset, (warning,) = load(passes, GEYSER)
+    assert any("stands last" in one for one in warning.notes)
+    geyser = ruleset.element("geyser")
+    assert geyser is not None
+    for backend in ("reference", "dense", "planes"):
+        sim = powderdsl.compile(ruleset, backend=backend)
+        assert sim.step(sim.world([[[geyser.id, 3, 4, 0]]]))["age"][0, 0].tolist() == [5, 3, 5, 0]
+
+
+def test_packs_that_know_each_other_conflict_as_before() -> None:
+    both = TREES.replace("tags: wet}", "tags: [wet, hot]}")
+    assert [one.code for one in refused(CHANGE, GEYSER, both) if one.code != "PD504"][:1] == ["PD502"]
+    knows = CHANGE + "      - geyser? -> ash if below is geyser?\n"
+    assert {one.code for one in refused(knows, GEYSER)} >= {"PD502"}
+    load(CHANGE, GEYSER)
+    Path("geyser.yaml").write_text(GEYSER)
+    Path("grove.yaml").write_text("ruleset: grove\npacks: [trees, geyser]\n")
+    with pytest.raises(CompileError) as caught:
+        powderdsl.load("grove.yaml")
+    assert "PD502" in {one.code for one in caught.value.diagnostics}
+
+
+def test_where_a_policy_would_change_more_the_tag_is_an_error() -> None:
+    moving = CHANGE.replace(
+        "hot -> ash if above is air", "hot moves below leaving air if below is air and above is air"
+    )
+    errors = [one for one in refused(moving, GEYSER) if one.code == "PD501"]
+    assert [under_caret(one) for one in errors] == [("added.yaml", "wet")]
+    assert any("leave out `wet` or `hot`" in one for one in errors[0].helps)
+    effects = CHANGE.replace(
+        "wet -> mud if above is air",
+        "wet -> mud if above is air, then age += 1\n      - wet -> mud if below is air, then age += 1",
+    )
+    errors = [one for one in refused(effects, GEYSER) if one.code == "PD502"]
+    assert {under_caret(one) for one in errors} == {("added.yaml", "wet")}
