@@ -109,6 +109,7 @@ class _StudyCheck:
         for values in self.places.values(used):
             words = self.places.words(step, values)
             given = self.converted(step, words)
+            self.device(step, words)
             if step.command == ("train",):
                 self.train(step, words, given)
             elif step.command == ("evaluate",):
@@ -185,6 +186,15 @@ class _StudyCheck:
         return found
 
     # What commands ask for
+
+    def device(self, step: Step, words: Words) -> None:
+        """Whether the machine has the device of a step, which all of its runs would need."""
+        from powderdsl.programs import find_device
+
+        word = _first(words, "device")
+        if word is not None and not self.asked(step.name, "device", word.filled):
+            with self.told(word, step):
+                find_device(word.filled)
 
     def task(self, step: Step, word: Word | None, text: str) -> Task | None:
         """The task of some words; None after reporting that there is none."""

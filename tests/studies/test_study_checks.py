@@ -107,6 +107,11 @@ def test_shipped_studies_pass(name: str) -> None:
         (MODELS, "elements: $elements", "elements: $elements, chances: 3", "PD806", "3"),
         (MODELS, "elements: $elements", "elements: $elements, rulesets: 2, chances: 0.5", "PD806", "0.5"),
         (MODELS, "elements: $elements", "elements: $elements, chance: 3", "PD806", "chance"),
+        (AGENTS, "preset: $size", "device: cdua", "PD701", "cdua"),
+        (AGENTS, "preset: $size", "device: meta", "PD701", "meta"),
+        (AGENTS, "episodes: 4", "device: cuda:99", "PD701", "cuda:99"),
+        (MODELS, "iterations: 5", "device: gpu", "PD701", "gpu"),
+        (MODELS, "split: held_out", "device: [cpu, cdua]", "PD806", "cdua"),
         # names in tasks and rules
         (AGENTS, "lines: 2", "lines: 999", "PD803", "999"),
         (AGENTS, "knob: lines=$lines", "knob: lnies=$lines", "PD803", "2"),
