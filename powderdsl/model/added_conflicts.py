@@ -22,11 +22,15 @@ CheckAlone = Callable[[tuple[str, ...], Reporter], object]
 
 @dataclass(frozen=True)
 class Given:
-    """What an added pack does to an element: `tag` is a tag that it gives, or empty for the element itself."""
+    """What an added pack does to an element: `word` is a tag or a value that it gives, or empty for the element itself.
+
+    `noun` says which: ``tag`` or ``value``.
+    """
 
     pack: str
     element: str
-    tag: str
+    noun: str
+    word: str
     span: Span
 
 
@@ -74,26 +78,30 @@ class AddedPacks:
         return self._conflicts[scope]
 
     def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> Iterator[Given]:
-        """The tags that packs outside a scope give an element, of those that stand in some words; else the element."""
+        """What packs outside a scope give an element: tags that stand in some words, else such values, else itself."""
         composition = self.composition
         named = composition.element_decls[element]
-        listed = [(named.pack, named.decl.tags)]
+        entries = [(named.pack, named.decl.tags, named.decl.values)]
         for pack in composition.packs:
             own = pack.name.text
-            listed += [
-                (own, also.tags)
+            entries += [
+                (own, also.tags, also.values)
                 for also in pack.also
                 if composition.element(also.element.text.removesuffix("?"), own) == element
             ]
-        found = [
-            Given(pack, element, tag, scalar.span)
-            for pack, tags in listed
-            if pack not in scope
-            for scalar in tags
-            if (tag := composition.names.of(pack, scalar.text.removesuffix("?"))).rpartition(".")[2] in words
-        ]
+        tags = [("tag", pack, tag) for pack, given, _ in entries for tag in given]
+        values = [("value", pack, key) for pack, _, given in entries for key, _ in given]
+        found: list[Given] = []
+        for several in (tags, values):
+            found = found or [
+                Given(pack, element, noun, name, scalar.span)
+                for noun, pack, scalar in several
+                if pack not in scope
+                and (name := composition.names.of(pack, scalar.text.removesuffix("?"))).rpartition(".")[2]
+                in words
+            ]
         if not found and named.pack not in scope:
-            found = [Given(named.pack, element, "", named.decl.name.span)]
+            found = [Given(named.pack, element, "", "", named.decl.name.span)]
         yield from found
 
 
@@ -123,28 +131,23 @@ def report_added(
         one.element: [given for given in causes if given.element == one.element] for one in causes
     }
     first, *more = causes
-    tags = [one.tag for one in by_element[first.element] if one.tag]
-    listed = " and ".join(
-        filter(None, [", ".join(f"`{tag}`" for tag in tags[:-1]), *(f"`{tag}`" for tag in tags[-1:])])
-    )
+    words = [f"`{one.word}`" for one in by_element[first.element] if one.word]
+    listed = " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+    several = "s" if len(words) > 1 else ""
     what = (
-        f"gives `{first.element}` the tag{'s' if len(tags) > 1 else ''} {listed}"
-        if tags
-        else f"adds `{first.element}`"
+        f"gives `{first.element}` the {first.noun}{several} {listed}" if words else f"adds `{first.element}`"
     )
     message = f"`{first.pack}` {what}: two rules of `{pass_name}` may claim one cell with it"
     secondary = [
-        *(Label(one.span, "and this" if one.tag else "this element too") for one in more),
+        *(Label(one.span, "and this" if one.word else "this element too") for one in more),
         *(Label(span, "claims the cell" if number == 0 else "claims it too") for number, span in enumerate(dict.fromkeys(rules))),
     ]  # fmt: skip
-    if tags:
-        alternatives = " or ".join(f"`{tag}`" for tag in tags)
-        helps = [
-            f"leave out {alternatives} here, if `{first.element}` need not be {'all of them' if len(tags) > 1 else 'that'}"
-        ]
+    if first.noun == "tag":
+        needless = "all of them" if several else "that"
+        helps = [f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"]
     else:
         helps = [
-            f"give `{first.element}` other properties, so that it does not fulfil the conditions of both rules"
+            f"give `{first.element}` other values, so that it does not fulfil the conditions of both rules"
         ]
     if settled:
         holds = (

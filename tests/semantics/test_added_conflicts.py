@@ -143,3 +143,29 @@ def test_where_a_policy_would_change_more_the_tag_is_an_error() -> None:
     )
     errors = [one for one in refused(effects, GEYSER) if one.code == "PD502"]
     assert {under_caret(one) for one in errors} == {("added.yaml", "wet")}
+
+
+def test_a_value_of_an_added_pack() -> None:
+    trees = TREES.replace("fields:", "properties: {heat: 0..9}\nfields:")
+    passes = CHANGE.replace("hot ->", "heat > 5 ->")
+    for added, caret, words in (
+        ("also:\n  pond: {heat: 7}\n", "heat", "gives `pond` the value `heat`"),
+        (
+            'elements:\n  lye: {color: "#A0C0FF", heat: 7}\nalso:\n  lye: wet\n',
+            "wet",
+            "gives `lye` the tag `wet`",
+        ),
+    ):
+        _, (warning,) = load(passes, f"pack: kiln\nneeds: trees\n{added}", trees)
+        assert under_caret(warning) == ("added.yaml", caret)
+        assert words in warning.message
+    _, (warning,) = load(
+        CHANGE.replace("wet ->", "any but (mud, ash, coal) ->"),
+        "pack: kiln\nneeds: trees\nalso: {air: hot}\n",
+    )
+    assert under_caret(warning) == ("added.yaml", "hot")
+    either = CHANGE.replace("wet ->", "any but (air, mud, ash, coal, pond) ->").replace(
+        "hot ->", "any but (air, mud, ash, coal, pond) ->"
+    )
+    _, (warning,) = load(either, 'pack: kiln\nneeds: trees\nelements: {lye: {color: "#A0C0FF"}}\n')
+    assert under_caret(warning) == ("added.yaml", "lye")
