@@ -25,6 +25,9 @@ MAX_REPORTED = 8
 MAX_COLORS = 1 << 16
 """Wrong colors that are counted. A picture with more has more of them below."""
 
+CHUNK = 1 << 20
+"""Pixels that are looked up at once: more would take memory."""
+
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 """Pixel formats of eight bits or fewer: those with more have colours that no element can have."""
 
@@ -48,10 +51,12 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
     ids, known = np.zeros(packed.shape, np.uint8), np.zeros(packed.shape, np.bool_)
     clear = {color: owned[0].id for color, owned in sorted(owners.items()) if len(owned) == 1}
     colors, meant = np.array([*clear], dtype=np.uint32), np.array([*clear.values()], dtype=np.uint8)
-    for row, line in enumerate(packed if clear else ()):
-        place = np.searchsorted(colors, line).clip(max=len(colors) - 1)
-        known[row] = colors[place] == line
-        ids[row] = np.where(known[row], meant[place], 0)
+    cells = packed.reshape(-1)
+    for first in range(0, len(cells) if clear else 0, CHUNK):
+        part = slice(first, first + CHUNK)
+        place = np.searchsorted(colors, cells[part]).clip(max=len(colors) - 1)
+        found = colors[place] == cells[part]
+        known.reshape(-1)[part], ids.reshape(-1)[part] = found, np.where(found, meant[place], 0)
     if not known.all():
         raise CompileError(_wrong_colors(path, packed, known, owners))
     return ids

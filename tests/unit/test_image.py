@@ -6,6 +6,7 @@ import struct
 import tracemalloc
 import zlib
 from dataclasses import replace
+from time import process_time
 
 import numpy as np
 import pytest
@@ -182,3 +183,13 @@ def test_a_damaged_file_gives_a_world_or_a_diagnostic(tmp_path, data):
     except CompileError as error:
         codes = {one.code for one in error.diagnostics}
     assert codes <= {"PD602", "PD607", "PD609"}
+
+
+@pytest.mark.parametrize("shape", [(1100, 1000), (1 << 21, 1)])
+def test_large_pictures_are_read_in_parts(tmp_path, shape) -> None:
+    ids = np.random.default_rng(3).integers(0, len(ELEMENTS), shape).astype(np.uint8)
+    path = tmp_path / "large.png"
+    write_png(path, rgb(ids, palette(ELEMENTS)))
+    begun = process_time()
+    assert np.array_equal(read_image(path, ELEMENTS), ids)
+    assert process_time() - begun < 3  # not a round of Python for each row
