@@ -37,14 +37,19 @@ class Undecided(Exception):
 
 
 @dataclass(frozen=True)
-class Cells:
-    """What is known of cells: values that an input can hold, and inputs that some elements alone can hold.
+class Holders:
+    """The elements whose cells can hold anything in a slot, and by id what cells of the others hold there."""
 
-    `holders` are ids and the value elsewhere, by slot.
-    """
+    ids: frozenset[int]
+    usual: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Cells:
+    """What is known of cells: values that an input can hold, and inputs that some elements alone are free to hold."""
 
     domains: Mapping[str, tuple[int, ...]]
-    holders: Mapping[str, tuple[frozenset[int], int]]
+    holders: Mapping[str, Holders]
 
 
 @dataclass
@@ -341,9 +346,9 @@ def _domain(
         raise Undecided
     asked = set(uses)
     if slot == "element":
-        for other, (ids, _) in cells.holders.items():
+        for other, holders in cells.holders.items():
             if ("input", other, name[2]) in all_uses:
-                asked.add(("in_set", ids))
+                asked |= {("in_set", holders.ids), ("table", holders.usual)}
     if "value" in asked:
         return values
     kinds: dict[tuple[object, ...], int] = {}
@@ -361,13 +366,14 @@ def _answer(value: int, op: str, attr: Any) -> object:
 
 
 def _valid(table: Mapping[Variable, Array], cells: Cells, size: int) -> Array:
-    """The cases that can be: where an element cannot hold a value, there is the usual one."""
+    """The cases that can be: where an element is not free to hold a value, there is the usual one."""
     valid = np.ones(size, bool)
     for name, values in table.items():
         element = table.get(("input", "element", name[2])) if name[0] == "input" else None
         if element is not None and name[1] in cells.holders:
-            ids, usual = cells.holders[str(name[1])]
-            valid &= np.isin(element, sorted(ids)) | (values == usual)
+            holders = cells.holders[str(name[1])]
+            usual = np.asarray(holders.usual, np.int32)[element]
+            valid &= np.isin(element, sorted(holders.ids)) | (values == usual)
     return valid
 
 

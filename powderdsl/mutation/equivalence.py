@@ -6,7 +6,7 @@ from powderdsl.ir.lower import lower_moment, lower_pass, plane_names
 from powderdsl.ir.ops import Graph, Node
 from powderdsl.model.state import slots
 from powderdsl.model.types import Pass, Ruleset
-from powderdsl.mutation.equal_nodes import Cells, Comparison
+from powderdsl.mutation.equal_nodes import Cells, Comparison, Holders
 
 
 def proven_equal(first: Ruleset, second: Ruleset) -> bool:
@@ -42,15 +42,20 @@ def _same_worlds(first: Ruleset, second: Ruleset) -> bool:
 def _cells(ruleset: Ruleset) -> Cells:
     ids = tuple(element.id for element in ruleset.elements)
     domains: dict[str, tuple[int, ...]] = {}
-    holders: dict[str, tuple[frozenset[int], int]] = {}
+    holders: dict[str, Holders] = {}
     for slot in slots(ruleset):
         if slot.is_real:
             continue
         (name,) = plane_names(slot)
+        prop = ruleset.property(slot.name)
         if slot.kind.name == "element":
             domains[name] = ids
-        if slot.of is not None and not slot.own:
-            holders[name] = slot.of, int(slot.default)
+        if prop is not None and slot.kind.name in ("int", "flag"):
+            holders[name] = Holders(
+                prop.stored, tuple(int(value) if isinstance(value, int) else 0 for value in prop.values)
+            )
+        elif slot.of is not None and not slot.own:
+            holders[name] = Holders(slot.of, (int(slot.default),) * (max(ids) + 1))
     return Cells(domains, holders)
 
 

@@ -61,6 +61,10 @@ SAME = {
         "let: {wet: damp > 2}\ndo: soil -> moss if wet",
         "let: {wet: damp > 2}\ndo: soil -> moss if damp > 2 or wet",
     ),
+    "a property that cells of other elements hold one by one": (
+        "do: rock -> soil if weight == 3 and above is moss\nthen: weight := 1 where moss",
+        "do: rock -> soil if above is moss\nthen: weight := 1 where moss",
+    ),
     "a condition beside a count of more than can be tried": (
         "do: soil -> moss if count(damp > 4 and age == 1) > 2 and weight < 2",
         "do: soil -> moss if count(damp > 4 and age == 1) > 2",
@@ -87,6 +91,10 @@ OTHER = {
     "the cell itself is counted, among more than can be tried": (
         "do: moss -> soil if count((damp > 4 and age == 1) in ring) == 2",
         "do: moss -> soil if count(damp > 4 and age == 1) == 2",
+    ),
+    "a property that cells hold one by one": (
+        "do: moss -> soil if weight == 2\nthen: weight := 1 where moss and above is rock",
+        "do: moss -> soil\nthen: weight := 1 where moss and above is rock",
     ),
     "a count of more than can be tried": (
         "do: moss -> soil if count(damp > 4 and age == 1) == 2",
