@@ -48,6 +48,12 @@ def test_the_table_is_about_what_is_shipped():
     assert set(measured()) <= set(table().compositions())
 
 
+def test_every_pack_is_in_the_table():
+    assert {rules: list(entry["packs"]) for rules, entry in measured().items()} == {
+        rules: table().packs_of(rules) for rules in table().compositions()
+    }
+
+
 def test_the_counts_of_a_pack_are_kept_when_others_are_counted_again():
     old, new = {"mutants": 3}, {"mutants": 4}
     measured = {"life": {"packs": {"life": old}}, "powderworld": {"packs": {"lava": old, "sand": old}}}
