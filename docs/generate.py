@@ -17,8 +17,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
-from powderdsl.cli.commands import COMMANDS
+from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.compiler import MAX_BASES, shipped_rules
+from powderdsl.ir.stages import PIPELINE
 from powderdsl.model.builtins import (
     DIRECTION_SETS,
     DIRECTIONS,
@@ -32,17 +33,16 @@ from powderdsl.model.builtins import (
     RESERVED,
     shaped_kernel,
 )
+from powderdsl.model.composition.pass_order import MAX_PASSES
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
-from powderdsl.model.expressions import MAX_ROUNDS, MAX_SET_DEPTH
-from powderdsl.model.pass_order import MAX_PASSES
+from powderdsl.model.expressions.typer import MAX_ROUNDS, MAX_SET_DEPTH
 from powderdsl.model.schema import KEYS, MAX_NAME, OPEN
 from powderdsl.model.text import show_offset
 from powderdsl.model.types import Kernel
-from powderdsl.passes import PIPELINE
 from powderdsl.syntax import parse, yaml_tree
 from powderdsl.syntax.parse import reserved_words
-from powderdsl.tasks.task_keys import TASK_KEYS
+from powderdsl.tasks.keys import TASK_KEYS
 from powderdsl.worlds.scene.read import FILE_KEYS, SCENE_KEYS
 from powderdsl.worlds.scene.statements import SETTING, STATEMENTS
 
@@ -185,9 +185,9 @@ def scene_statements() -> str:
 
 def tasks() -> str:
     """The tasks that come with powderdsl: what may be placed, how often, and their knobs."""
-    from powderdsl.tasks.shipped_tasks import load_task
+    from powderdsl.tasks.names import shipped_tasks
+    from powderdsl.tasks.shipped import load_task
     from powderdsl.tasks.task import BLOW, NO_CHANGE
-    from powderdsl.tasks.task_names import shipped_tasks
 
     rows = []
     for name in shipped_tasks():
@@ -229,7 +229,7 @@ def mutations() -> str:
 
 
 def mutation_operators() -> str:
-    from powderdsl.mutation.mutants import OPERATORS
+    from powderdsl.testing.mutation.mutants import OPERATORS
 
     return table(
         ("mistake", "what is written instead"), ((f"`{n}`", about) for n, about in OPERATORS.items())
@@ -238,7 +238,7 @@ def mutation_operators() -> str:
 
 def mutation_testing() -> str:
     """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
-    from powderdsl.mutation.tally import COUNTED, by_hand_share, noticed_share
+    from powderdsl.testing.mutation.tally import COUNTED, by_hand_share, noticed_share
 
     path = DOCS / "mutation.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}

@@ -43,7 +43,7 @@ Counts = dict[str, dict[str, int]]
 
 def packs_of(rules: str) -> list[str]:
     """The packs of a composition that are mutated, in their order."""
-    from powderdsl.mutation.original import Original
+    from powderdsl.testing.mutation.original import Original
 
     only = compositions()[rules]
     return list(dict.fromkeys(mutant.pack for mutant in Original.of(rules).mutants(frozenset(only))))
@@ -54,9 +54,9 @@ def count(rules: str, packs: Sequence[str], jobs: int, worlds: bool = False) -> 
 
     `worlds`: also look for worlds that show survivors, which takes longer.
     """
-    from powderdsl.mutation.mutation_run import Outcome, run_campaign
-    from powderdsl.mutation.original import Original
-    from powderdsl.mutation.tally import tally
+    from powderdsl.testing.mutation.original import Original
+    from powderdsl.testing.mutation.run import Outcome, run_campaign
+    from powderdsl.testing.mutation.tally import tally
 
     mutants = Original.of(rules).mutants(frozenset(packs))
     left = Counter(mutant.pack for mutant in mutants)

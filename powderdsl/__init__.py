@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from powderdsl.moved import find_old_names
+
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from powderdsl.analysis.ledger.book import ledger
     from powderdsl.compiler import load
     from powderdsl.diagnostics import CompileError
-    from powderdsl.ledgers.book import ledger
-    from powderdsl.simulator import Simulator, World, compile
+    from powderdsl.simulation.simulator import Simulator, World, compile
     from powderdsl.worlds.store import load_world, save
+
+find_old_names()
 
 _HOMES = {
     "load": "powderdsl.compiler",
-    "compile": "powderdsl.simulator",
+    "compile": "powderdsl.simulation.simulator",
     "CompileError": "powderdsl.diagnostics",
-    "ledger": "powderdsl.ledgers.book",
-    "Simulator": "powderdsl.simulator",
-    "World": "powderdsl.simulator",
+    "ledger": "powderdsl.analysis.ledger.book",
+    "Simulator": "powderdsl.simulation.simulator",
+    "World": "powderdsl.simulation.simulator",
     "save": "powderdsl.worlds.store",
     "load_world": "powderdsl.worlds.store",
 }

@@ -1,6 +1,6 @@
 """The sequence: text → located tree → checked model → IR → passes → program. Each stage takes one value and gives one.
 
-`load` stops at the checked model, `lower` at optimised IR; neither needs torch. `simulator.compile` goes on from there.
+`load` stops at the checked model, `lower` at optimised IR; neither needs torch. `simulation.simulator.compile` goes on from there.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.bounded_files import inside, is_path
+from powderdsl.analysis.outgrown import with_outgrown
 from powderdsl.diagnostics import Label, Reporter, Severity, Span, suggest
 from powderdsl.model.check import check
-from powderdsl.model.compose import compose
+from powderdsl.model.composition.compose import compose
+from powderdsl.model.composition.layout import own_slots
+from powderdsl.model.composition.optional_names import words_of_tree
+from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl
-from powderdsl.model.layout import own_slots
-from powderdsl.model.optional_names import words_of_tree
-from powderdsl.model.outgrown import with_outgrown
 from powderdsl.model.packs import read_file
-from powderdsl.model.palette import Palette
 from powderdsl.model.types import Kind, Param, Ruleset, Value
 from powderdsl.syntax.sources import path_beside, read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.system.reading import inside, is_path
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
@@ -465,7 +465,7 @@ def param_value(param: Param, value: Any) -> Value:
 
 def lower(ruleset: Ruleset) -> Program:
     """The checked model as optimised IR."""
-    from powderdsl.ir.lower import lower_ruleset
-    from powderdsl.passes import run_passes
+    from powderdsl.ir.lower.rules import lower_ruleset
+    from powderdsl.ir.stages import run_passes
 
     return run_passes(lower_ruleset(ruleset))

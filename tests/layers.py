@@ -4,69 +4,101 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_MODEL = ("bounded_files", "diagnostics", "syntax", "model")
-_COMPILER = (*_MODEL, "reference", "ir", "passes", "backends", "compiler")
-_PROGRAMS = ("programs", "native_start", "auto_program")
-_STEPS = ("observe", "state_checks", "simulator", "provenance")
-_SCREEN = (*_COMPILER, *_PROGRAMS, "draw", *_STEPS, "tracing", "worlds", "media", "terminal")
-_TESTING = (*_SCREEN, "ledgers", "pack_test_fields", "pack_test_chances", "pack_tests", "testing")
-_AFTER = ("bench", "tasks", "envs", "runs", "datasets", "rl", "worldmodel", "studies", "web", "cli")
-_EVERYTHING = (*_TESTING, "properties", "mutation", "pytest_plugin", *_AFTER)
+_FRONT = ("diagnostics", "system", "syntax", "model")
+_COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
+_TARGETS = ("targets", "targets.dense", "targets.planes", "targets.arrays", "targets.cpp", "targets.cuda")
+_BACK = (*_COMPILER, "model.reference", *_TARGETS)
+_STEPS = (
+    "simulation.draw",
+    "simulation.state_checks",
+    "simulation.programs",
+    "simulation.views",
+    "simulation.observe",
+    "simulation.simulator",
+)
+_SIMULATION = (*_STEPS, "simulation.provenance", "simulation.tracing", "simulation.media")
+_WORLDS = ("worlds", "worlds.store")
+_SCREEN = (*_BACK, *_SIMULATION, *_WORLDS)
+_TESTING = (
+    "testing.generators",
+    "testing.strategies",
+    "testing.pack_tests",
+    "testing.fuzz",
+    "testing.properties",
+)
+_LEARNING = (
+    "experiments.runs",
+    "tasks",
+    "tasks.tensors",
+    "tasks.episodes",
+    "envs",
+    "datasets",
+    "rl",
+    "worldmodel",
+)
 
 LAYERS: dict[str, tuple[str, ...]] = {
-    # module or pattern: what it may import besides its own package. The longest row that fits counts.
-    "user_cache": (),
-    "scratch": (),
-    "interrupts": (),
-    "bounded_files": (),
+    # A row is a package with all that lies in it, or a module; the longest row that fits a module is its own. It may
+    # import from its own row and from the rows named beside it, all of them further up.
+    "moved": (),
     "diagnostics": (),
-    "syntax": ("bounded_files", "diagnostics", "user_cache"),
+    "system": ("diagnostics",),
+    "syntax": ("diagnostics", "system"),
     "model": ("diagnostics", "syntax"),
-    "ledgers": _MODEL,  # decides from the model alone: no world is run
-    "reference": _MODEL,  # never ir: an oracle that shares the lowering cannot see a bug in it
+    "model.reference": _FRONT,  # never ir: an oracle that shares the lowering cannot see a bug in it
+    "analysis": _FRONT,  # decides from the model alone: no world is run
     "ir": ("diagnostics",),
-    "ir.lower*": _MODEL,  # the one door from the model into the IR
-    "passes": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
-    "backends": ("bounded_files", "diagnostics", "ir", "user_cache", "scratch", "interrupts"),
+    "ir.stages": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
+    "ir.lower": (*_FRONT, "analysis", "ir"),  # the one door from the model into the IR
+    "schedule": ("diagnostics", "ir"),
+    "targets": ("diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
+    "targets.dense": ("diagnostics", "ir", "schedule", "targets"),
+    "targets.planes": ("diagnostics", "ir", "schedule", "targets", "targets.dense"),
+    "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.dense", "targets.planes"),
+    "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense"),
+    "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense", "targets.cpp"),
     "compiler": _COMPILER[:-1],
-    "native_start": _COMPILER,
-    "auto_program": _COMPILER,
-    "programs": (*_COMPILER, "native_start", "auto_program"),
-    "draw": _MODEL,
-    "observe": (*_COMPILER, "draw"),
-    "state_checks": _MODEL,
-    "simulator": (*_COMPILER, "programs", "observe", "state_checks"),
-    "provenance": (*_MODEL, "simulator"),
-    "tracing": (*_MODEL, "reference", "provenance", "simulator"),  # explains by what the oracle does
-    "worlds": (*_MODEL, "scratch", "draw"),
-    "worlds.store": (*_MODEL, "simulator"),  # saved worlds are values of the simulator
-    "media": (*_SCREEN[: _SCREEN.index("media")], "interrupts"),
-    "terminal": _SCREEN[: _SCREEN.index("terminal")],
-    "pack_test_fields": _SCREEN,
-    "pack_test_chances": _SCREEN,
-    "pack_tests": (*_SCREEN, "pack_test_fields", "pack_test_chances"),
-    "testing": (*_SCREEN, "ledgers", "pack_tests", "scratch", "interrupts"),
-    "properties": (*_TESTING, "user_cache"),
-    "mutation": (*_TESTING, "properties"),
-    "pytest_plugin": (*_TESTING, "properties"),
-    "bench": _SCREEN,
-    "tasks": (*_COMPILER, "simulator", "worlds"),
-    "envs": (*_SCREEN, "tasks"),
-    "runs": ("bounded_files", "diagnostics", "worlds", "scratch"),
-    "datasets": (*_SCREEN, "tasks", "envs", "runs"),
-    "rl": (*_SCREEN, "tasks", "envs", "runs"),
-    "worldmodel": (*_SCREEN, "tasks", "runs", "interrupts"),
-    "studies": (
-        *_MODEL,
-        "compiler",
-        "worlds",
-        "runs",
-        "bench",
-        "interrupts",
-    ),  # calls commands, in processes of their own
-    "web": _SCREEN,
-    "cli": (*_EVERYTHING[:-1], "user_cache", "scratch", "interrupts"),
-    "__init__": _EVERYTHING,  # the public names, imported when they are asked for
+    "simulation": (),
+    "simulation.draw": _FRONT,
+    "simulation.state_checks": _FRONT,
+    "simulation.native_start": _BACK,
+    "simulation.auto": _BACK,
+    "simulation.programs": (*_BACK, "simulation.native_start", "simulation.auto"),
+    "simulation.views": ("targets", "targets.cpp"),
+    "simulation.observe": (*_BACK, "simulation.draw", "simulation.views"),
+    "simulation.simulator": (*_BACK, "simulation.programs", "simulation.observe", "simulation.state_checks"),
+    "simulation.provenance": (*_FRONT, "simulation.simulator"),
+    "simulation.tracing": (
+        *_FRONT,
+        "model.reference",
+        "simulation.provenance",
+        "simulation.simulator",
+    ),  # explains by what the oracle does
+    "simulation.media": ("system", "simulation.draw"),
+    "worlds": (*_FRONT, "analysis", "simulation.draw"),
+    "worlds.store": (*_FRONT, "worlds", "simulation.simulator"),  # saved worlds are values of the simulator
+    "testing.generators": _SCREEN,
+    "testing.strategies": (*_SCREEN, "testing.generators"),
+    "testing": ("testing.strategies",),  # the public names
+    "testing.pack_tests": _SCREEN,
+    "testing.fuzz": (*_SCREEN, "testing.generators"),
+    "testing.properties": (*_SCREEN, *_TESTING[:-1]),
+    "testing.mutation": (*_SCREEN, *_TESTING),
+    "testing.pytest_plugin": (*_SCREEN, *_TESTING),
+    "experiments": (),
+    "experiments.bench": _SCREEN,
+    "experiments.runs": ("diagnostics", "system"),
+    "tasks": (*_FRONT, "compiler", "worlds"),
+    "tasks.tensors": (*_BACK, "simulation.simulator", "worlds", "tasks"),
+    "tasks.episodes": (*_BACK, "simulation.simulator", "tasks", "tasks.tensors"),
+    "envs": (*_SCREEN, "tasks", "tasks.episodes"),
+    "datasets": (*_SCREEN, *_LEARNING[:5]),
+    "rl": (*_SCREEN, *_LEARNING[:5]),
+    "worldmodel": (*_SCREEN, *_LEARNING[:4]),
+    # Calls commands, in processes of their own.
+    "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
+    "cli": (*_SCREEN, *_TESTING, "testing.mutation", *_LEARNING, "experiments.bench", "experiments.studies"),
+    "__init__": ("moved", *_SCREEN),  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }
 
@@ -81,15 +113,28 @@ class Home:
 
 _TEXT = ("syntax", "worlds.scene")
 _TORCH = (
-    "*.torch_*",
-    *_PROGRAMS,
-    *_STEPS,
-    "testing",
-    "mutation",
+    "targets.job",
+    "targets.laps",
+    "targets.random",
+    "targets.words",
+    "targets.dense.mixed",
+    "targets.*.program",
+    "simulation.native_start",
+    "simulation.auto",
+    "simulation.programs",
+    "simulation.views",
+    "simulation.observe",
+    "simulation.state_checks",
+    "simulation.simulator",
+    "simulation.provenance",
+    "testing.generators",
+    "testing.fuzz",
+    "testing.mutation",
+    "tasks.tensors",
     "tasks.episodes",
     "envs",
     "datasets",
-    "runs",
+    "experiments.runs",
     "worldmodel",
     "rl",
 )
@@ -97,10 +142,19 @@ THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
     "lark": Home(_TEXT, _TEXT),
     "torch": Home(
-        (*_TORCH, "worlds.store", "draw", "media", "terminal", "pack_tests", "bench", "web", "cli"), _TORCH
+        (
+            *_TORCH,
+            "worlds.store",
+            "simulation.draw",
+            "simulation.media",
+            "testing.pack_tests",
+            "experiments.bench",
+            "cli",
+        ),
+        _TORCH,
     ),
     "gymnasium": Home(("envs", "rl"), ("envs", "rl")),
     "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
     "click": Home(("cli",), ("cli",)),
-    "matplotlib": Home(("bench", "studies", "cli"), ()),
+    "matplotlib": Home(("experiments.bench", "experiments.studies", "cli"), ()),
 }

@@ -31,8 +31,8 @@ from click.testing import CliRunner
 from powderdsl.compiler import load, load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.model.types import Ruleset
-from powderdsl.pack_tests import run_examples
-from powderdsl.tasks.shipped_tasks import load_task_with_diagnostics
+from powderdsl.tasks.shipped import load_task_with_diagnostics
+from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.worlds.scene import load_start
 
 ROOT = Path(__file__).resolve().parents[1]

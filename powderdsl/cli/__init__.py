@@ -1,5 +1,5 @@
 """The command line. A command's module is imported when it is called, torch when a world runs."""
 
-from powderdsl.cli.commands import main
+from powderdsl.cli.dispatch import main
 
 __all__ = ["main"]

@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.interrupts import Terminated
+from powderdsl.system.interrupts import Terminated
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic

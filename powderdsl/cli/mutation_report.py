@@ -16,9 +16,9 @@ from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
-    from powderdsl.mutation.mutants import Mutant
-    from powderdsl.mutation.mutation_run import Outcome
-    from powderdsl.mutation.written import GeneratedTest
+    from powderdsl.testing.mutation.mutants import Mutant
+    from powderdsl.testing.mutation.run import Outcome
+    from powderdsl.testing.mutation.written import GeneratedTest
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def report_mutants(names: Sequence[str], plan: MutationPlan) -> int:
 
 
 def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
-    from powderdsl.mutation.mutation_run import run_campaign, sampled
-    from powderdsl.mutation.original import Original
+    from powderdsl.testing.mutation.original import Original
+    from powderdsl.testing.mutation.run import run_campaign, sampled
 
     began = monotonic()
     original = Original.of(name)
@@ -109,7 +109,7 @@ def _because(outcome: Outcome) -> str:
 
 def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
     """How many there were, and what noticed them."""
-    from powderdsl.mutation.tally import noticed_share, tally
+    from powderdsl.testing.mutation.tally import noticed_share, tally
 
     counts = tally(outcome for _, outcome in found)
     by = ", ".join(f"{counts[key]} by {words}" for key, words in WORDS.items())
@@ -128,7 +128,7 @@ WORDS = {
 
 
 def _write(found: list[tuple[Mutant, Outcome]]) -> None:
-    from powderdsl.mutation.written import add_tests
+    from powderdsl.testing.mutation.written import add_tests
 
     tests: dict[Path, dict[str, GeneratedTest]] = {}
     for mutant, outcome in found:
@@ -144,7 +144,7 @@ def _write(found: list[tuple[Mutant, Outcome]]) -> None:
 
 
 def _data(found: list[tuple[Mutant, Outcome]]) -> dict[str, Any]:
-    from powderdsl.mutation.tally import tally
+    from powderdsl.testing.mutation.tally import tally
 
     packs = dict.fromkeys(mutant.pack for mutant, _ in found)
     return {

@@ -164,7 +164,7 @@ def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
 
 def check_writable(path: Path) -> None:
     """Fail before long work if a file cannot be written. Raises CompileError (PD613)."""
-    from powderdsl.worlds.files import destination, failure
+    from powderdsl.system.writing import destination, failure
 
     folder = destination(path, follow=True).parent
     if not folder.is_dir():

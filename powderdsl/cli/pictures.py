@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.draw import contact_sheet, palette, ramps, rgb, scale, to_numpy
+from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale, to_numpy
 
 if TYPE_CHECKING:
-    from powderdsl.simulator import World
+    from powderdsl.simulation.simulator import World
 
 USUAL_SIDE = 400
 MAX_SIDE = 16_384

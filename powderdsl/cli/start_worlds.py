@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.model.types import Ruleset
 from powderdsl.model.world_sides import fitting
-from powderdsl.worlds.files import failure
+from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene import FieldValues, Start, load_start
 from powderdsl.worlds.strewn import check_cells, strew
 
 if TYPE_CHECKING:
-    from powderdsl.simulator import Simulator, World
+    from powderdsl.simulation.simulator import Simulator, World
 
 DEFAULT_SIZE: Size = (64, 64)
 

@@ -15,8 +15,8 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
 from powderdsl.cli.plain_table import table
-from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
-from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
+from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task
 
 
@@ -121,7 +121,7 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
     """Start worlds side by side, each region outlined in a colour of its own."""
     import torch
 
-    from powderdsl.media import write_png
+    from powderdsl.simulation.media import write_png
     from powderdsl.tasks.episodes import compile_task
 
     program = compile_task(task, split=split, backend="dense")

@@ -13,13 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from powderdsl.backends.torch_random import MASK, mix
 from powderdsl.datasets.manifest import Manifest, Recipe, damaged, differences, many_damaged, read_manifest
 from powderdsl.datasets.recipes import check_count, recipe_of
 from powderdsl.datasets.shards import Shard, open_shard
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.worlds.files import failure
+from powderdsl.system.writing import failure
+from powderdsl.targets.random import MASK, mix
 
 Array = NDArray[Any]
 

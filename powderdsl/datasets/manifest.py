@@ -11,9 +11,9 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from powderdsl.bounded_files import check_links, parse_json, read_bytes
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
-from powderdsl.worlds.files import failure, replacing
+from powderdsl.system.reading import check_links, parse_json, read_bytes
+from powderdsl.system.writing import failure, replacing
 
 FORMAT = "powderdsl-dataset"
 VERSION = 2

@@ -31,10 +31,10 @@ from powderdsl.datasets.shards import is_whole, write_shard
 from powderdsl.envs.acting import Policy, action_keys
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.runs.folder import held
+from powderdsl.experiments.runs.folder import held
+from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
-from powderdsl.worlds.files import failure
 
 Array = NDArray[Any]
 Progress = Callable[[float, int], None]

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.bounded_files import open_regular
 from powderdsl.datasets.manifest import Recipe, ShardRow, damaged, shard_file
-from powderdsl.worlds.files import failure, replacing
+from powderdsl.system.reading import open_regular
+from powderdsl.system.writing import failure, replacing
 
 Array = NDArray[Any]
 

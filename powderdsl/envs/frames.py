@@ -6,8 +6,8 @@ from typing import Any
 
 from gymnasium.error import ResetNeeded
 
-from powderdsl.draw import scale
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.simulation.draw import scale
 
 RENDER_MODES = ("rgb_array", "ansi")
 

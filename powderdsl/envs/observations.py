@@ -10,8 +10,8 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from powderdsl.diagnostics import suggest
-from powderdsl.observe import Observer
-from powderdsl.simulator import Simulator, World
+from powderdsl.simulation.observe import Observer
+from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.worlds.raster import Size
 
 KINDS = ("ids", "compact", "matrix", "rgb")

@@ -12,9 +12,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from powderdsl.backends.torch_random import MASK, mix
 from powderdsl.envs.observations import observation_of
-from powderdsl.simulator import MAX_CELLS
+from powderdsl.simulation.simulator import MAX_CELLS
+from powderdsl.targets.random import MASK, mix
 from powderdsl.tasks.episodes import Episodes, TaskProgram, check_actions, compile_task, load_task
 from powderdsl.tasks.task import Task
 

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import CompileError, Label, Reporter, Span
-from powderdsl.model.compose import Composition
+from powderdsl.model.composition.compose import Composition
+from powderdsl.model.logic.unused import pack_words
 from powderdsl.model.types import Moment, Move, Transform
-from powderdsl.model.unused import pack_words
 
 CODES = ("PD501", "PD502")
 

@@ -9,27 +9,19 @@ from functools import partial
 
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.added_conflicts import AddedPacks
-from powderdsl.model.compose import Composition, compose
-from powderdsl.model.constants import constant_of
-from powderdsl.model.contested import given_values, report_contested
+from powderdsl.model.composition.compose import Composition, compose
+from powderdsl.model.composition.contested import given_values, report_contested
+from powderdsl.model.composition.layout import matrix_channels, state_order
+from powderdsl.model.composition.optional_names import report_misspelt
+from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
-from powderdsl.model.expressions import Typer
-from powderdsl.model.field_values import add_field_values, unknown_element_key
-from powderdsl.model.invariants import check_invariants
-from powderdsl.model.layout import matrix_channels, state_order
-from powderdsl.model.logic import check_logic, overridden_ids, produced_ids, without_dead_overrides
-from powderdsl.model.lost_writes import report_lost_writes
-from powderdsl.model.needless import report_needless, report_undrawn, silent_rules
-from powderdsl.model.operands import Asleep, Broken, Poisoned, SetOf
-from powderdsl.model.optional_names import report_misspelt
-from powderdsl.model.palette import Palette
-from powderdsl.model.property_words import not_a_value
-from powderdsl.model.ramps import element_ramps
-from powderdsl.model.satisfy import Facts
-from powderdsl.model.scope import Scope
-from powderdsl.model.symbols import (
+from powderdsl.model.expressions.constants import constant_of
+from powderdsl.model.expressions.operands import Asleep, Broken, Poisoned, SetOf
+from powderdsl.model.expressions.property_words import not_a_value
+from powderdsl.model.expressions.scope import Scope
+from powderdsl.model.expressions.symbols import (
     Symbols,
     base_symbols,
     check_param_names,
@@ -39,6 +31,15 @@ from powderdsl.model.symbols import (
     read_kind,
     settled,
 )
+from powderdsl.model.expressions.typer import Typer
+from powderdsl.model.fields.values import add_field_values, unknown_element_key
+from powderdsl.model.invariants import check_invariants
+from powderdsl.model.logic.conflicts import check_logic, overridden_ids, produced_ids, without_dead_overrides
+from powderdsl.model.logic.lost_writes import report_lost_writes
+from powderdsl.model.logic.needless import report_needless, report_undrawn, silent_rules
+from powderdsl.model.logic.satisfy import Facts
+from powderdsl.model.logic.unused import report_unused
+from powderdsl.model.ramps import element_ramps
 from powderdsl.model.types import (
     CHANCE,
     FLAG,
@@ -53,7 +54,6 @@ from powderdsl.model.types import (
     Stream,
     Value,
 )
-from powderdsl.model.unused import report_unused
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
@@ -96,7 +96,7 @@ def check(
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter.
 
     Args:
-        palette: ids that were recorded earlier, see `model/palette.py`.
+        palette: ids that were recorded earlier, see `model/composition/palette.py`.
         elsewhere: words that packs define which are not loaded, with the pack.
         alone: no pack counts as added to others: rules that meet are errors.
     """

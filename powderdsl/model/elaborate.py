@@ -6,10 +6,9 @@ from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
-from powderdsl.model.compose import Named
+from powderdsl.model.composition.compose import Named
 from powderdsl.model.declarations import Block, PassDecl
-from powderdsl.model.expressions import Typer
-from powderdsl.model.operands import (
+from powderdsl.model.expressions.operands import (
     FALSE,
     Absent,
     Asleep,
@@ -22,9 +21,10 @@ from powderdsl.model.operands import (
     conjunction,
     constant,
 )
-from powderdsl.model.qualified import certain, of_pack
-from powderdsl.model.scope import IDENTITY, Matrix, Scope, turned
-from powderdsl.model.symbols import default_of, read_kind, stream_ident
+from powderdsl.model.expressions.qualified import certain, of_pack
+from powderdsl.model.expressions.scope import IDENTITY, Matrix, Scope, turned
+from powderdsl.model.expressions.symbols import default_of, read_kind, stream_ident
+from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import (
     REAL,
     VEC2,

@@ -7,14 +7,14 @@ from fractions import Fraction
 from math import lcm
 
 from powderdsl.diagnostics import Reporter, Span, suggest
-from powderdsl.model.claim_scopes import words_of
-from powderdsl.model.compose import Composition
-from powderdsl.model.constants import constant_of
+from powderdsl.model.composition.claim_scopes import words_of
+from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import TestDecl
-from powderdsl.model.expressions import Typer
-from powderdsl.model.field_grids import GridReader
-from powderdsl.model.operands import Asleep, Poisoned
-from powderdsl.model.scope import Scope
+from powderdsl.model.expressions.constants import constant_of
+from powderdsl.model.expressions.operands import Asleep, Poisoned
+from powderdsl.model.expressions.scope import Scope
+from powderdsl.model.expressions.typer import Typer
+from powderdsl.model.fields.grids import GridReader
 from powderdsl.model.types import CHANCE, Example, Expr, Kernel, Often, Property
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from powderdsl.diagnostics import Reporter, Span, suggest
-from powderdsl.model.claim_scopes import names_left_out, with_optional, words_of
-from powderdsl.model.compose import Composition
+from powderdsl.model.composition.claim_scopes import names_left_out, with_optional, words_of
+from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import RulesetDecl
-from powderdsl.model.expressions import Typer
-from powderdsl.model.literals import read_bounds
-from powderdsl.model.operands import (
+from powderdsl.model.expressions.literals import read_bounds
+from powderdsl.model.expressions.operands import (
     ELEMENT_HERE,
     FALSE,
     TRUE,
@@ -22,7 +21,8 @@ from powderdsl.model.operands import (
     disjunction,
     member,
 )
-from powderdsl.model.scope import Scope
+from powderdsl.model.expressions.scope import Scope
+from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.text import one_line
 from powderdsl.model.types import (
     Bounded,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from powderdsl.diagnostics import Label, suggest
-from powderdsl.model.compose import Composition, needed_first
+from powderdsl.model.composition.compose import Composition, needed_first
 from powderdsl.model.declarations import RampDecl
-from powderdsl.model.expressions import Typer
-from powderdsl.model.literals import read_bounds
-from powderdsl.model.operands import Poisoned
+from powderdsl.model.expressions.literals import read_bounds
+from powderdsl.model.expressions.operands import Poisoned
+from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import ColorRamp, Element, Field
 
 ORDERED = ("int", "flag", "real")

@@ -1,7 +1,7 @@
 """The checked model: what a ruleset means, resolved, typed and unrolled. Frozen, printable, no torch, no NumPy.
 
 Everything discrete has a declared range; every chance and count is explicit. The reference interpreter runs these
-values directly, and `ir/lower.py` lowers them; neither looks at syntax again.
+values directly, and `ir/lower/rules.py` lowers them; neither looks at syntax again.
 """
 
 from __future__ import annotations
@@ -466,7 +466,7 @@ class Ruleset:
     passes: tuple[Pass, ...]
     matrix: tuple[MatrixChannel, ...]
     order: tuple[str, ...] = ()
-    """What a cell holds besides its element, as `model/layout.py` orders it."""
+    """What a cell holds besides its element, as `model/composition/layout.py` orders it."""
     tests: tuple[Example, ...] = field(default=(), metadata=UNMEANING)
     invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
     side_multiple: int = field(default=1, metadata=UNMEANING)

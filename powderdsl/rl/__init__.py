@@ -7,16 +7,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.rl.ppo_config import TrainConfig, preset
+from powderdsl.rl.config import TrainConfig, preset
 
 if TYPE_CHECKING:
+    from powderdsl.rl.evaluation import evaluate
     from powderdsl.rl.policies import load_policy
-    from powderdsl.rl.policy_evaluation import evaluate
-    from powderdsl.rl.ppo_training import train
+    from powderdsl.rl.training import train
 
 __all__ = ["TrainConfig", "evaluate", "load_policy", "preset", "train"]
 
-_HOMES = {"train": "ppo_training", "evaluate": "policy_evaluation", "load_policy": "policies"}
+_HOMES = {"train": "training", "evaluate": "evaluation", "load_policy": "policies"}
 
 
 def __getattr__(name: str) -> Any:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from powderdsl.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
 from powderdsl.envs.acting import Policy
-from powderdsl.rl.policy_evaluation import Played, play
-from powderdsl.simulator import World
+from powderdsl.rl.evaluation import Played, play
+from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
+from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import Episodes, TaskProgram
 from powderdsl.tasks.task import BLOW, Task
 
@@ -86,7 +86,7 @@ def film(
     seed: int = 0,
     factor: int = 4,
 ) -> tuple[Played, Iterator[NDArray[np.uint8]]]:
-    """Play worlds, int64 [n], as `policy_evaluation.play` does; what came of it, and the pictures, uint8 [H', W', 3].
+    """Play worlds, int64 [n], as `rl.evaluation.play` does; what came of it, and the pictures, uint8 [H', W', 3].
 
     There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
     episode is over stand still.

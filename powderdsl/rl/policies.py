@@ -16,14 +16,14 @@ from torch import Tensor
 from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.model.palette import MAX_ELEMENTS
+from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run
+from powderdsl.model.composition.palette import MAX_ELEMENTS
+from powderdsl.rl.config import TrainConfig, from_json
 from powderdsl.rl.patch_network import small_policy
-from powderdsl.rl.ppo_config import TrainConfig, from_json
-from powderdsl.runs import RunFolder, does_not_fit, find_run
+from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import compile_task
-from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
-from powderdsl.worlds.files import failure
 
 BESIDES = ("task_fingerprint", "palette", "channels")
 """What a run keeps besides its settings."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-from powderdsl.bounded_files import inside, read_bytes
 from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
+from powderdsl.system.reading import inside, read_bytes
 
 MAX_BYTES = 4 * MAX_CHARACTERS
 

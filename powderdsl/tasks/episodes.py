@@ -9,14 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.backends.torch_native import PackedState
-from powderdsl.simulator import Simulator, World
-from powderdsl.simulator import compile as compile_rules
-from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import compile as compile_rules
+from powderdsl.targets.cpp.program import PackedState
+from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
-from powderdsl.tasks.torch_actions import Done, Hands, params_of
-from powderdsl.tasks.torch_generator import Made, WorldMaker
-from powderdsl.tasks.torch_measures import Facts, Given, Meter, measures_of, scalar_value, scalars_of
+from powderdsl.tasks.tensors.actions import Done, Hands, params_of
+from powderdsl.tasks.tensors.generator import Made, WorldMaker
+from powderdsl.tasks.tensors.measures import Facts, Given, Meter, measures_of, scalar_value, scalars_of
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 

@@ -8,10 +8,10 @@ from fractions import Fraction
 from functools import reduce
 
 from powderdsl.diagnostics import Span, suggest
-from powderdsl.model.expressions import Typer
-from powderdsl.model.literals import read_number
-from powderdsl.model.operands import Asleep, Number, Operand, Poisoned, SetOf
-from powderdsl.model.scope import Scope
+from powderdsl.model.expressions.literals import read_number
+from powderdsl.model.expressions.operands import Asleep, Number, Operand, Poisoned, SetOf
+from powderdsl.model.expressions.scope import Scope
+from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import FLAG, Expr
 from powderdsl.syntax.ast import Syntax
 from powderdsl.tasks.task import Measure, Scalar

@@ -1,6 +1,6 @@
 """The checked task: resolved, ranges known, knobs filled in. Frozen; no torch, no NumPy but in stamps.
 
-`task_file.read_task` makes it from a file; `generator` and `episodes` run it.
+`tasks.file.read_task` makes it from a file; `generator` and `episodes` run it.
 """
 
 from __future__ import annotations

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.cases import Start, load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.rulemaker import ruleset_text
-from powderdsl.testing.vocabulary import Manner
+from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import ruleset_text
+from powderdsl.testing.generators.vocabulary import Manner
 
 T = TypeVar("T")
 

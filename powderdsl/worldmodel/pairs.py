@@ -11,15 +11,15 @@ from torch import Tensor
 
 from powderdsl.compiler import load
 from powderdsl.diagnostics import suggest
+from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.model.palette import Palette
 from powderdsl.model.types import Ruleset
-from powderdsl.simulator import World
+from powderdsl.simulation.simulator import World
+from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
-from powderdsl.tasks.shipped_tasks import check_split, load_task
+from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.worldmodel.rulesets import MAX_RULESETS, RulesetSource, VariedWorlds, Variety
 from powderdsl.worldmodel.watched import Watched, watched
-from powderdsl.worlds.files import failure
 
 TEST_SEEDS = 1 << 32
 """The first seed of worlds that models are tested on. Training takes seeds below it."""

@@ -11,19 +11,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.backends.torch_random import MASK, base_keys, mix
 from powderdsl.compiler import read, set_params
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
+from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.model.palette import Palette
 from powderdsl.model.types import Ruleset
-from powderdsl.simulator import World
+from powderdsl.simulation.simulator import World
+from powderdsl.system.writing import failure
+from powderdsl.targets.random import MASK, base_keys, mix
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.task import Task
 from powderdsl.worldmodel.watched import Watched, watched
-from powderdsl.worlds.files import failure
 
 TRIES = 8
 """How often a swap or a selection of packs is drawn anew where the rules would contradict themselves."""

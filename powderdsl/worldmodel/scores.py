@@ -10,13 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from powderdsl.worldmodel.pairs import (
-    Pairs,
-    TaskWorlds,
-    pairs_of,
-    task_worlds,
-    unseen_seeds,
-)
+from powderdsl.worldmodel.pairs import Pairs, TaskWorlds, pairs_of, task_worlds, unseen_seeds
 from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, VariedWorlds
 from powderdsl.worldmodel.training import HERE, Machine, Network, Trained, check_palette, load_rules_of
 

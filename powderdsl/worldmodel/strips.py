@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from powderdsl.draw import contact_sheet, palette, rgb, scale
 from powderdsl.model.types import Ruleset
+from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
 from powderdsl.worldmodel.pairs import TaskWorlds, unseen_seeds
 from powderdsl.worldmodel.rulesets import VariedWorlds
 from powderdsl.worldmodel.training import Network

@@ -14,16 +14,16 @@ from torch.nn import functional as F
 
 from powderdsl.compiler import load, whole_palette
 from powderdsl.diagnostics import CompileError
-from powderdsl.interrupts import held_back
+from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run, read_run
+from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.model.palette import MAX_ELEMENTS, Palette
 from powderdsl.model.types import Ruleset
-from powderdsl.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run, read_run
-from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.system.interrupts import held_back
+from powderdsl.system.writing import failure
+from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.unet import UNet, fresh_unet
-from powderdsl.worlds.files import failure
 
 KIND = "worldmodel"
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.rule_words import add, pack_names
 from powderdsl.worldmodel.training import TrainConfig, Trained, extended_palette, load_rules_of
 

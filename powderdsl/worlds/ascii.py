@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.model.types import Element
 from powderdsl.syntax.sources import read_source
-from powderdsl.worlds.files import failure
+from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_BYTES = 4 * MAX_CELLS

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from powderdsl.bounded_files import open_regular
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
-from powderdsl.draw import ramps
 from powderdsl.model.types import Element
-from powderdsl.worlds.files import failure
+from powderdsl.simulation.draw import ramps
+from powderdsl.system.reading import open_regular
+from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_REPORTED = 8
@@ -33,7 +33,7 @@ _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 
 
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a PNG file, as `media.write_png` writes of `draw.rgb`. Raises CompileError.
+    """The ids uint8 [H, W] of a PNG file, as `simulation.media.write_png` writes of `simulation.draw.rgb`. Raises CompileError.
 
     Colors of a ramp mean its element; the values of its field are not read.
 

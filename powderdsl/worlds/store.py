@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from powderdsl.bounded_files import parse_json
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.types import ELEMENT
-from powderdsl.simulator import Simulator, World
-from powderdsl.worlds.archives import Archive, BadArchive, open_archive
-from powderdsl.worlds.files import failure, replacing
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.system.archives import Archive, BadArchive, open_archive
+from powderdsl.system.reading import parse_json
+from powderdsl.system.writing import failure, replacing
 from powderdsl.worlds.raster import MAX_CELLS
 
 FORMAT = 1

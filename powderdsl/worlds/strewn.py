@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.model.reactions import moved_ids, unchanging_ids
+from powderdsl.analysis.reactions import moved_ids, unchanging_ids
 from powderdsl.model.types import Ruleset
-from powderdsl.worlds.files import failure
+from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS, Box, Disk, Frame, Line, Shape, Size, mask
 
 MAX_TOTAL = 16 * MAX_CELLS

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.backends.native_build import Building, building
-from powderdsl.bench import make_plan, measure, report_data, report_text
-from powderdsl.bench.figures import Costs, Ready, Sample, Started, make_report
-from powderdsl.bench.machine import Machine
-from powderdsl.bench.measure import interleaved, measure_events
-from powderdsl.bench.memory import Memory, peak_growth
-from powderdsl.bench.tables import aligned, number
-from powderdsl.bench.workloads import start_worlds
+from powderdsl.experiments.bench import make_plan, measure, report_data, report_text
+from powderdsl.experiments.bench.figures import Costs, Ready, Sample, Started, make_report
+from powderdsl.experiments.bench.machine import Machine
+from powderdsl.experiments.bench.measure import interleaved, measure_events
+from powderdsl.experiments.bench.memory import Memory, peak_growth
+from powderdsl.experiments.bench.tables import aligned, number
+from powderdsl.experiments.bench.workloads import start_worlds
 from powderdsl.model.state import slots
+from powderdsl.targets.cpp.build import Building, building
 
 TINY = {"sizes": [(6, 8)], "batches": [1, 3], "rounds": 2, "seconds": 1e-3, "steps": 2}
 

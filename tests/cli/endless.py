@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from powderdsl.scratch import is_scratch
+from powderdsl.system.scratch import is_scratch
 from tests.cli.commands import command_line, environment_with
 from tests.processes import alive, started, waited
 

@@ -7,8 +7,9 @@ import sys
 
 import pytest
 
-from powderdsl.bench.measure import measure_events
-from powderdsl.cli import bench_command, exits
+from powderdsl.cli import exits
+from powderdsl.cli.commands import bench as bench_command
+from powderdsl.experiments.bench.measure import measure_events
 from tests.cli.commands import powderdsl
 
 QUICK = ("bench", "life", "--size", "6x8", "--rounds", "2", "--seconds", "0.001", "--steps", "2")

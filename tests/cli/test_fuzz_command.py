@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from powderdsl.backends.native_build import Building
-from powderdsl.simulator import Simulator
-from powderdsl.testing import differential
-from powderdsl.testing.case_files import read_case, write_case
-from powderdsl.testing.reducer import reduce_case
+from powderdsl.simulation.simulator import Simulator
+from powderdsl.targets.cpp.build import Building
+from powderdsl.testing.fuzz import differential
+from powderdsl.testing.fuzz.case_files import read_case, write_case
+from powderdsl.testing.fuzz.reducer import reduce_case
 from tests.cli.commands import command_line, environment_with, powderdsl, process
 from tests.processes import started, waited
 

@@ -119,7 +119,7 @@ def test_a_replay_needs_one_name(folder):
 def test_packs_under_pytest(folder):
     (folder / "other.yaml").write_text("services: {web: 1}\n")
     root = Path(__file__).resolve().parents[2]
-    command = [sys.executable, "-m", "pytest", "-p", "no:powderdsl", "-p", "powderdsl.pytest_plugin"]
+    command = [sys.executable, "-m", "pytest", "-p", "no:powderdsl", "-p", "powderdsl.testing.pytest_plugin"]
     command += ["-p", "no:xdist", "-p", "no:cacheprovider", "-v", "--rootdir", str(folder), str(folder)]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=300, check=False)
     assert "collected 7 items" in done.stdout, done.stdout + done.stderr

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from powderdsl.cli import exits, main
-from powderdsl.cli.commands import COMMANDS
+from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Label
 from tests.cli.commands import powderdsl, process
 

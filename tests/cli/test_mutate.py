@@ -9,8 +9,8 @@ import pytest
 
 import powderdsl as package
 from powderdsl.compiler import shipped
-from powderdsl.mutation.mutation_run import sampled
-from powderdsl.mutation.original import Original
+from powderdsl.testing.mutation.original import Original
+from powderdsl.testing.mutation.run import sampled
 from tests.cli.commands import powderdsl
 
 PACK = """\

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import powderdsl as package
-from powderdsl.pack_tests import SEEDS, run_examples
+from powderdsl.testing.pack_tests.runner import SEEDS, run_examples
 from tests.cli.commands import PACK, powderdsl
 
 TESTS = """\

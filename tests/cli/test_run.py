@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 import powderdsl as package
+from powderdsl.analysis.reactions import unchanging_ids
 from powderdsl.cli.start_worlds import start_drawn
 from powderdsl.compiler import shipped_rules
 from powderdsl.diagnostics import CompileError
-from powderdsl.model.reactions import unchanging_ids
 from powderdsl.worlds.scene import shipped_scenes
 from powderdsl.worlds.strewn import strew
 from tests.cli.commands import PACK, powderdsl

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import powderdsl as package
+from powderdsl.analysis.reactions import moved_ids, reactions, unchanging_ids
 from powderdsl.compiler import shipped_rules
-from powderdsl.model.reactions import moved_ids, reactions, unchanging_ids
 from powderdsl.model.text import print_model, show_number, show_set
 from tests.cli.commands import PACK, ROOT, powderdsl
 

@@ -98,7 +98,7 @@ def test_two_studies_do_not_share_a_folder(tmp_path: Path) -> None:
 
 CAUGHT = """
 import os, signal, sys, tempfile, time
-from powderdsl.interrupts import Terminated, held_back, interruptible
+from powderdsl.system.interrupts import Terminated, held_back, interruptible
 
 class Unlucky:
     def __del__(self):

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import pytest
 
 from powderdsl.diagnostics import CompileError, Reporter, Source
-from powderdsl.model.budget import BUDGET, Budget
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl
+from powderdsl.model.logic.budget import BUDGET, Budget
+from powderdsl.model.logic.satisfy import Facts, decide, satisfiable
 from powderdsl.model.packs import read_file
-from powderdsl.model.satisfy import Facts, decide, satisfiable
 from powderdsl.model.types import FLAG, Expr, integer
 
 HEAD = """pack: yard

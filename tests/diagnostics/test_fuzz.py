@@ -13,8 +13,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from powderdsl.model.declarations import PackDecl
-from powderdsl.testing import damage
-from powderdsl.testing.damage import KINDS, damaged_text, load_damaged, needed, rule_texts, run_trial, whole
+from powderdsl.testing.fuzz import damage
+from powderdsl.testing.fuzz.damage import (
+    KINDS,
+    damaged_text,
+    load_damaged,
+    needed,
+    rule_texts,
+    run_trial,
+    whole,
+)
 from powderdsl.testing.strategies import chosen
 from tests.tiers import tiered
 

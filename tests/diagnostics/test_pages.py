@@ -25,21 +25,21 @@ import pytest
 from PIL import Image
 
 import powderdsl
+from powderdsl.analysis.ledger.book import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
-from powderdsl.ledgers.book import ledger
-from powderdsl.properties.refute import refuted
+from powderdsl.experiments.runs import does_not_fit, find_run, open_run
+from powderdsl.experiments.studies.file import load_study
+from powderdsl.experiments.studies.paths import TEXT
 from powderdsl.rl import preset
-from powderdsl.runs import does_not_fit, find_run, open_run
-from powderdsl.studies.study_file import load_study
-from powderdsl.studies.study_paths import TEXT
-from powderdsl.tasks.shipped_tasks import load_task, load_task_with_diagnostics
+from powderdsl.system.writing import replacing
+from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics
+from powderdsl.testing.properties.refute import refuted
 from powderdsl.worldmodel.training import diverged
 from powderdsl.worlds.ascii import read_ascii
-from powderdsl.worlds.files import replacing
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.scene import find_scene, load_scene
 
@@ -219,7 +219,7 @@ def read_a_soft_picture() -> None:
 
 
 def write_a_film_without_the_package() -> None:
-    from powderdsl.media import write_mp4
+    from powderdsl.simulation.media import write_mp4
 
     imports = builtins.__import__
 

@@ -24,10 +24,10 @@ from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.single import PowderEnv
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.envs.vector import PowderVectorEnv
-from powderdsl.simulator import Simulator
-from powderdsl.simulator import compile as compile_rules
+from powderdsl.simulation.simulator import Simulator
+from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import TaskProgram, load_task
-from powderdsl.tasks.task_names import shipped_tasks
+from powderdsl.tasks.names import shipped_tasks
 
 
 @pytest.fixture(scope="module")

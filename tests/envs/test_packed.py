@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from powderdsl.backends.native_build import Building, building
-from powderdsl.backends.torch_native import PackedState
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.simulator import Simulator
-from powderdsl.simulator import compile as compile_rules
+from powderdsl.simulation.simulator import Simulator
+from powderdsl.simulation.simulator import compile as compile_rules
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.episodes import TaskProgram, load_task
 from tests.compilers import skip_without_compiler
 

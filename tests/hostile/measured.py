@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from powderdsl.cli import main
-from powderdsl.cli.commands import COMMANDS
+from powderdsl.cli.dispatch import COMMANDS
 
 PATIENCE = 90.0
 """Seconds by the clock after which a command counts as one that hangs."""
@@ -21,14 +21,14 @@ ROOM = 16 << 30
 """Bytes of addresses that a command may have, so that a mistake does not take the machine's memory."""
 
 MODULES = (
-    *(f"powderdsl.cli.{module}" for module, _ in COMMANDS.values()),
+    *(f"powderdsl.cli.commands.{module}" for module, _ in COMMANDS.values()),
     "powderdsl.cli.start_worlds",
     "powderdsl.datasets.dataset",
-    "powderdsl.properties.refute",
-    "powderdsl.rl.policy_evaluation",
-    "powderdsl.studies.study_run",
-    "powderdsl.tasks.shipped_tasks",
-    "powderdsl.testing.case_files",
+    "powderdsl.testing.properties.refute",
+    "powderdsl.rl.evaluation",
+    "powderdsl.experiments.studies.run",
+    "powderdsl.tasks.shipped",
+    "powderdsl.testing.fuzz.case_files",
     "powderdsl.worldmodel.scores",
     "powderdsl.worlds.image",
     "powderdsl.worlds.scene",

@@ -10,12 +10,12 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.ir.bits import lower_bits
 from powderdsl.ir.build import Builder
-from powderdsl.ir.lower import lower_ruleset
+from powderdsl.ir.lower.rules import lower_ruleset
 from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Program, Step, nodes_of, whole
 from powderdsl.ir.rewrite import RewriteLoop, rewrite_pass
+from powderdsl.ir.stages import PIPELINE, run_passes
 from powderdsl.ir.text import print_program
 from powderdsl.ir.verify import InvalidIR, verify
-from powderdsl.passes import PIPELINE, run_passes
 
 GOLDEN = Path(__file__).parent / "golden"
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.backends.native_build import Building
-from powderdsl.testing.case_files import read_case
-from powderdsl.testing.differential import check_case
+from powderdsl.targets.cpp.build import Building
+from powderdsl.testing.fuzz.case_files import read_case
+from powderdsl.testing.fuzz.differential import check_case
 from tests.compilers import skip_without_compiler
 
 FOLDER = Path(__file__).parent

@@ -11,16 +11,16 @@ import torch
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.draw import OUTLINES
 from powderdsl.envs.acting import action_keys, random_policy, uniforms
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.experiments.runs import RunFolder
 from powderdsl.rl import evaluate, load_policy, train
+from powderdsl.rl.evaluation import play
 from powderdsl.rl.films import HAND, film
-from powderdsl.rl.policy_evaluation import play
-from powderdsl.runs import RunFolder
+from powderdsl.simulation.draw import OUTLINES
 from powderdsl.tasks.episodes import TaskProgram, compile_task
-from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.tasks.shipped import load_task
 from tests.rl.tiny_tasks import quick, write_task
 
 

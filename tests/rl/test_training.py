@@ -17,10 +17,10 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError
+from powderdsl.experiments.runs import RunFolder, read_run
+from powderdsl.experiments.runs.metrics import read_metrics
 from powderdsl.rl import evaluate, preset, train
-from powderdsl.rl.ppo_config import HOW, from_json
-from powderdsl.runs import RunFolder, read_run
-from powderdsl.runs.metrics import read_metrics
+from powderdsl.rl.config import HOW, from_json
 from tests.processes import started
 from tests.rl.tiny_tasks import PLACE, quick, write_task
 from tests.states import same
@@ -80,7 +80,7 @@ def test_a_run_that_is_done_stays_as_it_is(task: Path, tmp_path: Path) -> None:
 TRAINING = """
 import json, sys
 from powderdsl.rl import train
-from powderdsl.rl.ppo_config import from_json
+from powderdsl.rl.config import from_json
 train(from_json(json.loads(sys.argv[2])), sys.argv[1], progress=lambda step, mean: print(step, flush=True))
 """
 

@@ -13,10 +13,10 @@ import pytest
 import powderdsl
 from powderdsl.datasets import Dataset
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.experiments.runs import find_run
 from powderdsl.rl import train as train_agent
 from powderdsl.rl.policies import config_of, load_policy, recorded_palette, task_of
-from powderdsl.runs import find_run
-from powderdsl.tasks.shipped_tasks import load_task
+from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import Machine, TrainConfig, load_trained, train
 from powderdsl.worldmodel.transfer import finetuned
 from powderdsl.worlds.store import load_world

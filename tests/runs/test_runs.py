@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.runs import find_run, open_run, read_run
-from powderdsl.runs.metrics import read_metrics
+from powderdsl.experiments.runs import find_run, open_run, read_run
+from powderdsl.experiments.runs.metrics import read_metrics
 from tests.processes import waited
 
 
@@ -153,7 +153,7 @@ def test_metrics_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> N
 
 SAVING = """
 import sys, torch
-from powderdsl.runs import open_run
+from powderdsl.experiments.runs import open_run
 run = open_run(sys.argv[1], "toy", {})
 found = run.latest_checkpoint()
 step = found.step if found else 0

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from powderdsl import reference
-from powderdsl.ledgers.book import Ledger, RuleEntry
-from powderdsl.ledgers.changes import RuleLine, footprint, rule_line
-from powderdsl.ledgers.overlaps import order_matters
+from powderdsl.analysis.ledger.book import Ledger, RuleEntry
+from powderdsl.analysis.ledger.changes import RuleLine, footprint, rule_line
+from powderdsl.analysis.ledger.overlaps import order_matters
+from powderdsl.model import reference
 from powderdsl.model.types import ELEMENT, Assign, Moment, Move, Pass, Ruleset, Swap, Transform
 
 Array = np.ndarray[Any, Any]

@@ -10,13 +10,13 @@ from pathlib import Path
 import yaml
 
 import powderdsl
+from powderdsl.analysis.ledger.book import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
-from powderdsl.ledgers.book import ledger
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
-from powderdsl.pack_tests import run_examples
-from powderdsl.properties.refute import broken_invariants
+from powderdsl.testing.pack_tests.runner import run_examples
+from powderdsl.testing.properties.refute import broken_invariants
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "rules"

@@ -11,8 +11,8 @@ import powderdsl
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.cases import random_start
-from powderdsl.testing.choices import Choices
+from powderdsl.testing.generators.cases import random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 
 TREES = """\

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 import powderdsl as library
+from powderdsl.analysis.ledger.book import ledger
 from powderdsl.diagnostics import Severity
-from powderdsl.ledgers.book import ledger
 from powderdsl.model.restrict import restricted
 from powderdsl.model.text import place_of
-from powderdsl.pack_tests import run_examples
-from powderdsl.properties.outcomes import Result
-from powderdsl.properties.refute import refuted
-from powderdsl.properties.running import Runner
-from powderdsl.properties.samples import single
-from powderdsl.properties.search import Plan, Search
+from powderdsl.testing.pack_tests.runner import run_examples
+from powderdsl.testing.properties.outcomes import Result
+from powderdsl.testing.properties.refute import refuted
+from powderdsl.testing.properties.running import Runner
+from powderdsl.testing.properties.samples import single
+from powderdsl.testing.properties.search import Plan, Search
 from tests.cli.commands import ROOT, powderdsl
 
 KERNEL = ", ".join(

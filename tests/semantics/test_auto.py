@@ -18,20 +18,20 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl import auto_program
-from powderdsl.auto_program import AutoProgram
-from powderdsl.backends.native_build import Building, building
-from powderdsl.backends.native_compilers import NoCompiler
-from powderdsl.backends.torch_job import Job
 from powderdsl.compiler import lower
 from powderdsl.ir.text import print_program
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
-from powderdsl.native_start import start_key
-from powderdsl.simulator import Simulator, World
-from powderdsl.testing.cases import load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.compare import find_difference
+from powderdsl.simulation import auto
+from powderdsl.simulation.auto import AutoProgram
+from powderdsl.simulation.native_start import start_key
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.targets.cpp.compilers import NoCompiler
+from powderdsl.targets.job import Job
+from powderdsl.testing.fuzz.compare import find_difference
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import environment_with
 from tests.cli.commands import powderdsl as command
 from tests.processes import alive, waited
@@ -114,7 +114,7 @@ def test_little_work_starts_no_compiler() -> None:
 
 def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """It compiles as soon as the pace shows what is to come, and changes over within the call."""
-    monkeypatch.setattr(auto_program, "SLICE", 0.02)
+    monkeypatch.setattr(auto, "SLICE", 0.02)
     program, compiler, log = made(0.005)
     threading.Timer(0.3, compiler.go.set).start()
     state = program.run(job(5000))  # 25 s on torch
@@ -132,7 +132,7 @@ def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatc
 
 
 def test_many_short_calls_are_worth_it_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auto_program, "WORTH", 0.05)
+    monkeypatch.setattr(auto, "WORTH", 0.05)
     program, compiler, _ = made(0.005)
     for start in range(30):
         program.run(job(1, start))
@@ -159,7 +159,7 @@ def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
 
 @pytest.mark.parametrize("problem", [NoCompiler("no C++ compiler: tried g++"), ValueError("oh")])
 def test_without_native_code_torch_goes_on(problem: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auto_program, "WORTH", 0.0)
+    monkeypatch.setattr(auto, "WORTH", 0.0)
     log: list[tuple[str, int, int]] = []
     asked = []
 
@@ -176,7 +176,7 @@ def test_without_native_code_torch_goes_on(problem: Exception, monkeypatch: pyte
 
 
 def test_threads_share_one_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auto_program, "WORTH", 0.0)
+    monkeypatch.setattr(auto, "WORTH", 0.0)
     program, compiler, _ = made(0.0001)
     results = []
 
@@ -237,7 +237,7 @@ def test_every_compiler_gives_the_oracles_worlds(
 def test_auto_changes_over_to_the_same_worlds_and_remembers(
     rules: Ruleset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(auto_program, "WORTH", 0.0)
+    monkeypatch.setattr(auto, "WORTH", 0.0)
     with building(Building("-O0", tmp_path)):
         sims = [powderdsl.compile(rules) for _ in range(3)]
         assert [sim.running for sim in sims] == ["torch"] * 3
@@ -283,9 +283,9 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
         library.write_bytes(part)
         program = (
             "import sys; from pathlib import Path\n"
-            "from powderdsl.backends.native_build import Building, building\n"
-            "from powderdsl.testing.cases import load_text\n"
-            "from powderdsl.simulator import compile\n"
+            "from powderdsl.targets.cpp.build import Building, building\n"
+            "from powderdsl.testing.generators.cases import load_text\n"
+            "from powderdsl.simulation.simulator import compile\n"
             "with building(Building('-O0', Path(sys.argv[1]))):\n"
             "    rules = load_text(sys.argv[2], 'kettle.yaml')\n"
             "    print(compile(rules).running, compile(rules, backend='native').running, compile(rules).running)"
@@ -308,10 +308,10 @@ def test_forks_run_native_code_too(rules: Ruleset, tmp_path: Path) -> None:
     program = """
 import os, sys, time
 from pathlib import Path
-from powderdsl import auto_program
-from powderdsl.backends.native_build import Building, building
-from powderdsl.testing.cases import load_text
-from powderdsl.simulator import compile
+from powderdsl.simulation import auto as auto_program
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.simulation.simulator import compile
 auto_program.WORTH = 0.0
 with building(Building('-O0', Path(sys.argv[1]))):
     rules = load_text(sys.argv[2], 'kettle.yaml')
@@ -354,10 +354,10 @@ def test_the_end_does_not_wait_for_the_compiler(tmp_path: Path) -> None:
     program = """
 import sys, time
 from pathlib import Path
-from powderdsl import auto_program
-from powderdsl.backends.native_build import Building, building
-from powderdsl.testing.cases import load_text
-from powderdsl.simulator import compile
+from powderdsl.simulation import auto as auto_program
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.simulation.simulator import compile
 auto_program.WORTH = 0.0
 cache = Path(sys.argv[1])
 with building(Building('-O0', cache / 'cache')):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 import powderdsl
-from powderdsl.backends import array_draws, array_kernels, torch_arrays
-from powderdsl.backends.torch_mixed import packed_program
-from powderdsl.backends.torch_planes import PlanesProgram
 from powderdsl.compiler import lower, shipped_rules
 from powderdsl.model.types import Ruleset
+from powderdsl.targets.arrays import draws, kernels, program
+from powderdsl.targets.dense.mixed import packed_program
+from powderdsl.targets.planes.program import PlanesProgram
 from tests.compilers import skip_without_compiler
 
 SIZES = [(1, 1), (1, 7), (5, 1), (2, 2), (3, 33), (7, 64), (4, 65), (9, 130)]
@@ -82,11 +82,11 @@ def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyp
 def test_what_is_skipped_changes_nothing(seed: int, torch, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     """Word by word or all at once, in large or small batches and pieces, with wind or without: the same worlds."""
     few = seed % 2
-    for module in (array_draws, array_kernels):
+    for module in (draws, kernels):
         monkeypatch.setattr(module, "FEW", 0 if few else 1 << 20)
         monkeypatch.setattr(module, "SPARSE", 1)
-    monkeypatch.setattr(array_kernels, "PIECE", 100)
-    monkeypatch.setattr(torch_arrays, "CHUNK", 64 * 30 * 2)
+    monkeypatch.setattr(kernels, "PIECE", 100)
+    monkeypatch.setattr(program, "CHUNK", 64 * 30 * 2)
     rules = powderdsl.load("powderworld")
     oracle, other = powderdsl.compile(rules, backend="dense"), powderdsl.compile(rules, backend="planes")
     generator = torch.Generator().manual_seed(seed)

@@ -8,7 +8,7 @@ import pytest
 import powderdsl as package
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError
-from powderdsl.draw import to_numpy
+from powderdsl.simulation.draw import to_numpy
 from tests.cli.commands import powderdsl as command
 
 HEAD = """\

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl.simulator import Simulator, World
+from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.worlds.ascii import read_ascii, write_ascii
 from tests.compilers import skip_without_compiler
 

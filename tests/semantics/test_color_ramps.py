@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.draw import palette, ramps, rgb
+from powderdsl.cli.terminal import LiveView, render_frame
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
-from powderdsl.terminal import LiveView, render_frame
-from powderdsl.testing.cases import load_text, random_start
-from powderdsl.testing.choices import Choices
+from powderdsl.simulation.draw import palette, ramps, rgb
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import powderdsl as run_command
 from tests.compilers import skip_without_compiler
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.ledgers.book import ledger
+from powderdsl.analysis.ledger.book import ledger
 from powderdsl.model.types import Ruleset
-from powderdsl.properties.refute import refuted
+from powderdsl.testing.properties.refute import refuted
 
 WISHES = """pack: wishes
 elements:

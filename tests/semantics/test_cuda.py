@@ -10,17 +10,17 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.backends.cuda_source import KernelSource, cuda_source
 from powderdsl.compiler import load, lower, shipped_rules
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.segments import segments
 from powderdsl.model.types import Ruleset
-from powderdsl.simulator import compile as compile_ruleset
-from powderdsl.testing.cases import load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.compare import assert_same
-from powderdsl.testing.cuda_emulation import emulated_simulator
-from powderdsl.testing.rulemaker import random_ruleset_text
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.targets.cuda.source import KernelSource, cuda_source
+from powderdsl.testing.fuzz.compare import assert_same
+from powderdsl.testing.fuzz.cuda_emulation import emulated_simulator
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
 
 PACKS_ALONE = {"acid", "cloner", "core", "fire", "gas", "lava", "plant", "sand", "stone", "water", "wind"}
 LARGE = "powderworld"
@@ -84,7 +84,7 @@ def test_random_rulesets(seed: int, folder: Path) -> None:
 
 def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Then nothing is held back in registers: planes that neighbours read are never written in place."""
-    monkeypatch.setattr("powderdsl.backends.cuda_source.HELD", 0)
+    monkeypatch.setattr("powderdsl.targets.cuda.source.HELD", 0)
     ruleset = load("core+sand+water")
     simulators = [compile_ruleset(ruleset, backend="reference"), emulated_simulator(ruleset, folder)]
     start = random_start(ruleset, Choices.seeded(2), (2, 9, 40))
@@ -107,7 +107,7 @@ def test_many_steps_a_launch(folder: Path, torch) -> None:  # type: ignore[no-un
 
 
 def test_a_missing_barrier_would_be_seen(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import powderdsl.backends.torch_cuda as torch_cuda
+    import powderdsl.targets.cuda.program as torch_cuda
 
     def careless(*arguments: object) -> KernelSource:
         source = cuda_source(*arguments)  # type: ignore[arg-type]

@@ -18,17 +18,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from powderdsl.backends.native_build import Building
 from powderdsl.compiler import load, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
-from powderdsl.simulator import compile as compile_ruleset
-from powderdsl.testing.cases import Start, load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.compare import assert_same, find_difference
-from powderdsl.testing.differential import Outcome, Plan, run_seed
-from powderdsl.testing.exercised import constructs, missing, operations
-from powderdsl.testing.rulemaker import random_ruleset_text
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.targets.cpp.build import Building
+from powderdsl.testing.fuzz.compare import assert_same, find_difference
+from powderdsl.testing.fuzz.differential import Outcome, Plan, run_seed
+from powderdsl.testing.fuzz.exercised import constructs, missing, operations
+from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from powderdsl.testing.strategies import rulesets, worlds
 from tests.compilers import skip_without_compiler
 from tests.tiers import tiered

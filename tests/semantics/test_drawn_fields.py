@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import powderdsl as package
-from powderdsl.draw import to_numpy
-from powderdsl.pack_tests import run_examples
+from powderdsl.simulation.draw import to_numpy
+from powderdsl.testing.pack_tests.runner import run_examples
 
 FIELDS = """\
 pack: load

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.mutation.equivalence import proven_equal
-from powderdsl.mutation.judging import differing
-from powderdsl.mutation.original import Invalid, Original, meaning
-from powderdsl.properties.running import run_sample
-from powderdsl.simulator import compile
-from powderdsl.testing.cases import load_text
+from powderdsl.simulation.simulator import compile
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.mutation.equivalence import proven_equal
+from powderdsl.testing.mutation.judging import differing
+from powderdsl.testing.mutation.original import Invalid, Original, meaning
+from powderdsl.testing.properties.running import run_sample
 
 HEAD = """\
 pack: two

@@ -12,8 +12,8 @@ import torch
 
 import powderdsl
 from powderdsl.model.types import Ruleset
-from powderdsl.pack_tests import run_examples
-from powderdsl.simulator import Simulator, World
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.worlds.ascii import read_ascii, write_ascii
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"

@@ -7,8 +7,8 @@ import pytest
 
 import powderdsl as package
 from powderdsl.diagnostics import CompileError
-from powderdsl.draw import to_numpy
-from powderdsl.pack_tests import run_examples
+from powderdsl.simulation.draw import to_numpy
+from powderdsl.testing.pack_tests.runner import run_examples
 
 HEAD = """\
 pack: hunt
@@ -94,7 +94,7 @@ def test_painted_cells_are_fresh(rules):
 
 
 def test_the_ledger_and_traces_know_them(rules):
-    from powderdsl.tracing.trace import trace
+    from powderdsl.simulation.tracing.trace import trace
 
     fields = {entry.name: entry for entry in package.ledger(rules).fields}
     assert fields["energy"].fresh_bounds == (1, 7)
@@ -138,9 +138,9 @@ def test_an_invariant_meets_every_fresh_cell(tmp_path):
 @pytest.mark.parametrize("backend", ["reference", "torch"])
 def test_tasks_make_fresh_cells(tmp_path, torch, backend, monkeypatch):
     """Worlds of tasks are drawn and acted on by code of their own."""
-    from powderdsl.simulator import compile as compile_rules
+    from powderdsl.simulation.simulator import compile as compile_rules
     from powderdsl.tasks.episodes import TaskProgram, check_actions
-    from powderdsl.tasks.shipped_tasks import load_task
+    from powderdsl.tasks.shipped import load_task
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hunt.yaml").write_text(PACK.replace("energy > 4", "energy > 9"))

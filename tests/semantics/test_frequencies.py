@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.model.types import Ruleset
-from powderdsl.properties.breaks import Alike, breaks
-from powderdsl.properties.running import Runner
-from powderdsl.properties.samples import Sample, single
-from powderdsl.properties.search import COPIES, Plan, Search
-from powderdsl.testing.cases import load_text
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.properties.breaks import Alike, breaks
+from powderdsl.testing.properties.running import Runner
+from powderdsl.testing.properties.samples import Sample, single
+from powderdsl.testing.properties.search import COPIES, Plan, Search
 from tests.compilers import skip_without_compiler
 
 BACKENDS = ["reference", "dense", "planes", "native"]

@@ -10,7 +10,7 @@ import pytest
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics, whole_palette
 from powderdsl.diagnostics import CompileError
-from powderdsl.pack_tests import run_examples
+from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.worlds.store import load_world, save
 
 SLIME = """

@@ -6,12 +6,12 @@ import itertools
 
 import pytest
 
-from powderdsl.mutation.judging import broken_invariant
-from powderdsl.mutation.mutation_run import run_campaign
-from powderdsl.mutation.original import Original
-from powderdsl.simulator import compile
-from powderdsl.testing import crew
-from powderdsl.testing.cases import load_text
+from powderdsl.simulation.simulator import compile
+from powderdsl.system import crew
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.mutation.judging import broken_invariant
+from powderdsl.testing.mutation.original import Original
+from powderdsl.testing.mutation.run import run_campaign
 
 ROCK = """\
 pack: rocks

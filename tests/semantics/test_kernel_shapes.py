@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import powderdsl as package
-from powderdsl.draw import to_numpy
 from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
+from powderdsl.simulation.draw import to_numpy
 
 CELLS = {
     "box": lambda y, x, r: True,
@@ -96,6 +96,6 @@ def test_radii_follow_loops(tmp_path):
         "passes: {p: {do: 'off -> lit if any(count(lit in ring(r)) == 1 for r in (2, 4))'}}\n"
         "tests: [{t: {given: l . . . . . ., after: 1 step, expect: l . l . l . .}}]\n"
     )
-    from powderdsl.pack_tests import run_examples
+    from powderdsl.testing.pack_tests.runner import run_examples
 
     assert [one.problem for one in run_examples(package.load(path))] == [""]

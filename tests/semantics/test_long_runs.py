@@ -13,11 +13,11 @@ import pytest
 
 from powderdsl.compiler import load, shipped_rules
 from powderdsl.diagnostics import CompileError
-from powderdsl.simulator import Simulator, World
-from powderdsl.simulator import compile as compile_ruleset
-from powderdsl.testing.cases import random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.compare import find_difference
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.testing.fuzz.compare import find_difference
+from powderdsl.testing.generators.cases import random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 
 MOMENTS = (1, 2, 5, 10, 100, 1000)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import pytest
 
 import powderdsl
-from powderdsl.backends.torch_mixed import MixedProgram, mixed_program
-from powderdsl.backends.torch_planes import PlanesProgram
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, whole
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
-from powderdsl.simulator import Simulator, World
-from powderdsl.testing.cases import load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.compare import assert_same, find_difference
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.targets.dense.mixed import MixedProgram, mixed_program
+from powderdsl.targets.planes.program import PlanesProgram
+from powderdsl.testing.fuzz.compare import assert_same, find_difference
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 
 ROWS = "\n".join("      - " + " ".join(str(1 + (5 * i + 3 * j) % 7) for j in range(21)) for i in range(21))

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from powderdsl.mutation.tally import COUNTED, by_hand_share, noticed_share
+from powderdsl.testing.mutation.tally import COUNTED, by_hand_share, noticed_share
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -64,9 +64,9 @@ def test_the_counts_of_a_pack_are_kept_when_others_are_counted_again():
 
 
 def test_each_pack_is_told_as_soon_as_it_is_counted(monkeypatch):
-    from powderdsl.mutation import mutation_run
-    from powderdsl.mutation.judging import Verdict
-    from powderdsl.mutation.mutation_run import Outcome
+    from powderdsl.testing.mutation import run
+    from powderdsl.testing.mutation.judging import Verdict
+    from powderdsl.testing.mutation.run import Outcome
 
     def judged(rules, packs, numbers, jobs, seed, worlds):
         for number in numbers:
@@ -74,7 +74,7 @@ def test_each_pack_is_told_as_soon_as_it_is_counted(monkeypatch):
                 raise KeyboardInterrupt
             yield Outcome(number, Verdict("killed", "test"))
 
-    monkeypatch.setattr(mutation_run, "run_campaign", judged)
+    monkeypatch.setattr(run, "run_campaign", judged)
     found = table().count("powderworld", ["sand", "gas"], 1)
     assert next(found)["sand"]["killed"] == 10
     with pytest.raises(KeyboardInterrupt):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.draw import palette, rgb
 from powderdsl.model.types import Ruleset
-from powderdsl.observe import Observer
-from powderdsl.simulator import Simulator, World
-from powderdsl.testing.cases import load_text, random_start
-from powderdsl.testing.choices import Choices
+from powderdsl.simulation.draw import palette, rgb
+from powderdsl.simulation.observe import Observer
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 
 BACKENDS = ["reference", "dense", "planes", "native"]

@@ -8,8 +8,8 @@ import pytest
 
 import powderdsl
 from powderdsl.diagnostics import CompileError
-from powderdsl.pack_test_chances import ERROR_RATE, OFF, divergence, is_unlikely, trials_for
-from powderdsl.pack_tests import run_examples
+from powderdsl.testing.pack_tests.chances import ERROR_RATE, OFF, divergence, is_unlikely, trials_for
+from powderdsl.testing.pack_tests.runner import run_examples
 
 PACK = """\
 pack: coins

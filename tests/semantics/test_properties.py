@@ -16,20 +16,20 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl import reference
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, Source, Span
+from powderdsl.model import reference
 from powderdsl.model.check import check
 from powderdsl.model.packs import PackDecl, read_file
 from powderdsl.model.state import SNAP, slots
 from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Ruleset, Swap, Transform
-from powderdsl.simulator import Simulator, World
-from powderdsl.simulator import compile as compile_ruleset
-from powderdsl.testing.cases import Start, load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.compare import find_difference
-from powderdsl.testing.rulemaker import random_ruleset_text
-from powderdsl.testing.vocabulary import Manner
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.testing.fuzz.compare import find_difference
+from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from powderdsl.testing.generators.vocabulary import Manner
 
 ANYTHING = Manner()
 STEADY = Manner(draws=False, borders=False, symmetry=False)

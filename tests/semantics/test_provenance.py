@@ -9,12 +9,12 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
-from powderdsl.provenance import SLOT, Provenance, Recorder, writers
-from powderdsl.simulator import compile
-from powderdsl.testing.cases import Start, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.tracing.scenes import record_step
-from powderdsl.tracing.writes import writes_of
+from powderdsl.simulation.provenance import SLOT, Provenance, Recorder, writers
+from powderdsl.simulation.simulator import compile
+from powderdsl.simulation.tracing.scenes import record_step
+from powderdsl.simulation.tracing.writes import writes_of
+from powderdsl.testing.generators.cases import Start, random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import compositions, seeded_ruleset
 
 SHAPES = ((2, 5, 33), (1, 2, 2))

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from powderdsl.model.symbols import stream_ident
-from powderdsl.reference import Clock, draw
-from powderdsl.simulator import compile as compile_ruleset
-from powderdsl.testing.cases import load_text
+from powderdsl.model.expressions.symbols import stream_ident
+from powderdsl.model.reference import Clock, draw
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.testing.generators.cases import load_text
 
 Shape = tuple[int, int]
 Planes = Any
@@ -19,14 +19,14 @@ Planes = Any
 
 def test_draws_are_uniform_and_unrelated(torch) -> None:  # type: ignore[no-untyped-def]
     """Bit planes of our randomness: fair, and uncorrelated with neighbours, steps, streams, seeds and worlds."""
-    from powderdsl.backends import torch_random
+    from powderdsl.targets import random
 
     idents = torch.tensor([0x05562E58, 0x116B05CF])
 
     def bits(seed: int, index: int, step: int, stream: int):  # type: ignore[no-untyped-def]
-        base = torch_random.base_keys(torch.tensor([seed]), torch.tensor([index]))
-        keys = torch_random.step_keys(base, torch.tensor([step]), idents)
-        draws = torch_random.draws(keys[stream], 16, 256, 256)[0]
+        base = random.base_keys(torch.tensor([seed]), torch.tensor([index]))
+        keys = random.step_keys(base, torch.tensor([step]), idents)
+        draws = random.draws(keys[stream], 16, 256, 256)[0]
         return torch.stack([(draws >> j) & 1 for j in range(16)]).double() * 2 - 1
 
     first = bits(1, 0, 0, 0)

@@ -13,7 +13,7 @@ import torch
 import yaml
 
 import powderdsl
-from powderdsl.simulator import Simulator
+from powderdsl.simulation.simulator import Simulator
 
 ROOT = Path(__file__).parents[2]
 SALT = ROOT / "docs" / "examples" / "salt.yaml"

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.backends.native_build import Building, building
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError
-from powderdsl.simulator import compile as compile_ruleset
-from powderdsl.testing.cases import load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.testing.compare import assert_same
-from powderdsl.testing.rulemaker import random_ruleset_text
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.testing.fuzz.compare import assert_same
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.compilers import skip_without_compiler
 
 STRIPS = [(1, 8, 8), (2, 16, 70), (1, 64, 64), (3, 128, 65), (1, 256, 256), (9, 520, 20), (2, 8, 1)]

@@ -11,14 +11,14 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
-from powderdsl.simulator import World, compile
-from powderdsl.testing.cases import load_text, random_start
-from powderdsl.testing.choices import Choices
-from powderdsl.tracing.scenes import pick, record_step
-from powderdsl.tracing.trace import Miss, Trace, trace
-from powderdsl.tracing.trace_data import trace_data
-from powderdsl.tracing.trace_text import trace_text
-from powderdsl.tracing.writes import writes_of
+from powderdsl.simulation.simulator import World, compile
+from powderdsl.simulation.tracing.data import trace_data
+from powderdsl.simulation.tracing.scenes import pick, record_step
+from powderdsl.simulation.tracing.text import trace_text
+from powderdsl.simulation.tracing.trace import Miss, Trace, trace
+from powderdsl.simulation.tracing.writes import writes_of
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import seeded_ruleset
 
 HEAD = """\

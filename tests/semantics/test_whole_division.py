@@ -10,7 +10,7 @@ import pytest
 
 import powderdsl as package
 from powderdsl.diagnostics import CompileError
-from powderdsl.draw import to_numpy
+from powderdsl.simulation.draw import to_numpy
 
 PACK = """\
 pack: quotients
@@ -137,6 +137,6 @@ def test_constants_are_divided_when_rules_are_read(tmp_path):
         "passes: {p: {do: a -> b if -7 div 2 == -4 and 7 div -2 == -4 and 7 div 2 * 2 + 7 mod 2 == 7}}\n"
         "tests: [{t: {given: a, after: 1 step, expect: b}}]\n"
     )
-    from powderdsl.pack_tests import run_examples
+    from powderdsl.testing.pack_tests.runner import run_examples
 
     assert [one.problem for one in run_examples(package.load(path))] == [""]

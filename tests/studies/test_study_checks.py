@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from powderdsl.cli.study_checks import check_study
-from powderdsl.cli.study_command import called, commands
-from powderdsl.cli.study_measures import LEADS_TO, values_of_agent, values_of_world_model
+from powderdsl.cli.commands.study import called, commands
+from powderdsl.cli.study.checks import check_study
+from powderdsl.cli.study.measures import LEADS_TO, values_of_agent, values_of_world_model
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
-from powderdsl.studies.study import Study
-from powderdsl.studies.study_file import load_study, read_study, shipped_studies
+from powderdsl.experiments.studies.file import load_study, read_study, shipped_studies
+from powderdsl.experiments.studies.study import Study
 from tests.cli.commands import powderdsl
 
 AGENTS = """

@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 import pytest
 
-from powderdsl.cli.study_command import CALLED, MEANS, commands
+from powderdsl.cli.commands.study import CALLED, MEANS, commands
 from powderdsl.diagnostics import CompileError
-from powderdsl.studies.study_file import load_study
-from powderdsl.studies.study_paths import FILE, RULES, RUN_OR_TASK, TASK, confined
-from powderdsl.studies.study_run import StudyRun
+from powderdsl.experiments.studies.file import load_study
+from powderdsl.experiments.studies.paths import FILE, RULES, RUN_OR_TASK, TASK, confined
+from powderdsl.experiments.studies.run import StudyRun
 from tests.cli.commands import powderdsl
 
 STUDY = """
@@ -136,8 +136,7 @@ def test_every_word_that_stands_for_a_value_is_known():
     from importlib import import_module
 
     for words in CALLED:
-        name = {"train": "train_command", "evaluate": "evaluate_command", "wm": "wm_command"}[words[0]]
-        command: click.Command = import_module(f"powderdsl.cli.{name}").command
+        command: click.Command = import_module(f"powderdsl.cli.commands.{words[0]}").command
         for word in words[1:]:
             command = command.commands[word]  # type: ignore[attr-defined]
         for one in command.params:

@@ -8,7 +8,7 @@ import pytest
 
 from powderdsl.compiler import load_with_diagnostics, read
 from powderdsl.diagnostics import Reporter
-from powderdsl.tasks import task_file
+from powderdsl.tasks import file
 
 RULES = "powderworld"
 
@@ -28,5 +28,5 @@ def _rules_once(monkeypatch: pytest.MonkeyPatch) -> None:
     def read_names(names, reporter):  # type: ignore[no-untyped-def]
         return loaded()[1] if list(names) == [RULES] else read(names, reporter)
 
-    monkeypatch.setattr(task_file, "load_with_diagnostics", load)
-    monkeypatch.setattr(task_file, "read", read_names)
+    monkeypatch.setattr(file, "load_with_diagnostics", load)
+    monkeypatch.setattr(file, "read", read_names)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from powderdsl.diagnostics import CompileError, Reporter, Source
-from powderdsl.tasks.shipped_tasks import load_task
-from powderdsl.tasks.task_file import read_task
+from powderdsl.tasks.file import read_task
+from powderdsl.tasks.shipped import load_task
 
 HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\n"
 NOISE = "generate:\n" + "".join(
@@ -29,7 +29,7 @@ def task_of(text: str):
 def program_of():
     """Programs of tasks on one simulator: they all have the same rules."""
     from powderdsl.compiler import load
-    from powderdsl.simulator import compile as compile_rules
+    from powderdsl.simulation.simulator import compile as compile_rules
     from powderdsl.tasks.episodes import TaskProgram
 
     simulator = compile_rules(load("powderworld"), "torch")

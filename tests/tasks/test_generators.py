@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
-from powderdsl.tasks.shipped_tasks import load_task
-from powderdsl.tasks.task_file import read_task
-from powderdsl.tasks.task_names import shipped_tasks
+from powderdsl.tasks.file import read_task
+from powderdsl.tasks.names import shipped_tasks
+from powderdsl.tasks.shipped import load_task
 from powderdsl.worlds.raster import mask
 from powderdsl.worlds.scene import load_scenes
 from powderdsl.worlds.scene.fixed import shape_of
@@ -28,7 +28,7 @@ def task_of(text: str):
 
 
 def maker(torch, task, split: str = "train", variant: int = 0):
-    from powderdsl.tasks.torch_generator import WorldMaker
+    from powderdsl.tasks.tensors.generator import WorldMaker
 
     return WorldMaker(task.split(split).variants[variant], task.size, torch.device("cpu"))
 
@@ -76,7 +76,7 @@ generate:
 
 
 def test_a_world_is_the_same_alone_and_in_any_batch(torch, monkeypatch):
-    from powderdsl.tasks import torch_generator
+    from powderdsl.tasks.tensors import generator
 
     one = maker(torch, task_of(EVERYTHING))
     seeds = torch.tensor([0, 7, 2**40, 3, 12_345, 2**62])
@@ -87,7 +87,7 @@ def test_a_world_is_the_same_alone_and_in_any_batch(torch, monkeypatch):
         assert torch.equal(alone.ids, together.ids[order])
         assert torch.equal(alone.regions["spot"], together.regions["spot"][order])
         assert torch.equal(alone.targets["wanted"], together.targets["wanted"][order])
-    monkeypatch.setattr(torch_generator, "CHUNK_CELLS", 2 * 64 * 64)
+    monkeypatch.setattr(generator, "CHUNK_CELLS", 2 * 64 * 64)
     chunked = one.make(seeds)
     assert torch.equal(chunked.ids, together.ids)
     assert torch.equal(chunked.regions["left_half"], together.regions["left_half"])

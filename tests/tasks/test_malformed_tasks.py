@@ -9,8 +9,8 @@ import pytest
 
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.diagnostics.render import render_text
-from powderdsl.tasks.shipped_tasks import load_task
-from powderdsl.tasks.task_file import read_task
+from powderdsl.tasks.file import read_task
+from powderdsl.tasks.shipped import load_task
 
 GOOD = """task: yard
 rules: powderworld

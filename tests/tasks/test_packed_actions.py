@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
-from powderdsl.tasks.task_file import read_task
+from powderdsl.tasks.file import read_task
 
 TASK = """task: packed
 rules: powderworld

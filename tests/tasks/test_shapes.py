@@ -53,7 +53,7 @@ NUMBERS: dict[str, st.SearchStrategy[Any]] = {
 
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_batches_cover_the_same_cells(torch, kind):
-    from powderdsl.tasks.torch_shapes import covered_rows, unpack, words_of_rows
+    from powderdsl.tasks.tensors.shapes import covered_rows, unpack, words_of_rows
 
     @settings(max_examples=60, deadline=None, derandomize=True)
     @given(batch=st.lists(NUMBERS[kind], min_size=1, max_size=6), size=SIZES)
@@ -74,7 +74,7 @@ def test_batches_cover_the_same_cells(torch, kind):
 def test_bits_and_cells_are_the_same(seed, size):
     import torch
 
-    from powderdsl.tasks.torch_shapes import pack, unpack
+    from powderdsl.tasks.tensors.shapes import pack, unpack
 
     ids = torch.from_numpy(np.random.default_rng(seed).integers(0, 16, (3, *size), dtype=np.uint8))
     planes = [pack((ids >> place & 1).bool()) for place in range(4)]
@@ -82,7 +82,7 @@ def test_bits_and_cells_are_the_same(seed, size):
 
 
 def test_whole_roots_are_exact(torch):
-    from powderdsl.tasks.torch_shapes import root
+    from powderdsl.tasks.tensors.shapes import root
 
     n = torch.tensor([0, 1, 2, 3, 4, 2**26, 2**25 - 1, 67_108_863])
     assert torch.equal(root(n * n), n)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from powderdsl.tasks.shipped_tasks import load_task
-from powderdsl.tasks.task_names import shipped_tasks
+from powderdsl.tasks.names import shipped_tasks
+from powderdsl.tasks.shipped import load_task
 from tests.tasks.conftest import RULES
 from tests.tasks.witnesses import WITNESSES, Act, Seen
 

@@ -16,8 +16,8 @@ import torch
 
 import powderdsl
 from powderdsl.diagnostics import CompileError
-from powderdsl.runs.checkpoints import latest_checkpoint, save_checkpoint
-from powderdsl.worlds.archives import BadArchive, open_archive
+from powderdsl.experiments.runs.checkpoints import latest_checkpoint, save_checkpoint
+from powderdsl.system.archives import BadArchive, open_archive
 from powderdsl.worlds.raster import MAX_CELLS
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.bounded_files import check_links, inside, parse_json, read_bytes, read_json
 from powderdsl.compiler import split_names
 from powderdsl.diagnostics import CompileError
-from powderdsl.worlds.files import replacing
+from powderdsl.system.reading import check_links, inside, parse_json, read_bytes, read_json
+from powderdsl.system.writing import replacing
 from tests.cli.commands import PACK
 from tests.cli.commands import powderdsl as command
 

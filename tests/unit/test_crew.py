@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from powderdsl.testing.crew import Done, Lost, work_through
+from powderdsl.system.crew import Done, Lost, work_through
 from tests.unit.crew_work import work
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from powderdsl.draw import contact_sheet, palette, rgb, scale, to_numpy
+from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale, to_numpy
 from tests.unit.elements import ELEMENTS, ID
 
 COLORS = palette(ELEMENTS)
@@ -156,7 +156,7 @@ def test_to_numpy_takes_tensors_that_know_their_gradient():
 
 def test_drawing_arrays_does_not_import_torch():
     code = (
-        "import sys, numpy; from powderdsl.draw import rgb; import powderdsl.terminal, powderdsl.media;"
+        "import sys, numpy; from powderdsl.simulation.draw import rgb; import powderdsl.cli.terminal, powderdsl.simulation.media;"
         "rgb(numpy.zeros((1, 1), int), ['#000000']); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

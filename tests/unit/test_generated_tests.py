@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.diagnostics import Source
-from powderdsl.mutation.distinguishing import distinguish
-from powderdsl.mutation.original import Original
-from powderdsl.mutation.written import GeneratedTest, with_tests, written_test
-from powderdsl.pack_tests import run_examples
-from powderdsl.simulator import compile
-from powderdsl.testing.cases import load_text
+from powderdsl.simulation.simulator import compile
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.mutation.distinguishing import distinguish
+from powderdsl.testing.mutation.original import Original
+from powderdsl.testing.mutation.written import GeneratedTest, with_tests, written_test
+from powderdsl.testing.pack_tests.runner import run_examples
 
 NEW = GeneratedTest("p", "generated x", "- generated x:\n    given: a\n    expect: a\n")
 HEAD = 'pack: p\nelements: {a: {id: 0, color: "#101010", glyph: a}}\n'

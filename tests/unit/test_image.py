@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.draw import palette, rgb
-from powderdsl.media import write_png
+from powderdsl.simulation.draw import palette, rgb
+from powderdsl.simulation.media import write_png
 from powderdsl.worlds.image import MAX_REPORTED, read_image
 from tests.unit.elements import ELEMENTS
 

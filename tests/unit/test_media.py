@@ -13,11 +13,11 @@ import pytest
 import torch
 from PIL import Image
 
-from powderdsl import media
 from powderdsl.diagnostics import CompileError
-from powderdsl.draw import palette, rgb, scale
-from powderdsl.media import write_gif, write_mp4, write_png
-from powderdsl.worlds.files import replacing
+from powderdsl.simulation import media
+from powderdsl.simulation.draw import palette, rgb, scale
+from powderdsl.simulation.media import write_gif, write_mp4, write_png
+from powderdsl.system.writing import replacing
 from tests.unit.elements import ELEMENTS
 
 COLORS = palette(ELEMENTS)

@@ -16,12 +16,13 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from powderdsl.backends import cuda_build, native_cache
-from powderdsl.backends.cuda_source import KernelSource
-from powderdsl.backends.native_build import Building, build, building, run_guarded
-from powderdsl.backends.native_compilers import Compiler, NoCompiler, find_compiler, flags_for
-from powderdsl.backends.native_layout import Layout
-from powderdsl.scratch import is_scratch, scratch_folder
+from powderdsl.system.scratch import is_scratch, scratch_folder
+from powderdsl.targets import cache
+from powderdsl.targets.cpp.build import Building, build, building, run_guarded
+from powderdsl.targets.cpp.compilers import Compiler, NoCompiler, find_compiler, flags_for
+from powderdsl.targets.cuda import build as cuda_build
+from powderdsl.targets.cuda.source import KernelSource
+from powderdsl.targets.layout import Layout
 from tests.cli.commands import environment_with
 from tests.processes import alive, waited
 
@@ -33,10 +34,10 @@ def put(folder: Path, key: str, data: bytes, used: float | None = None) -> Path:
     with scratch_folder(folder) as scratch:
         built = scratch / "built"
         built.mkdir()
-        (built / native_cache.LIBRARY).write_bytes(data)
-        library = native_cache.add(folder, key, built, ABOUT)
+        (built / cache.LIBRARY).write_bytes(data)
+        library = cache.add(folder, key, built, ABOUT)
     if used is not None:
-        os.utime(folder / key / native_cache.ABOUT, (time.time() - used,) * 2)
+        os.utime(folder / key / cache.ABOUT, (time.time() - used,) * 2)
     return library
 
 
@@ -50,13 +51,13 @@ def names(folder: Path) -> set[str]:
 def test_a_library_is_found_with_what_is_known_of_it(tmp_path: Path) -> None:
     library = put(tmp_path, "a", b"code", used=100)
     put(tmp_path, "b", b"more code")
-    assert [entry.key for entry in native_cache.entries(tmp_path)] == ["b", "a"]
-    assert native_cache.find(tmp_path, "a") == library
-    first, second = native_cache.entries(tmp_path)  # a has just been used
+    assert [entry.key for entry in cache.entries(tmp_path)] == ["b", "a"]
+    assert cache.find(tmp_path, "a") == library
+    first, second = cache.entries(tmp_path)  # a has just been used
     assert {first.key, second.key} == {"a", "b"}
     assert first.age < 50
     assert (first.about.ruleset, second.about.ruleset) == ("yard", "yard")
-    assert native_cache.find(tmp_path, "c") is None
+    assert cache.find(tmp_path, "c") is None
 
 
 @pytest.mark.parametrize(
@@ -77,44 +78,44 @@ def test_a_library_is_found_with_what_is_known_of_it(tmp_path: Path) -> None:
 def test_a_damaged_library_counts_as_absent_and_is_replaced(tmp_path: Path, damage: object) -> None:
     put(tmp_path, "a", b"code")
     damage(tmp_path / "a")  # type: ignore[operator]
-    assert native_cache.find(tmp_path, "a") is None
-    native_cache.entries(tmp_path)
+    assert cache.find(tmp_path, "a") is None
+    cache.entries(tmp_path)
     library = put(tmp_path, "a", b"code")
-    assert native_cache.find(tmp_path, "a") == library
+    assert cache.find(tmp_path, "a") == library
 
 
 def test_beyond_the_limit_the_least_recently_used_go(tmp_path: Path) -> None:
     for i, key in enumerate("abcd"):
         put(tmp_path, key, bytes(100), used=1000 - i)
-    native_cache.find(tmp_path, "a")
-    native_cache.tidy(tmp_path, limit=200)
+    cache.find(tmp_path, "a")
+    cache.tidy(tmp_path, limit=200)
     assert names(tmp_path) == {"a", "d"}
-    native_cache.tidy(tmp_path, limit=50, keep="d")  # what was just made stays, even if it is too much
+    cache.tidy(tmp_path, limit=50, keep="d")  # what was just made stays, even if it is too much
     assert names(tmp_path) == {"d"}
 
 
 def test_only_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
     put(tmp_path, "a", b"code")
-    native_cache.write_json(tmp_path / "needed.json", {"library": "a"})
-    native_cache.write_json(tmp_path / "orphan.json", {"library": "z"})
+    cache.write_json(tmp_path / "needed.json", {"library": "a"})
+    cache.write_json(tmp_path / "orphan.json", {"library": "z"})
     (tmp_path / ".powderdsl-0123456789abcdef").mkdir()
     (tmp_path / "a.lock").touch()
     for place in tmp_path.iterdir():
-        os.utime(place, (time.time() - 2 * native_cache.UNUSED,) * 2)
+        os.utime(place, (time.time() - 2 * cache.UNUSED,) * 2)
     with scratch_folder(tmp_path) as mine, FileLock(tmp_path / "b.lock"):
-        native_cache.tidy(tmp_path)
+        cache.tidy(tmp_path)
         assert names(tmp_path) == {"a", "needed.json", mine.name, "b.lock"}
 
 
 def test_clear(tmp_path: Path) -> None:
     for key, used in (("a", 10.0), ("b", 1000.0)):
         put(tmp_path, key, b"code", used)
-        native_cache.write_json(tmp_path / f"start-{key}.json", {"library": key})
-    assert [entry.key for entry in native_cache.clear(tmp_path, older_than=100)] == ["b"]
-    assert native_cache.find(tmp_path, "a") is not None
+        cache.write_json(tmp_path / f"start-{key}.json", {"library": key})
+    assert [entry.key for entry in cache.clear(tmp_path, older_than=100)] == ["b"]
+    assert cache.find(tmp_path, "a") is not None
     (tmp_path / "damaged").mkdir()
     with scratch_folder(tmp_path) as being_built:
-        assert [entry.key for entry in native_cache.clear(tmp_path)] == ["a"]
+        assert [entry.key for entry in cache.clear(tmp_path)] == ["a"]
         assert names(tmp_path) == {being_built.name}
 
 
@@ -125,7 +126,7 @@ def test_a_cache_that_cannot_be_written_still_serves(tmp_path: Path, monkeypatch
         raise PermissionError
 
     monkeypatch.setattr(os, "utime", refuse)
-    assert native_cache.find(tmp_path, "a") == library
+    assert cache.find(tmp_path, "a") == library
 
 
 # --- compilers
@@ -208,7 +209,7 @@ def test_without_a_compiler_all_that_were_tried_are_named(
 ) -> None:
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr("powderdsl.backends.native_compilers.find_spec", lambda name: None)
+    monkeypatch.setattr("powderdsl.targets.cpp.compilers.find_spec", lambda name: None)
     with pytest.raises(NoCompiler, match=r"tried g\+\+, c\+\+, clang\+\+, the package ziglang"):
         find_compiler()
     fake(tmp_path, "clang++", "clang version 9")
@@ -240,7 +241,7 @@ def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.Mon
 BUILD = """
 import sys
 from pathlib import Path
-from powderdsl.backends.native_build import Building, build, building
+from powderdsl.targets.cpp.build import Building, build, building
 with building(Building("-O0", Path(sys.argv[1]))):
     print(build("// source\\n", "yard").read_text())
 """
@@ -286,7 +287,7 @@ def test_a_fork_that_ends_does_not_end_its_parents_compiler(tmp_path: Path) -> N
     program = """
 import os, sys, threading, time
 from pathlib import Path
-from powderdsl.backends.native_build import run_guarded
+from powderdsl.targets.cpp.build import run_guarded
 scratch = Path(sys.argv[1])
 found = []
 thread = threading.Thread(target=lambda: found.append(run_guarded(["sleep", "2"], scratch)))
@@ -320,7 +321,7 @@ def test_what_cannot_be_run_says_so(tmp_path: Path) -> None:
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from powderdsl.user_cache import cache_folder
+    from powderdsl.system.user_cache import cache_folder
     from tests.cli.commands import powderdsl
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -371,5 +372,5 @@ def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.Monk
     wanted = [(a, "sm_90"), (a, "sm_80"), (a, "sm_90"), (b, "sm_90")]
     assert [cuda_build.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
     assert compiled == ["a", "a", "b"]
-    found = native_cache.entries(tmp_path / "powderdsl" / "native")
+    found = cache.entries(tmp_path / "powderdsl" / "native")
     assert [one.about.backend for one in found] == ["cuda"] * 3

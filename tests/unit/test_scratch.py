@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl import scratch
-from powderdsl.scratch import is_scratch, scratch_file, scratch_folder, sweep
-from powderdsl.worlds.files import replacing
+from powderdsl.system import scratch
+from powderdsl.system.scratch import is_scratch, scratch_file, scratch_folder, sweep
+from powderdsl.system.writing import replacing
 from tests.cli.commands import environment_with
 from tests.processes import started, waited
 
 HOLDING = """
 import sys, time
 from pathlib import Path
-from powderdsl.scratch import scratch_file, scratch_folder
+from powderdsl.system.scratch import scratch_file, scratch_folder
 place = Path(sys.argv[1])
 with scratch_folder(place) as folder, scratch_file(place / "world.npz") as file:
     (folder / "inner").mkdir()
@@ -90,7 +90,7 @@ def test_a_fork_removes_nothing_of_its_parents(tmp_path: Path) -> None:
     program = """
 import os, sys
 from pathlib import Path
-from powderdsl.scratch import scratch_file
+from powderdsl.system.scratch import scratch_file
 with scratch_file(Path(sys.argv[1]) / "x") as path:
     pid = os.fork()
     if pid == 0:
@@ -120,8 +120,8 @@ def test_many_processes_may_write_to_one_folder(tmp_path: Path) -> None:
     program = """
 import sys
 from pathlib import Path
-from powderdsl import scratch
-from powderdsl.worlds.files import replacing
+from powderdsl.system import scratch
+from powderdsl.system.writing import replacing
 for turn in range(300):
     scratch._swept.clear()
     with replacing(Path(sys.argv[1]) / "x.txt") as path:

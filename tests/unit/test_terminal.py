@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from powderdsl import terminal
-from powderdsl.draw import palette, rgb
-from powderdsl.terminal import LiveView, render_frame
+from powderdsl.cli import terminal
+from powderdsl.cli.terminal import LiveView, render_frame
+from powderdsl.simulation.draw import palette, rgb
 from tests.unit.elements import ELEMENTS
 
 COLORS = palette(ELEMENTS)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from powderdsl.simulator import compile as compile_rules
+from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.worldmodel import DataConfig, Replay, TaskWorlds, pairs_of, task_worlds, unseen_seeds
 from powderdsl.worldmodel.pairs import TEST_SEEDS

@@ -14,17 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.runs import RunFolder
-from powderdsl.runs.metrics import read_metrics
-from powderdsl.worldmodel import (
-    DataConfig,
-    Machine,
-    TrainConfig,
-    evaluate,
-    finetuned,
-    load_trained,
-    train,
-)
+from powderdsl.experiments.runs import RunFolder
+from powderdsl.experiments.runs.metrics import read_metrics
+from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, finetuned, load_trained, train
 from powderdsl.worldmodel.scores import unseen_worlds
 from powderdsl.worldmodel.training import Moment
 from tests.processes import started, waited

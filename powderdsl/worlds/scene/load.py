@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.types import Element
 from powderdsl.syntax.sources import read_source
-from powderdsl.worlds.files import failure
+from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, paint
 from powderdsl.worlds.scene.read import SIZE_RULE, Scene, read_scenes
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.diagnostics import Reporter, suggest
-from powderdsl.model.field_words import WordProblem, read_word
+from powderdsl.model.fields.words import WordProblem, read_word
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.worlds.raster import Paint, Setting, Size, mask

@@ -1,0 +1,214 @@
+"""The ledger as text for people, and as plain data for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from powderdsl.analysis.ledger.book import Ledger, RuleEntry
+from powderdsl.analysis.ledger.changes import RuleLine
+from powderdsl.analysis.ledger.field_writes import FieldEntry
+from powderdsl.analysis.ledger.overlaps import OUTCOMES
+
+SCHEMA = 1
+"""The version of the JSON form. It changes when a key changes its meaning or goes; new keys may come without."""
+
+
+def ledger_text(ledger: Ledger) -> str:
+    """The whole ledger, ends with a line break; equal rules give equal texts."""
+    blocks = [_head(ledger), _sums(ledger), _sources(ledger)]
+    blocks += [_element(ledger, name) for name in ledger.elements]
+    blocks += [_rules(ledger), _fields(ledger), _overlaps(ledger)]
+    return "\n\n".join("\n".join(block) for block in blocks) + "\n"
+
+
+def _head(ledger: Ledger) -> Iterator[str]:
+    yield f"ledger of {ledger.name}: {len(ledger.elements)} elements, {len(ledger.rules)} lines of rules"
+    yield "What is not listed cannot happen: in worlds of any size and content, with any parameters."
+    if not ledger.complete:
+        yield "Not decided in full: the rules are too many. What could not be excluded in time is listed."
+
+
+def _sums(ledger: Ledger) -> Iterator[str]:
+    yield "sums of cells"
+    for title, sums in (
+        ("constant", ledger.constant_sums),
+        ("never falls", ledger.rising_sums),
+        ("never rises", ledger.falling_sums),
+    ):
+        for names in sums:
+            yield f"  {title:<12} {_sum(names, ledger)}"
+
+
+def _sum(names: tuple[str, ...], ledger: Ledger) -> str:
+    """`a + b`; the larger half of all elements the other way round."""
+    others = [name for name in ledger.elements if name not in names]
+    if not others:
+        return "all cells"
+    return "all but " + " and ".join(others) if len(others) < 3 < len(names) else " + ".join(names)
+
+
+def _sources(ledger: Ledger) -> Iterator[str]:
+    made = {after for _, after in ledger.changes}
+    never = [name for name in ledger.elements if name not in made]
+    copied = [name for name in ledger.elements if name in made and ledger.never_appears(name)]
+    standing = [name for name in ledger.elements if ledger.unchanged(name)]
+    yield "elements"
+    yield f"  no rule makes: {_listed(never)}"
+    yield f"  made only in worlds that hold them already: {_listed(copied)}"
+    yield f"  stay where they are for good: {_listed(standing)}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _element(ledger: Ledger, name: str) -> Iterator[str]:
+    yield f"{name}: its number {TRENDS[trend(ledger, name)]}"
+    rows = []
+    for entry in ledger.rules:
+        made = [before for before, after in entry.changes if after == name]
+        lost = [after for before, after in entry.changes if before == name]
+        rows += [("made from", made, entry)] if made else []
+        rows += [("becomes", lost, entry)] if lost else []
+    for verb in ("made from", "becomes"):
+        yield from (f"  {verb} {_listed(names)}: {_place(e.rule)}" for word, names, e in rows if word == verb)
+    moved = [_place(entry.rule) for entry in ledger.rules if name in entry.moves]
+    if moved:
+        yield f"  moved: {_listed(moved)}"
+
+
+TRENDS = {
+    "constant": "is constant",
+    "never falls": "never falls",
+    "never rises": "never rises",
+    "not decided": "may rise and fall",
+}
+"""What can be said of an element's number of cells, for JSON, and in words."""
+
+
+def trend(ledger: Ledger, name: str) -> str:
+    """One of TRENDS."""
+    if ledger.conserved({name: 1}):
+        return "constant"
+    if ledger.never_falls([name]):
+        return "never falls"
+    return "never rises" if ledger.never_rises([name]) else "not decided"
+
+
+def _place(rule: RuleLine) -> str:
+    return f"{rule} ({rule.pass_name})"
+
+
+def _rules(ledger: Ledger) -> Iterator[str]:
+    yield "lines of rules"
+    for entry in ledger.rules:
+        yield f"  {_place(entry.rule)}: {entry.rule.text}"
+        if not entry.fires:
+            yield "    never happens: no cell of any world can fulfil it"
+        elif entry.needs:
+            yield f"    never happens without {', and without '.join(_one_of(names) for names in entry.needs)}"
+
+
+def _one_of(names: tuple[str, ...]) -> str:
+    return names[0] if len(names) == 1 else f"one of ({', '.join(names)})"
+
+
+def _fields(ledger: Ledger) -> Iterator[str]:
+    yield "fields" if ledger.fields else "fields: none"
+    for entry in ledger.fields:
+        place = "travels with its element" if entry.travels else "stays in its place"
+        yield f"  {entry.name}: {entry.kind}{_bounds(entry)}, starts as {entry.default}, {place}"
+        yield f"    written: {_listed(_place(line) for line in entry.writers)}"
+
+
+def _bounds(entry: FieldEntry) -> str:
+    if entry.fresh_bounds is None or entry.fresh_bounds == entry.bounds:
+        return ""
+    return f", within {entry.fresh_bounds[0]:g}..{entry.fresh_bounds[1]:g} unless set by hand"
+
+
+def _overlaps(ledger: Ledger) -> Iterator[str]:
+    yield "lines that may meet" if ledger.overlaps else "lines that may meet: none"
+    for outcome, words in OUTCOMES.items():
+        found = [one for one in ledger.overlaps if one.outcome == outcome]
+        if found:
+            yield f"  {words}"
+        for one in found:
+            what = f"{one.field}: " if one.field else ""
+            other = _place(one.second) if one.second != one.first else "another copy of it"
+            yield f"    {what}{_place(one.first)} and {other}"
+
+
+# JSON
+
+
+def ledger_data(ledger: Ledger) -> dict[str, Any]:
+    """The ledger as plain lists and mappings: the form is in docs/testing.md."""
+    numbers = {entry.rule: number for number, entry in enumerate(ledger.rules)}
+    return {
+        "schema": SCHEMA,
+        "name": ledger.name,
+        "complete": ledger.complete,
+        "constant_sums": [list(names) for names in ledger.constant_sums],
+        "never_falls": [list(names) for names in ledger.rising_sums],
+        "never_rises": [list(names) for names in ledger.falling_sums],
+        "elements": [_element_data(ledger, name, numbers) for name in ledger.elements],
+        "rules": [_rule_data(entry) for entry in ledger.rules],
+        "fields": [_field_data(entry, numbers) for entry in ledger.fields],
+        "overlaps": [
+            {
+                "outcome": one.outcome,
+                "field": one.field or None,
+                "rules": [numbers[one.first], numbers[one.second]],
+            }
+            for one in ledger.overlaps
+        ],
+    }
+
+
+def _element_data(ledger: Ledger, name: str, numbers: dict[RuleLine, int]) -> dict[str, Any]:
+    return {
+        "name": name,
+        "number": trend(ledger, name),
+        "unchanged": bool(ledger.unchanged(name)),
+        "never_appears": bool(ledger.never_appears(name)),
+        "made_from": _pairs_data(ledger, name, 1, numbers),
+        "becomes": _pairs_data(ledger, name, 0, numbers),
+        "moved_by": [numbers[entry.rule] for entry in ledger.rules if name in entry.moves],
+    }
+
+
+def _pairs_data(ledger: Ledger, name: str, side: int, numbers: dict[RuleLine, int]) -> dict[str, list[int]]:
+    """The other elements of the changes that have this one on one side, and the numbers of the lines."""
+    return {
+        pair[1 - side]: [numbers[line] for line in lines]
+        for pair, lines in ledger.changes.items()
+        if pair[side] == name
+    }
+
+
+def _rule_data(entry: RuleEntry) -> dict[str, Any]:
+    return {
+        "rule": entry.rule.text,
+        "where": str(entry.rule),
+        "pass": entry.rule.pass_name,
+        "pack": entry.rule.pack,
+        "fires": entry.fires,
+        "changes": [list(pair) for pair in entry.changes],
+        "moves": list(entry.moves),
+        "needs": [list(names) for names in entry.needs],
+        "copies": list(entry.copies),
+    }
+
+
+def _field_data(entry: FieldEntry, numbers: dict[RuleLine, int]) -> dict[str, Any]:
+    return {
+        "name": entry.name,
+        "kind": entry.kind,
+        "default": entry.default,
+        "travels": entry.travels,
+        "bounds": None if entry.bounds is None else list(entry.bounds),
+        "fresh_bounds": None if entry.fresh_bounds is None else list(entry.fresh_bounds),
+        "written_by": [numbers[line] for line in entry.writers],
+    }

@@ -1,0 +1,267 @@
+"""The ledger of a ruleset: what its rules create, destroy and move, and what follows for all worlds.
+
+A verdict `Proven` holds for worlds of every size and every content, for all parameter values and all random numbers
+that streams draw, at every step. `NotProven` names the lines of rules that stand in the way: it is no proof of the
+contrary, for several rules may make up for each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+from powderdsl.analysis.ledger.absent import Wants, find_wants, named_by_fields
+from powderdsl.analysis.ledger.changes import Found, RuleLine, find_changes, ledger_facts
+from powderdsl.analysis.ledger.field_writes import FieldEntry, find_fields
+from powderdsl.analysis.ledger.overlaps import Overlap, find_overlaps
+from powderdsl.analysis.ledger.sums import constant_sums, falling_sums, in_order, rising_sums
+from powderdsl.model.types import Ruleset
+
+
+@dataclass(frozen=True)
+class Proven:
+    """It holds in every world, at every step. `given` says what a world must fulfil once, at the start, if anything."""
+
+    reason: str
+    given: str = ""
+
+    def __bool__(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True)
+class NotProven:
+    """Not decided: these lines may break it."""
+
+    reason: str
+    rules: tuple[RuleLine, ...] = ()
+
+    def __bool__(self) -> bool:
+        return False
+
+
+Verdict = Proven | NotProven
+
+
+@dataclass(frozen=True)
+class RuleEntry:
+    """What one line may do, at most.
+
+    `changes` are pairs (before, after) of elements: in a cell where the first was, the second is. `moves` are the
+    elements that it carries away or pushes aside. `fires` is False if it is proven never to happen.
+
+    Of each of `needs` one element must exist, or the line cannot happen. `copies` are elements that it makes only where
+    they exist already. To exist is to be held by a cell, or named by a field, at the start of
+    the step or earlier in it.
+    """
+
+    rule: RuleLine
+    fires: bool
+    changes: tuple[tuple[str, str], ...]
+    moves: tuple[str, ...]
+    needs: tuple[tuple[str, ...], ...]
+    copies: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """What the rules of a ruleset do, line by line, and what can be concluded. Elements go by their names.
+
+    `complete` is False if the rules were too many to be asked about everything: then more is taken for possible.
+    `named` are the elements that fields may name although no cell ever held them.
+    """
+
+    name: str
+    elements: tuple[str, ...]
+    rules: tuple[RuleEntry, ...]
+    fields: tuple[FieldEntry, ...]
+    overlaps: tuple[Overlap, ...]
+    named: tuple[str, ...]
+    complete: bool
+
+    @cached_property
+    def changes(self) -> dict[tuple[str, str], tuple[RuleLine, ...]]:
+        """Every pair (before, after) that some rule may bring about, and the lines that may."""
+        found: dict[tuple[str, str], tuple[RuleLine, ...]] = {}
+        for entry in self.rules:
+            for pair in entry.changes:
+                found[pair] = (*found.get(pair, ()), entry.rule)
+        return found
+
+    @cached_property
+    def constant_sums(self) -> tuple[tuple[str, ...], ...]:
+        """The smallest sums of elements that are constant: see `sums.constant_sums`."""
+        return constant_sums(self.elements, self.changes)
+
+    @cached_property
+    def rising_sums(self) -> tuple[tuple[str, ...], ...]:
+        """The smallest sums of elements that never fall and are not constant: see `sums.rising_sums`."""
+        return rising_sums(self.elements, self.changes)
+
+    @cached_property
+    def falling_sums(self) -> tuple[tuple[str, ...], ...]:
+        """The smallest sums of elements that never rise and are not constant."""
+        return falling_sums(self.elements, self.changes)
+
+    def conserved(self, weights: Mapping[str, int]) -> Verdict:
+        """Whether the weighted number of cells is constant: ``{"a": 1, "b": 1}`` is the sum of two elements.
+
+        Elements that are not named count 0. Raises KeyError for a name that is no element.
+        """
+        return self._weighed(weights, "changes", lambda before, after: before != after)
+
+    def never_rises(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
+        """Whether the (weighted) number of cells with these elements never rises. Raises KeyError as `conserved`."""
+        return self._weighed(_weights(what), "rises", lambda before, after: before < after)
+
+    def never_falls(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
+        """Whether the (weighted) number of cells with these elements never falls. Raises KeyError as `conserved`."""
+        return self._weighed(_weights(what), "falls", lambda before, after: before > after)
+
+    def unchanged(self, element: str) -> Verdict:
+        """Whether a cell with this element keeps it for good. Others may still become it: see `never_rises`.
+
+        Raises KeyError for a name that is no element.
+        """
+        self._known([element])
+        lines = [
+            entry.rule
+            for entry in self.rules
+            if element in entry.moves or any(before == element for before, _ in entry.changes)
+        ]
+        if not lines:
+            return Proven(f"no rule moves `{element}` or turns it into anything")
+        return NotProven(f"`{element}` may be moved or become something else", tuple(lines))
+
+    def never_appears(self, element: str) -> Verdict:
+        """Whether a world that starts without this element, in cells and in fields, stays without it.
+
+        Raises KeyError for a name that is no element.
+        """
+        self._known([element])
+        makers = [
+            entry.rule
+            for entry in self.rules
+            if any(after == element for _, after in entry.changes)
+            and element not in entry.copies
+            and (element,) not in entry.needs
+        ]
+        if makers:
+            return NotProven(f"`{element}` may come of other elements", tuple(makers))
+        made = any(after == element for _, after in self.changes)
+        return Proven(
+            f"rules make `{element}` only where it is already" if made else f"no rule makes `{element}`"
+        )
+
+    def reach(self, start: Iterable[str]) -> tuple[str, ...]:
+        """All elements that a world can ever hold, if it starts with these and its fields were not set by hand.
+
+        Raises KeyError for a name that is no element.
+        """
+        start = dict.fromkeys(start)
+        self._known(start)
+        cells, known = set(start), {*start, *self.named}
+        while True:
+            more = {
+                after
+                for entry in self.rules
+                if all(known.intersection(one) for one in entry.needs)
+                for before, after in entry.changes
+                if before in cells and (after in known or after not in entry.copies)
+            }
+            if more <= cells:
+                return in_order(self.elements, cells)
+            cells |= more
+            known |= more
+
+    def within(self, field: str, low: float, high: float) -> Verdict:
+        """Whether a field's numbers stay within two bounds, in every cell. Both parts of a vector are numbers.
+
+        Raises KeyError for a name that is no field.
+        """
+        entry = next((one for one in self.fields if one.name == field), None)
+        if entry is None:
+            raise KeyError(f"no field `{field}` in {self.name}")
+        if entry.bounds is None:
+            return NotProven(f"`{field}` is no number: it holds {entry.kind}")
+        if low <= entry.bounds[0] and entry.bounds[1] <= high:
+            return Proven(f"`{field}` is declared as {entry.kind}, and every write is cut off there")
+        if entry.fresh_bounds is None:
+            return NotProven(f"`{field}` holds {entry.kind}", entry.writers)
+        if low <= entry.fresh_bounds[0] and entry.fresh_bounds[1] <= high:
+            return Proven(f"no rule writes `{field}` beyond", f"`{field}` within {low:g}..{high:g}")
+        lines = [
+            line
+            for line, lowest, highest in entry.reaches
+            if (lowest is not None and lowest < low) or (highest is not None and highest > high)
+        ]
+        if not lines:
+            return NotProven(f"`{field}` starts outside {low:g}..{high:g}")
+        return NotProven(f"`{field}` may be written beyond {low:g}..{high:g}", tuple(lines))
+
+    def _weighed(self, weights: Mapping[str, int], verb: str, breaks: Callable[[int, int], bool]) -> Verdict:
+        self._known(weights)
+        broken = {
+            (a, b): lines
+            for (a, b), lines in self.changes.items()
+            if breaks(weights.get(a, 0), weights.get(b, 0))
+        }
+        if not broken:
+            return Proven(f"no rule {_DOES[verb]} {_sum_text(weights)}")
+        (before, after), _ = next(iter(broken.items()))
+        lines = tuple(dict.fromkeys(line for found in broken.values() for line in found))
+        more = f", and {len(broken) - 1} changes more" if len(broken) > 1 else ""
+        return NotProven(f"`{before}` may become `{after}`{more}", lines)
+
+    def _known(self, names: Iterable[str]) -> None:
+        for name in names:
+            if name not in self.elements:
+                raise KeyError(f"no element `{name}` in {self.name}")
+
+
+_DOES = {"changes": "alone changes", "rises": "adds to", "falls": "takes from"}
+
+
+def _weights(what: Mapping[str, int] | Iterable[str]) -> Mapping[str, int]:
+    return what if isinstance(what, Mapping) else dict.fromkeys(what, 1)
+
+
+def _sum_text(weights: Mapping[str, int]) -> str:
+    parts = [name if weight == 1 else f"{weight} {name}" for name, weight in weights.items() if weight]
+    return f"`{' + '.join(parts)}`" if parts else "nothing"
+
+
+def ledger(ruleset: Ruleset) -> Ledger:
+    """The ledger of a checked ruleset: decided from its rules, no world is run. Raises TypeError for anything else."""
+    if not isinstance(ruleset, Ruleset):
+        raise TypeError(f"ledger takes a Ruleset, from powderdsl.load; found {type(ruleset).__name__}")
+    parts = [ledger_facts(ruleset) for _ in range(3)]  # each with work of its own
+    names = {element.id: element.name for element in ruleset.elements}
+    found = find_changes(ruleset, parts[0])
+    wants = find_wants(ruleset, parts[1])
+    return Ledger(
+        ruleset.name,
+        tuple(names.values()),
+        tuple(_entry(one, wants.get(one.line), names) for one in found),
+        find_fields(ruleset, found),
+        find_overlaps(ruleset, parts[2]),
+        tuple(_named(named_by_fields(ruleset), names)),
+        all(facts.budget.left > 0 for facts in parts),
+    )
+
+
+def _entry(found: Found, wants: Wants | None, names: Mapping[int, str]) -> RuleEntry:
+    wants = wants or Wants((), frozenset())
+    return RuleEntry(
+        found.line,
+        found.fires,
+        tuple((names[a], names[b]) for a, b in sorted(found.pairs)),
+        tuple(_named(found.moves, names)),
+        tuple(tuple(_named(ids, names)) for ids in wants.needs),
+        tuple(_named(wants.copies & {after for _, after in found.pairs}, names)),
+    )
+
+
+def _named(ids: Iterable[int], names: Mapping[int, str]) -> Iterator[str]:
+    return (names[number] for number in sorted(ids))

@@ -1,0 +1,225 @@
+"""What each line of rules may do: which elements become which, which are moved, which fields are written.
+
+Everything found here is an upper bound. What a rule is not said to do, it cannot do, in no world: the search of
+`model.logic.satisfy` has excluded it. What it is said to do it may do, or the search could not exclude it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+from powderdsl.analysis.reactions import facts_of
+from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
+from powderdsl.model.logic.budget import Budget
+from powderdsl.model.logic.satisfy import Facts, satisfiable
+from powderdsl.model.text import one_line
+from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule, Ruleset, Swap, Transform
+
+HERE: Offset = (0, 0)
+
+BUDGET = 400_000
+"""Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs half of it."""
+
+MAX_QUESTION = 20_000
+"""Nodes evaluated for one question, after which the answer is that it may be."""
+
+MAX_PAIRS = 1024
+"""Pairs of elements that are asked about one by one where a rule computes what a cell becomes."""
+
+Condition = tuple[Expr, Offset]
+Pairs = set[tuple[int, int]]
+
+
+@dataclass(frozen=True, order=True)
+class RuleLine:
+    """A rule as it stands in a file. Loops and symmetries make many rules of one; they are one line."""
+
+    file: str
+    line: int
+    pack: str
+    pass_name: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}"
+
+
+@dataclass
+class Found:
+    """What the rules of one line may do, by ids. `pairs` are (before, after), never of one element."""
+
+    line: RuleLine
+    fires: bool = False
+    pairs: Pairs = field(default_factory=set)
+    moves: set[int] = field(default_factory=set)
+    writes: list[Assign] = field(default_factory=list)
+
+
+@dataclass
+class Asked:
+    """A moment, and how to ask about its rules."""
+
+    moment: Moment
+    facts: Facts
+    lets: dict[str, Expr]
+
+    @classmethod
+    def of(cls, moment: Moment, facts: Facts) -> Asked:
+        return cls(moment, facts, {let.name: let.value for let in moment.lets})
+
+    def may(self, rule: Rule, *more: Condition) -> bool:
+        """Whether the rule may happen while these conditions hold too. False is a proof."""
+        assert rule.mask is not None
+        first = ((rule.mask, HERE), *more)
+        if not possible(self.facts, first, self.lets):
+            return False
+        rivals = self.rivals(rule)
+        return not rivals or possible(self.facts, (*first, *rivals), self.lets)
+
+    def rivals(self, rule: Rule) -> list[Condition]:
+        """What must not hold for the rule to happen, by the moment's conflict policy.
+
+        Under ``drop_both`` no other rule may claim its cells; under ``first_wins`` no transform before it may. An
+        earlier swap or move that is wanted may itself be dropped, so that says nothing.
+        """
+        policy = self.moment.policy
+        if policy == "prove" or isinstance(rule, Assign):
+            return []
+        found: list[Condition] = []
+        cells = footprint(rule)
+        if not isinstance(rule, Transform):  # pairs of one rule that share a cell: none of them happens
+            assert rule.mask is not None
+            dy, dx = rule.offset
+            found += [(negation(rule.mask), rule.offset), (negation(rule.mask), (-dy, -dx))]
+        for other in self.moment.rules:
+            if isinstance(other, Assign):
+                continue
+            if other is rule:
+                if policy == "first_wins":
+                    break
+                continue
+            if policy == "drop_both" or isinstance(other, Transform):
+                for y, x in cells:
+                    found += [(negation(other.mask), (y - dy, x - dx)) for dy, dx in footprint(other)]
+        return found
+
+
+def possible(facts: Facts, conditions: Sequence[Condition], lets: dict[str, Expr]) -> bool:
+    """Whether the conditions may hold together. False is a proof; hard questions are given up, easy ones go on."""
+    with facts.budget.question(MAX_QUESTION):
+        return satisfiable(facts, conditions, lets)
+
+
+def footprint(rule: Rule) -> tuple[Offset, ...]:
+    """The cells that a rule claims, seen from the cell where its condition holds."""
+    return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)
+
+
+def is_(number: int, at: Offset = HERE) -> Condition:
+    return member(ELEMENT_HERE, (number,)), at
+
+
+def is_not(number: int, at: Offset = HERE) -> Condition:
+    return negation(member(ELEMENT_HERE, (number,))), at
+
+
+def ledger_facts(ruleset: Ruleset) -> Facts:
+    """What is known of cells, with work for all questions of one part of a ledger."""
+    return replace(facts_of(ruleset), budget=Budget(BUDGET))
+
+
+def find_changes(ruleset: Ruleset, facts: Facts) -> list[Found]:
+    """What each line may do, in the order in which the lines run first."""
+    found: dict[RuleLine, Found] = {}
+    for pass_ in ruleset.passes:
+        for moment in pass_.moments:
+            asked = Asked.of(moment, facts)
+            for rule in moment.rules:
+                line = rule_line(rule, pass_)
+                _look_at(rule, asked, found.setdefault(line, Found(line)))
+            for rule, pairs in _chains(asked):
+                found[rule_line(rule, pass_)].pairs |= pairs
+    return list(found.values())
+
+
+def rule_line(rule: Rule, pass_: Pass) -> RuleLine:
+    """Where a rule stands."""
+    return RuleLine(rule.span.source.name, rule.span.line, pass_.pack, pass_.name, one_line(rule.span))
+
+
+def _look_at(rule: Rule, asked: Asked, found: Found) -> None:
+    """Add to `found` what one rule of a moment may do."""
+    if not asked.may(rule):
+        return
+    found.fires = True
+    match rule:
+        case Assign():
+            found.writes.append(rule)
+            return
+        case Transform():
+            found.pairs |= set(becomes(rule, asked, found.pairs))
+        case Swap():
+            found.moves |= set(_pushed(rule, asked, found.moves))
+            found.moves |= {
+                a for a in _left(asked, found.moves) if asked.may(rule, is_(a), is_not(a, rule.offset))
+            }
+        case Move():
+            left = rule.leaving.value
+            found.moves |= set(_pushed(rule, asked, found.moves))
+            found.moves |= {a for a in _left(asked, found.moves) if a != left and asked.may(rule, is_(a))}
+            found.pairs |= {(x, left) for x in overwritten(rule, asked) if x != left}
+    found.writes += rule.effects
+
+
+def _left(asked: Asked, known: set[int]) -> Iterable[int]:
+    """Elements that are still to be asked about."""
+    return [number for number in asked.facts.ids if number not in known]
+
+
+def _pushed(rule: Swap | Move, asked: Asked, known: set[int]) -> Iterator[int]:
+    """Elements at the place where another element goes."""
+    for number in _left(asked, known):
+        if asked.may(rule, is_(number, rule.offset), is_not(number)):
+            yield number
+
+
+def overwritten(rule: Move, asked: Asked) -> list[int]:
+    """Elements at the place where something moves to, which are lost if they do not move away themselves."""
+    return [number for number in asked.facts.ids if asked.may(rule, is_(number, rule.offset))]
+
+
+def becomes(rule: Transform, asked: Asked, known: Pairs) -> Iterator[tuple[int, int]]:
+    """The pairs (before, after) of a transform, without those that are known already."""
+    ids = asked.facts.ids
+    if rule.target.op == "const":
+        after = int(rule.target.value)
+        for before in ids:
+            if before != after and (before, after) not in known and asked.may(rule, is_(before)):
+                yield before, after
+        return
+    firsts = [number for number in ids if asked.may(rule, is_(number))]
+    lasts = [number for number in ids if asked.may(rule, (member(rule.target, (number,)), HERE))]
+    few = len(firsts) * len(lasts) <= MAX_PAIRS
+    for before in firsts:
+        for after in lasts:
+            if before == after or (before, after) in known:
+                continue
+            if not few or asked.may(rule, is_(before), (member(rule.target, (after,)), HERE)):
+                yield before, after
+
+
+def _chains(asked: Asked) -> Iterator[tuple[Move, Pairs]]:
+    """What moves of different kinds may do together, where one goes to the place that another leaves.
+
+    Of such a row the first leaves its element behind and the last overwrites one: these need not be of one rule.
+    """
+    moves = [rule for rule in asked.moment.rules if isinstance(rule, Move)]
+    if asked.moment.policy != "prove" or len({rule.leaving.value for rule in moves}) < 2:
+        return
+    live = [rule for rule in moves if asked.may(rule)]
+    left = {int(rule.leaving.value) for rule in live}
+    lost = {number for rule in live for number in overwritten(rule, asked)}
+    pairs = {(before, after) for before in lost for after in left if before != after}
+    for rule in live:
+        yield rule, pairs

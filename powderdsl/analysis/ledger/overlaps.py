@@ -1,0 +1,168 @@
+"""Where two rules meet in one cell, so that their order or the conflict policy decides what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from powderdsl.analysis.ledger.changes import HERE, Asked, RuleLine, footprint, possible, rule_line
+from powderdsl.model.expressions.operands import negation
+from powderdsl.model.logic.satisfy import Facts
+from powderdsl.model.types import Assign, Expr, Offset, Pass, Rule, Ruleset, Transform
+
+OUTCOMES = {
+    "first wins": "both claim a cell at once: the first one happens",
+    "both dropped": "both claim a cell at once: neither happens",
+    "last writes": "both write a field of a cell at once: the last one has the final word",
+    "cut off": "both change a number of a cell at once: at the bounds of its range the order matters",
+    "first in turn": "both may want to turn a cell into something: the one that runs first does",
+}
+"""What becomes of two rules that meet, in words."""
+
+MAX_LINES = 64
+"""Lines that transform cells, up to which every two of different moments are compared."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Two lines that may meet in one cell. `outcome` is one of OUTCOMES; `field` is what they both write, if any.
+
+    The lines may be one line, of which a loop or a symmetry makes several rules.
+    """
+
+    outcome: str
+    first: RuleLine
+    second: RuleLine
+    field: str = ""
+
+
+def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
+    """Every two lines that could not be shown to keep apart, in the order in which they run."""
+    found: dict[Overlap, None] = {}
+    for pass_ in ruleset.passes:
+        for moment in pass_.moments:
+            asked = Asked.of(moment, facts)
+            live = [rule for rule in moment.rules if rule.mask is None or asked.may(rule)]
+            found |= dict.fromkeys(_claims(asked, pass_, found))
+            found |= dict.fromkeys(_writes(live, asked, pass_, found))
+    found |= dict.fromkeys(_in_turn(ruleset, facts, found))
+    return tuple(found)
+
+
+def _meet(first: Expr, second: Expr, at: Offset, asked: Asked) -> bool:
+    return possible(asked.facts, [(first, HERE), (second, at)], asked.lets)
+
+
+def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
+    """Rules of one moment that may claim one cell, where a policy decides."""
+    if asked.moment.policy == "prove":
+        return
+    # What is always dropped meets others too: here only the conditions count.
+    movers = [rule for rule in asked.moment.rules if not isinstance(rule, Assign)]
+    outcome = "first wins" if asked.moment.policy == "first_wins" else "both dropped"
+    for i, second in enumerate(movers):
+        for first in movers[: i + 1]:
+            one = first is second
+            what = "both dropped" if one else outcome
+            overlap = Overlap(what, rule_line(first, pass_), rule_line(second, pass_))
+            same = what == "first wins" and _alike(first, second)
+            if overlap in known or same:
+                continue
+            shifts = dict.fromkeys(
+                (a[0] - b[0], a[1] - b[1]) for a in footprint(first) for b in footprint(second)
+            )
+            if any(_meet(first.mask, second.mask, at, asked) for at in shifts if not (one and at == HERE)):
+                yield overlap
+
+
+def _alike(first: Rule, second: Rule) -> bool:
+    """Whether it makes no difference which of two transforms happens."""
+    if not isinstance(first, Transform) or not isinstance(second, Transform):
+        return False
+    return first.target == second.target and first.effects == second.effects
+
+
+def _writes(rules: list[Rule], asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
+    """Writes of one field in one moment whose order makes a difference. Roundings of reals are left out."""
+    plain = [(rule, rule.mask, rule) for rule in rules if isinstance(rule, Assign)]
+    effects = [
+        (effect, rule.mask, rule) for rule in rules if not isinstance(rule, Assign) for effect in rule.effects
+    ]
+    for writes in (plain, effects):
+        for i, (b, second, second_rule) in enumerate(writes):
+            for a, first, first_rule in writes[:i]:
+                outcome = order_matters(a, b)
+                if not outcome or first is None or second is None:
+                    continue
+                apart = first_rule is not second_rule and asked.moment.policy != "prove"
+                if apart and _own_cells(first_rule, a) and _own_cells(second_rule, b):
+                    continue  # rules that happen never share a cell
+                overlap = Overlap(
+                    outcome, rule_line(first_rule, pass_), rule_line(second_rule, pass_), a.field
+                )
+                at = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
+                if overlap not in known and _meet(first, second, at, asked):
+                    yield overlap
+
+
+def _own_cells(rule: Rule, effect: Assign) -> bool:
+    """Whether an effect stays in the cells that its rule claims."""
+    return not isinstance(rule, Assign) and effect.offset in footprint(rule)
+
+
+def order_matters(a: Assign, b: Assign) -> str:
+    """Which of OUTCOMES applies if these two write one cell, or nothing."""
+    if a.field != b.field or (a.op == b.op == ":=" and a.value == b.value):
+        return ""
+    if ":=" in (a.op, b.op):
+        return "last writes"
+    ways = [_ways(one) for one in (a, b)]
+    opposite = ("up" in ways[0] and "down" in ways[1]) or ("down" in ways[0] and "up" in ways[1])
+    return "cut off" if a.value.kind.name == "int" and opposite else ""
+
+
+def _ways(assign: Assign) -> set[str]:
+    """Whether `+=` or `-=` may raise or lower a number."""
+    low, high = assign.value.kind.lo, assign.value.kind.hi
+    if assign.op == "-=":
+        low, high = -high, -low
+    return {*(["up"] if high > 0 else []), *(["down"] if low < 0 else [])}
+
+
+def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iterator[Overlap]:
+    """Transforms of different moments that could happen to one cell of one world, with different results."""
+    rules = [
+        (number, pass_, rule, _renamed_lets(moment.lets, number), _renamed(rule.mask, number))
+        for number, (pass_, moment) in enumerate((p, m) for p in ruleset.passes for m in p.moments)
+        for rule in moment.rules
+        if isinstance(rule, Transform)
+    ]
+    if len({rule.span for _, _, rule, _, _ in rules}) > MAX_LINES:
+        return
+    seen = set(known)
+    for i, (number, pass_, rule, lets, mask) in enumerate(rules):
+        for other, other_pass, earlier, other_lets, other_mask in rules[:i]:
+            if other == number or (earlier.target == rule.target and rule.target.op == "const"):
+                continue
+            overlap = Overlap("first in turn", rule_line(earlier, other_pass), rule_line(rule, pass_))
+            changing = [
+                (negation(Expr("member", mask.kind, (Expr("element", t.kind),), frozenset({t.value}))), HERE)
+                for t in (rule.target, earlier.target)
+                if t.op == "const"
+            ]
+            conditions = [(other_mask, HERE), (mask, HERE), *changing]
+            if overlap not in seen and possible(facts, conditions, {**other_lets, **lets}):
+                seen.add(overlap)
+                yield overlap
+
+
+def _renamed(expr: Expr, number: int) -> Expr:
+    """Values under `let` of different moments may share a name: here they get the moment's number."""
+    if expr.op == "let":
+        return replace(expr, value=f"{expr.value}@{number}")
+    args = tuple(_renamed(arg, number) for arg in expr.args)
+    return replace(expr, args=args) if args else expr
+
+
+def _renamed_lets(lets: tuple, number: int) -> dict[str, Expr]:
+    return {f"{let.name}@{number}": _renamed(let.value, number) for let in lets}

@@ -1,0 +1,154 @@
+"""Claims that need no test: the ledger decides them, or what rules can see, or the claim's own words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from powderdsl.analysis.ledger.book import Ledger, NotProven, Proven, Verdict
+from powderdsl.analysis.reactions import facts_of
+from powderdsl.model.logic.satisfy import satisfiable
+from powderdsl.model.types import (
+    Assign,
+    Bounded,
+    Claim,
+    Expr,
+    Local,
+    Moment,
+    Never,
+    Offset,
+    Ruleset,
+    Swap,
+    Total,
+    Transform,
+    Unchanging,
+)
+
+
+def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int] = frozenset()) -> Verdict:
+    """Whether the claim holds in all worlds, or in those that start without some elements.
+
+    `NotProven` says nothing against it.
+    """
+    verdict = _prove(claim, ruleset, ledger)
+    if verdict or not without or not isinstance(claim, Total) or claim.ids is None:
+        return verdict
+    return _conserved(claim.trend, set(_names(ruleset, claim.ids)), ledger, _names(ruleset, without))
+
+
+def _conserved(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Verdict:
+    """What the ledger says of a count, where rules that need what is not there cannot happen."""
+    cells = set(ledger.reach(name for name in ledger.elements if name not in without))
+    known = cells | set(ledger.named)
+    lines = []
+    for entry in ledger.rules:
+        if not all(known.intersection(names) for names in entry.needs):
+            continue
+        for before, after in entry.changes:
+            if before not in cells or (after in entry.copies and after not in known):
+                continue
+            change = (after in counted) - (before in counted)
+            if {"constant": change != 0, "never rises": change > 0, "never falls": change < 0}[trend]:
+                lines.append(entry.rule)
+    if lines:
+        return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
+    return Proven("no rule that can happen in such worlds changes the number so")
+
+
+def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
+    match claim:
+        case Unchanging():
+            verdicts = [ledger.unchanged(name) for name in _names(ruleset, claim.ids)]
+            return next((one for one in verdicts if isinstance(one, NotProven)), verdicts[0])
+        case Total() if claim.ids is not None:
+            names = _names(ruleset, claim.ids)
+            if claim.trend == "constant":
+                return ledger.conserved(dict.fromkeys(names, 1))
+            return ledger.never_rises(names) if claim.trend == "never rises" else ledger.never_falls(names)
+        case Bounded():
+            return _bounded(claim, ruleset, ledger)
+        case Local():
+            reach = horizon(ruleset)
+            if reach <= claim.radius:
+                return Proven(f"what a cell holds depends on nothing beyond {reach} cells")
+            return NotProven(f"together the rules of a step might see {reach} cells far")
+        case Never():
+            if not satisfiable(facts_of(ruleset), [(claim.condition, (0, 0))]):
+                return Proven("no cell can fulfil the condition")
+    return NotProven("no proof is known for statements of this kind")
+
+
+def _names(ruleset: Ruleset, ids: Iterable[int]) -> list[str]:
+    kept = set(ids)
+    return [element.name for element in ruleset.elements if element.id in kept]
+
+
+def _bounded(claim: Bounded, ruleset: Ruleset, ledger: Ledger) -> Verdict:
+    prop = ruleset.property(claim.field)
+    if prop is not None and not prop.stored:
+        return Proven(f"no rule changes `{claim.field}`")
+    return ledger.within(claim.field, claim.lo, claim.hi)
+
+
+# How far a step sees
+
+
+def horizon(ruleset: Ruleset) -> int:
+    """What a cell holds after a step depends on cells at most so many rows and columns away: an upper bound.
+
+    Each moment sees what the moments before it saw around each cell that it reads. `step` and `row` are no cells.
+    """
+    seen = 0
+    for pass_ in ruleset.passes:
+        lets: dict[str, int] = {}
+        for moment in pass_.moments:
+            for let in moment.lets:
+                lets[let.name] = _sight(let.value, seen, lets)
+            seen = _moment(moment, seen, lets)
+    return seen
+
+
+def _moment(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
+    claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
+    masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules if rule.mask is not None}
+    reaches = [_length(rule.offset) for rule in claims if not isinstance(rule, Transform)]
+    if moment.policy != "prove" and claims:
+        # A rule must know where the others claim cells; those that come first decide one after the other.
+        rounds = len(claims) if moment.policy == "first_wins" and reaches else 1
+        widest = max(masks[id(rule)] for rule in claims)
+        wide = widest + 2 * max(reaches, default=0) * rounds
+        masks |= {id(rule): wide for rule in claims}
+    found = [seen]
+    for rule in moment.rules:
+        mask = masks[id(rule)]
+        match rule:
+            case Assign():
+                found.append(_length(rule.offset) + max(mask, _sight(rule.value, seen, lets)))
+                continue
+            case Transform():
+                found.append(max(mask, _sight(rule.target, seen, lets)))
+            case Swap():
+                found.append(_length(rule.offset) + max(mask, seen))
+            case _:
+                found.append(_length(rule.offset) + max(mask, seen, _sight(rule.leaving, seen, lets)))
+        for effect in rule.effects:
+            found.append(_length(effect.offset) + max(mask, _sight(effect.value, seen, lets)))
+    return max(found)
+
+
+def _sight(expr: Expr, seen: int, lets: Mapping[str, int]) -> int:
+    """How far an expression sees, where a cell itself depends on what is `seen` cells away."""
+    inner = max((_sight(arg, seen, lets) for arg in expr.args), default=0)
+    match expr.op:
+        case "element" | "property" | "field":
+            return seen
+        case "let":
+            return lets[str(expr.value)]
+        case "look":
+            return _length(expr.value) + inner
+        case "count" | "sum":
+            return expr.value.radius + inner
+    return inner
+
+
+def _length(offset: Offset) -> int:
+    return max(abs(offset[0]), abs(offset[1]))

@@ -1,0 +1,197 @@
+"""`powderdsl bench`: how fast rules run, on each backend, for each batch and size."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from powderdsl.cli.exits import OK, user_values
+from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules, set_option
+from powderdsl.cli.progress import progress
+from powderdsl.compiler import BACKENDS
+from powderdsl.experiments.bench.figures import Event, Report, Started, make_report, report_data
+from powderdsl.experiments.bench.machine import load_average, this_machine
+from powderdsl.experiments.bench.measure import measure_events
+from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
+from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
+from powderdsl.experiments.bench.tables import report_text
+from powderdsl.model.world_sides import fitting
+from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
+
+
+def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in (value or "").split(",")) if value is not None else ()
+    if not all(names):
+        raise click.BadParameter(f"`{value}`: write NAME,NAME", ctx, param)
+    return names
+
+
+EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about in WORKLOADS.items())
+
+
+@click.command("bench", epilog=EPILOG)
+@click.argument("rules", metavar="[RULES]", default="powderworld")
+@click.option(
+    "--backend",
+    "backends",
+    type=click.Choice(list(BACKENDS)),
+    multiple=True,
+    help="What runs the rules.  [default: torch, and native or cuda where they run]",
+)
+@click.option(
+    "--batch",
+    "batches",
+    type=WholeType(1, 1 << 20),
+    multiple=True,
+    default=(1, 32),
+    show_default=True,
+    help="Worlds at once.",
+)
+@click.option("--size", "sizes", type=SizeType(), multiple=True, help="Rows and columns.  [default: 64]")
+@click.option(
+    "--elements", type=WholeType(1, 256), multiple=True, help="Only the first N elements in the worlds."
+)
+@click.option("--only", metavar="NAME,NAME", callback=_names, help="Only these elements in the worlds.")
+@click.option(
+    "--threads",
+    type=WholeType(1, 1024),
+    multiple=True,
+    default=(1,),
+    show_default=True,
+    help="CPU threads.",
+)
+@click.option(
+    "--workload",
+    type=click.Choice(list(WORKLOADS)),
+    default="gusts",
+    show_default=True,
+    help="The worlds to start from.",
+)
+@click.option("--device", default="cpu", show_default=True, help="A torch device: cpu, cuda, cuda:1.")
+@click.option(
+    "--steps", type=WholeType(1, 1 << 20), default=16, show_default=True, help="Steps a call, at most."
+)
+@click.option(
+    "--seconds", type=float, default=2.0, show_default=True, help="Measured time of each combination."
+)
+@click.option(
+    "--rounds",
+    type=WholeType(1, 1000),
+    default=5,
+    show_default=True,
+    help="Parts it is measured in, in turn with the others.",
+)
+@click.option("--seed", type=WholeType(0, 2**63 - 1), default=0, show_default=True, help="Of the worlds.")
+@set_option
+@click.option("--profile", is_flag=True, help="What each pass costs.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object with every figure, instead of tables.")
+@click.option(
+    "--out",
+    "data",
+    type=click.Path(path_type=Path),
+    metavar="FILE.json",
+    help="Where else to write the JSON object.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw rates against batches. Needs matplotlib.",
+)
+def command(
+    rules: str,
+    backends: tuple[str, ...],
+    batches: tuple[int, ...],
+    sizes: tuple[tuple[int, int], ...],
+    elements: tuple[int, ...],
+    only: tuple[str, ...],
+    threads: tuple[int, ...],
+    workload: str,
+    device: str,
+    steps: int,
+    seconds: float,
+    rounds: int,
+    seed: int,
+    settings: dict[str, str],
+    profile: bool,
+    as_json: bool,
+    data: Path | None,
+    plot: Path | None,
+) -> int:
+    """Measure how fast rules run.
+
+    --backend, --batch, --size, --elements and --threads may be repeated. All their combinations are measured, in
+    turn, round after round, and medians are shown. Ctrl-C shows what was measured so far.
+    """
+    ruleset = load_rules(rules, settings)
+    for file in (data, plot):
+        if file is not None:
+            check_writable(file)
+    if plot is not None:
+        require_matplotlib()
+    with user_values():
+        plan = make_plan(
+            ruleset,
+            backends=backends or _usual_backends(device),
+            batches=batches,
+            sizes=sizes or ((fitting(ruleset, 64),) * 2,),
+            elements=elements,
+            only=only,
+            threads=threads,
+            workload=workload,
+            device=device,
+            seed=seed,
+            steps=steps,
+            seconds=seconds,
+            rounds=rounds,
+            profile=profile,
+        )
+    report, interrupt = _measured(plan)
+    click.echo(json.dumps(report_data(report), indent=2) if as_json else report_text(report))
+    if data is not None:
+        _write_json(data, report)
+    if plot is not None and report.cells:
+        write_plot(plot, report)
+    if interrupt is not None:
+        raise interrupt
+    return OK
+
+
+def _usual_backends(device: str) -> tuple[str, ...]:
+    """What runs here without asking: torch, and the fastest code for the device, if it can be compiled."""
+    if device != "cpu":
+        return ("torch", "cuda") if device.startswith("cuda") else ("torch",)
+    try:
+        find_compiler()
+    except NoCompiler as error:
+        click.echo(f"without the backend `native`: {error}", err=True)
+        return ("torch",)
+    return ("torch", "native")
+
+
+def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
+    """The report of a plan, or of as much of it as was done when Ctrl-C or another signal came."""
+    machine = this_machine(plan.device)
+    events: list[Event] = []
+    interrupt: KeyboardInterrupt | None = None
+    done = 0
+    try:
+        with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
+            for event in measure_events(plan):
+                events.append(event)
+                what = event.what if isinstance(event, Started) else "measure"
+                done += not isinstance(event, Started)
+                show(done, f"{what} {event.cell.backend}, batch {event.cell.batch}")
+    except KeyboardInterrupt as caught:
+        interrupt = caught
+    report = make_report(plan, machine, events, load_average(), interrupted=interrupt is not None)
+    return report, interrupt
+
+
+def _write_json(path: Path, report: Report) -> None:
+    from powderdsl.system.writing import replacing
+
+    with replacing(path, follow=True) as temporary:
+        temporary.write_text(json.dumps(report_data(report), indent=2, ensure_ascii=False) + "\n", "utf-8")

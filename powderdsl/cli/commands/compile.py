@@ -1,0 +1,165 @@
+"""`powderdsl compile`: what each stage of the compiler makes of rules, as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.options import backend_option, check_writable, load_rules, rules_argument, set_option
+from powderdsl.compiler import lower, read
+from powderdsl.diagnostics import Reporter, suggest
+from powderdsl.model.declarations import Block, PackDecl, PassDecl
+from powderdsl.model.text import one_line, place_of, print_model
+from powderdsl.syntax.ast import Syntax
+
+if TYPE_CHECKING:
+    from powderdsl.ir.ops import Program
+
+STAGES = ("tree", "model", "ir", "kernels")
+
+
+@click.command("compile")
+@rules_argument
+@click.option(
+    "--emit",
+    "stage",
+    type=click.Choice(STAGES),
+    required=True,
+    help="tree: rules as parsed; model: checked, loops unrolled; ir: optimised; kernels: what runs.",
+)
+@backend_option("auto", "Whose kernels are printed.")
+@click.option("--pass", "pass_name", metavar="NAME", help="Only this pass of the rules.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), metavar="FILE", help="Where to write it.")
+@set_option
+def command(
+    rules: str, stage: str, backend: str, pass_name: str | None, out: Path | None, settings: dict[str, str]
+) -> None:
+    """Print what a stage of the compiler makes of rules."""
+    if out is not None:
+        check_writable(out)
+    text = (
+        _tree(rules, pass_name) if stage == "tree" else _checked(rules, stage, backend, pass_name, settings)
+    )
+    if out is None:
+        click.echo(text, nl=not text.endswith("\n"))
+        return
+    from powderdsl.system.writing import replacing
+
+    with replacing(out, follow=True) as temporary:
+        temporary.write_text(text if text.endswith("\n") else text + "\n", encoding="utf-8")
+
+
+def _checked(rules: str, stage: str, backend: str, pass_name: str | None, settings: dict[str, str]) -> str:
+    """The stages from the checked model on."""
+    ruleset = load_rules(rules, settings)
+    if pass_name is not None:
+        _check_pass(pass_name, [p.name for p in ruleset.passes])
+    if stage == "model":
+        return print_model(ruleset, None if pass_name is None else [pass_name])
+    program = lower(ruleset)
+    if stage == "ir":
+        from powderdsl.ir.text import print_program
+
+        return print_program(program, pass_name)
+    return _kernels(program, backend, pass_name)
+
+
+SHOWN_SHARED = 227 << 10
+"""Bytes of shared memory of the GPU for which kernels are shown, on a grid of 64 × 64."""
+
+
+def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
+    """The generated source of a backend: part by part, where planes cannot carry all passes."""
+    from powderdsl.ir.segments import segments
+    from powderdsl.targets.dense.program import kernel_source
+    from powderdsl.targets.planes.program import planes_kernel_source
+
+    match backend:
+        case "reference":
+            raise BadInput("the reference backend runs the checked model: it has no kernels")
+        case "dense":
+            return kernel_source(program, pass_name)
+        case "native" | "cuda" if pass_name is not None:
+            raise BadInput(f"{backend} source is one text: --pass does not go with it")
+    texts = []
+    for part in segments(program):
+        if part.planes is None:
+            texts.append(kernel_source(part.program, pass_name))
+        elif backend == "native":
+            from powderdsl.targets.cpp.source import native_source
+
+            texts.append(native_source(part.planes)[0])
+        elif backend == "cuda":
+            from powderdsl.targets.cuda.source import cuda_source
+
+            texts.append(cuda_source(part.planes, 64, 64, SHOWN_SHARED).text)
+        else:
+            texts.append(planes_kernel_source(part.planes, pass_name))
+    return "\n\n".join(text for text in texts if text)
+
+
+def _check_pass(name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise BadInput("; ".join([f"no pass `{name}`", *suggest(name, known, "passes")]))
+
+
+# Syntax trees
+
+
+def _tree(rules: str, pass_name: str | None) -> str:
+    reporter = Reporter()
+    packs, _ = read([rules], reporter)
+    reporter.raise_if_errors()
+    if pass_name is not None:
+        _check_pass(pass_name, [one.name.text for pack in packs for one in pack.passes])
+    return "\n".join(line for pack in packs for line in _pack_lines(pack, pass_name)) + "\n"
+
+
+def _pack_lines(pack: PackDecl, pass_name: str | None) -> Iterator[str]:
+    chosen = [one for one in pack.passes if pass_name in (None, one.name.text)]
+    if pass_name is not None and not chosen:
+        return
+    yield f"pack {pack.name.text}  # {place_of(pack.name.span)}"
+    if pass_name is None:
+        for name, syntax in pack.sets:
+            yield from _syntax_lines(f"set {name.text}", syntax, "  ")
+    for one in chosen:
+        yield from _pass_lines(one)
+
+
+def _pass_lines(decl: PassDecl) -> Iterator[str]:
+    yield f"  pass {decl.name.text}  # {place_of(decl.name.span)}"
+    for item in decl.scratch:
+        if item.type is not None:
+            yield from _syntax_lines(f"scratch {item.name.text}", item.type, "    ")
+    yield from _block_lines(decl.block, "    ")
+
+
+def _block_lines(block: Block, indent: str) -> Iterator[str]:
+    for name, syntax in block.lets:
+        yield from _syntax_lines(f"let {name.text}", syntax, indent)
+    inner = indent
+    if block.header is not None:
+        yield from _syntax_lines("loop", block.header, indent)
+        inner += "  "
+    for key, value in (("symmetry", block.symmetry), ("conflicts", block.policy)):
+        if value:
+            yield f"{inner}{key} {value}"
+    for syntax in block.rules:
+        yield from _syntax_lines("rule", syntax, inner)
+    for child in block.blocks:
+        yield f"{inner}block"
+        yield from _block_lines(child, inner + "  ")
+    for child in block.then:
+        yield f"{indent}then"
+        yield from _block_lines(child, indent + "  ")
+
+
+def _syntax_lines(what: str, syntax: Syntax, indent: str) -> Iterator[str]:
+    """A heading with the line as written, below it the tree."""
+    yield f"{indent}{what}: {one_line(syntax.span)}  # {place_of(syntax.span)}"
+    yield syntax.dump(indent + "  ")

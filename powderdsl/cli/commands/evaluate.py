@@ -1,0 +1,143 @@
+"""`powderdsl evaluate`: an agent beside acting at random and doing nothing, on each split of its task."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.cli.options import (
+    ManyWords,
+    WholeType,
+    check_writable,
+    layout_options,
+    packs_option,
+    set_option,
+)
+from powderdsl.cli.plain_table import table
+from powderdsl.cli.task_sheets import knob_values
+from powderdsl.compiler import BACKENDS
+from powderdsl.tasks.names import is_task
+
+if TYPE_CHECKING:
+    from powderdsl.rl.evaluation import Evaluation, Score
+
+
+def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> list[str] | None:
+    if value is None:
+        return None
+    return [one.strip() for one in value.split(",") if one.strip()]
+
+
+@click.command("evaluate", cls=ManyWords)
+@click.argument("run", metavar="RUN|TASK")
+@click.option(
+    "--splits", callback=_names, metavar="A,B", help="Which worlds.  [default: all splits of the task]"
+)
+@click.option(
+    "--policies", callback=_names, metavar="A,B", help="Of trained, random, nothing.  [default: all]"
+)
+@click.option(
+    "--episodes",
+    type=WholeType(1, 10**6),
+    default=256,
+    show_default=True,
+    help="On each split, for each policy.",
+)
+@click.option(
+    "--deterministic/--sampled",
+    default=False,
+    help="The likeliest action, or one drawn as in training.  [default: sampled]",
+)
+@click.option(
+    "--seed", type=WholeType(0, 2**32 - 1), default=0, show_default=True, help="Of what policies draw."
+)
+@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
+@set_option
+@packs_option
+@click.option(
+    "--backend", type=click.Choice(list(BACKENDS)), help="What runs the rules.  [default: the run's]"
+)
+@click.option("--device", help="A torch device.  [default: the run's]")
+@layout_options("One JSON object instead of a table.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="FILE.json", help="Where else to write the JSON object."
+)
+def command(
+    run: str,
+    splits: list[str] | None,
+    policies: list[str] | None,
+    episodes: int,
+    deterministic: bool,
+    seed: int,
+    knobs: tuple[str, ...],
+    settings: dict[str, str],
+    packs: tuple[str, ...],
+    backend: str | None,
+    device: str | None,
+    layout: str,
+    out: Path | None,
+) -> None:
+    """Mean return and 95 % interval of the agent of a RUN, on each split, in the same worlds as the other policies.
+
+    The result is also written to evaluation.json in the run's folder. Of a TASK, the policies that need no training.
+    """
+    task = None
+    if is_task(run):
+        from powderdsl.tasks.shipped import load_task
+
+        task = load_task(run, knobs=knob_values(knobs), params=settings, packs=packs)
+    elif knobs or settings:
+        raise BadInput("--knob and --set go with a task: a run has its own")
+    if out is not None:
+        check_writable(out)
+    from powderdsl.experiments.runs import find_run
+    from powderdsl.experiments.runs.folder import write_json
+    from powderdsl.rl.evaluation import evaluate
+
+    with user_values():
+        found = evaluate(
+            find_run(run, "ppo") if task is None else task,
+            splits=splits,
+            policies=policies,
+            episodes=episodes,
+            deterministic=deterministic,
+            seed=seed,
+            backend=backend,
+            device=device,
+            packs=packs if task is None else (),
+        )
+    if out is not None:
+        write_json(out, found.as_json(), follow=True)
+    if layout == "json":
+        click.echo(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
+    else:
+        click.echo("\n".join(_text(found)))
+
+
+def _text(found: Evaluation) -> list[str]:
+    after = "" if found.step is None else f", after {found.step:,} interactions"
+    rows = [["split", "policy", "return", "above random", "above nothing", "success", "actions"]]
+    rows += [_row(score) for score in found.scores]
+    return [f"{found.task}{after}", *table(rows)]
+
+
+def _row(score: Score) -> list[str]:
+    from powderdsl.rl.evaluation import BASELINES
+
+    success = "" if score.success is None else f"{score.success:.0%}"
+    return [
+        score.split,
+        score.policy,
+        _number(score.mean, score.interval),
+        *(_number(*score.above[other]) if other in score.above else "" for other in BASELINES),
+        success,
+        f"{score.length:.1f}",
+    ]
+
+
+def _number(mean: float, half: float | None) -> str:
+    return f"{mean:.3f}" + ("" if half is None else f" ± {half:.3f}")

@@ -1,0 +1,261 @@
+"""`powderdsl fuzz`: random rules on all backends against the reference, and random damage to rule files."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from powderdsl.cli.exits import FAILED, OK, BadInput, counted
+from powderdsl.cli.options import WholeType
+from powderdsl.cli.progress import progress
+from powderdsl.system.interrupts import Terminated
+
+if TYPE_CHECKING:
+    from powderdsl.testing.fuzz.campaign import Tally
+    from powderdsl.testing.fuzz.differential import Plan
+
+Item = TypeVar("Item")
+
+COMPARED = ("dense", "planes", "native", "torch")
+MAX_SEED = 1 << 40
+LEVELS = ("0", "1", "2", "3")
+
+
+class SeedsType(click.ParamType):
+    """`0..1000`: seeds from 0 to 999."""
+
+    name = "FROM..TO"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
+        match = re.fullmatch(r"([0-9]{1,12})\.\.([0-9]{1,12})", str(value))
+        if match is None or int(match[1]) >= int(match[2]):
+            self.fail(f"`{value}` is no range of seeds: write FROM..TO, such as 0..1000", param, ctx)
+        return range(int(match[1]), int(match[2]))
+
+
+class BackendsType(click.ParamType):
+    """`dense,planes`: backends, joined by commas."""
+
+    name = "NAMES"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        names = tuple(dict.fromkeys(str(value).replace(" ", "").split(",")))
+        unknown = [name for name in names if name not in COMPARED]
+        if unknown:
+            self.fail(f"no backend `{unknown[0]}` to compare: {', '.join(COMPARED)}", param, ctx)
+        return names
+
+
+@click.command("fuzz")
+@click.option("--seeds", type=SeedsType(), help="Which rulesets, or damaged files.  [default: 0..200]")
+@click.option("--seconds", type=WholeType(1, 10_000_000), help="Run so long, with as many seeds as it takes.")
+@click.option(
+    "--backends",
+    type=BackendsType(),
+    default="dense,planes",
+    show_default=True,
+    help="What is compared with the reference: dense, planes, native, torch.",
+)
+@click.option("--worlds", type=WholeType(1, 100), default=4, show_default=True, help="Worlds of a ruleset.")
+@click.option("--steps", type=WholeType(1, 10_000), default=3, show_default=True, help="Steps of a world.")
+@click.option(
+    "--level",
+    type=click.Choice(LEVELS),
+    default="0",
+    show_default=True,
+    help="Optimisation of native code. Users' is 2.",
+)
+@click.option(
+    "--save",
+    "folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("fuzz"),
+    show_default=True,
+    help="Folder for what failed, and for how far it came.",
+)
+@click.option("--resume", is_flag=True, help="Go on where the run in that folder ended.")
+@click.option("--front-end", is_flag=True, help="Damage rule files instead, and load them.")
+@click.option("--jobs", type=WholeType(1, 256), help="Processes.  [default: one a processor]")
+@click.option(
+    "--replay",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Only run the case of a file again.",
+)
+def command(
+    seeds: range | None,
+    seconds: int | None,
+    backends: tuple[str, ...],
+    worlds: int,
+    steps: int,
+    level: str,
+    folder: Path,
+    resume: bool,
+    front_end: bool,
+    jobs: int | None,
+    replay: Path | None,
+) -> int:
+    """Compare all backends with the reference on random rules and worlds.
+
+    What differs is made small and saved as a file that `--replay` runs again. Ctrl-C ends a run with its report;
+    `--resume` goes on. Exit code: 0 if all agree, 1 if something was found.
+
+    \b
+        powderdsl fuzz --seconds 60
+        powderdsl fuzz --seeds 0..5000 --backends dense,planes,native
+        powderdsl fuzz --replay fuzz/seed7-native.yaml
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
+    if seeds is not None and seconds is not None:
+        raise BadInput("give --seeds or --seconds, not both")
+    if front_end:
+        return _front_end(seeds, seconds, folder, jobs or os.cpu_count() or 1)
+    from powderdsl.targets.cpp.build import Building
+    from powderdsl.testing.fuzz.differential import Plan
+
+    building = Building(f"-O{level}")
+    if replay is not None:
+        return _replay(replay, building)
+    plan = Plan(backends, worlds, steps, building)
+    if "native" in backends:
+        _check_compiler()
+    return _campaign(plan, seeds, seconds, folder, resume, jobs or os.cpu_count() or 1)
+
+
+def _check_compiler() -> None:
+    from powderdsl.system.writing import failure
+    from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
+
+    try:
+        find_compiler()
+    except NoCompiler as error:
+        helps = ("leave `native` out of --backends, or install g++, clang++ or `pip install ziglang`",)
+        raise failure(
+            "PD701", "the native backend is not available", notes=(str(error),), helps=helps
+        ) from None
+
+
+def _replay(path: Path, building: Any) -> int:
+    from dataclasses import replace
+    from tempfile import gettempdir
+
+    from powderdsl.system.scratch import scratch_folder
+    from powderdsl.testing.fuzz.case_files import read_case
+    from powderdsl.testing.fuzz.differential import check_case
+
+    case = read_case(path)
+    if case.backend not in (*COMPARED, "reference"):
+        raise BadInput(f"{path}: no backend `{case.backend}`")
+    with scratch_folder(Path(gettempdir())) as scratch:
+        found = check_case(case, replace(building, folder=scratch))
+    if found is None:
+        click.echo(f"{path}: {case.backend} and the reference agree")
+        return OK
+    click.echo(f"{path}: {case.backend} {found[1]}")
+    return FAILED
+
+
+def _campaign(
+    plan: Plan, seeds: range | None, seconds: int | None, folder: Path, resume: bool, jobs: int
+) -> int:
+    from powderdsl.testing.fuzz.campaign import Tally, describe, load_tally, run_campaign
+
+    wanted = seeds or (range(200) if seconds is None else range(MAX_SEED))
+    tally = load_tally(folder, plan) if resume else Tally(describe(plan), wanted.start, wanted.start)
+    left = range(max(wanted.start, tally.next) if resume else wanted.start, wanted.stop)
+    began = time.monotonic()
+    until = began + (seconds if seconds is not None else float("inf"))
+    events = run_campaign(plan, tally, iter(left), jobs, folder, until)
+    interrupt: KeyboardInterrupt | None = None
+    done = 0
+    with progress(_title(seconds), len(left) if seconds is None else None) as show:
+        try:
+            for event in events:
+                if isinstance(event, Path):
+                    click.echo(f"found: {event}", err=True)
+                else:
+                    done += 1
+                    show(done)
+        except KeyboardInterrupt as caught:
+            interrupt = caught
+        finally:
+            events.close()  # its processes end, its state is saved
+    _report(plan, tally, folder, time.monotonic() - began, interrupt is not None)
+    if isinstance(interrupt, Terminated):
+        raise interrupt
+    return FAILED if tally.files else OK
+
+
+def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted: bool) -> None:
+    from powderdsl.testing.fuzz.exercised import ON_CELLS, coverage_table
+
+    names = " and ".join(plan.backends)
+    if interrupted:
+        click.echo(f"interrupted; `--resume` continues from seed {tally.next}")
+    click.echo(
+        f"{tally.rulesets:,} rulesets and {tally.worlds:,} worlds, {counted(plan.steps, 'step')} each, in {seconds:.0f} s: "
+        f"{names} against the reference"
+    )
+    click.echo(f"{tally.refused:,} more texts were refused by the static checks")
+    click.echo(f"{tally.used[ON_CELLS]:,} have passes that bit planes cannot carry")
+    rows = coverage_table(tally.used)
+    widths = [max(len(row[i]) for row in rows) for i in range(2)]
+    click.echo("\nexercised (the rarest, with the number of rulesets that have it)")
+    for group, share, rarest, lacking in rows:
+        click.echo(f"  {group:<{widths[0]}}  {share:>{widths[1]}}  {rarest}")
+        if lacking != "nothing":
+            click.echo(f"  {'':<{widths[0]}}  {'':>{widths[1]}}  never: {lacking}")
+    click.echo()
+    for name in tally.files:
+        click.echo(f"powderdsl fuzz --replay {folder / name}")
+    click.echo(f"{counted(len(tally.files), 'difference')} found")
+
+
+def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int) -> int:
+    from collections import Counter
+
+    from powderdsl.testing.fuzz.damage import run_trials
+
+    wanted = seeds or (range(2000) if seconds is None else range(MAX_SEED))
+    began = time.monotonic()
+    trials = run_trials(iter(wanted), jobs, folder, began + (seconds or float("inf")))
+    kinds: Counter[str] = Counter()
+    accepted, slowest, largest, found = 0, 0.0, 0.0, []
+    interrupt: KeyboardInterrupt | None = None
+    with progress(_title(seconds), len(wanted) if seconds is None else None) as show:
+        try:
+            for trial in trials:
+                kinds[trial.kind] += 1
+                show(kinds.total())
+                accepted += trial.accepted
+                slowest, largest = max(slowest, trial.seconds), max(largest, trial.megabytes)
+                if trial.problem is not None:
+                    found.append(trial)
+                    click.echo(f"{folder / trial.file_name}: {trial.problem}", err=True)
+        except KeyboardInterrupt as caught:
+            interrupt = caught
+            click.echo("interrupted")
+        finally:
+            trials.close()  # its processes end
+    click.echo(
+        f"{kinds.total():,} inputs loaded in {time.monotonic() - began:.0f} s, {accepted:,} of them good rules"
+    )
+    click.echo("  " + ", ".join(f"{kind} {number:,}" for kind, number in kinds.most_common()))
+    click.echo(f"slowest {slowest:.2f} s of processor time, largest process {largest:.0f} MB")
+    for trial in found:
+        click.echo(f"powderdsl check {folder / trial.file_name}")
+    click.echo(f"{counted(len(found), 'problem')} found")
+    if isinstance(interrupt, Terminated):
+        raise interrupt
+    return FAILED if found else OK
+
+
+def _title(seconds: int | None) -> str:
+    return "fuzz" if seconds is None else f"fuzz for {seconds} s"

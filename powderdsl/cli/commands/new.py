@@ -1,0 +1,104 @@
+"""`powderdsl new`: a first pack to change: an element with a free id, a rule and a test."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Iterable
+from pathlib import Path
+from string import Template
+
+import click
+
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.options import check_writable
+from powderdsl.compiler import read, shipped, shipped_rules
+from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
+from powderdsl.model.check import check
+from powderdsl.model.declarations import ElementDecl, PackDecl
+from powderdsl.model.packs import read_file
+from powderdsl.model.schema import MAX_NAME, NAME
+from powderdsl.syntax.sources import read_source
+from powderdsl.system.writing import replacing
+
+TEMPLATE = Path(__file__).with_name("first_pack.yaml")
+
+
+@click.command("new")
+@click.argument("name")
+@click.option(
+    "--dir",
+    "folder",
+    default=".",
+    show_default=True,
+    type=click.Path(path_type=Path),
+    help="The folder of the new file.",
+)
+def command(name: str, folder: Path) -> None:
+    """Write NAME.yaml, a first pack: an element, a rule and a test.
+
+    The element gets an id that no shipped pack and no pack in the folder uses. Existing files stay.
+    """
+    if not NAME.match(name) or len(name) > MAX_NAME:
+        raise BadInput(
+            f"`{name}` cannot name a pack: up to {MAX_NAME} letters, digits and `_`, a letter first"
+        )
+    path = folder / f"{name}.yaml"
+    if path.exists() or path.is_symlink():
+        raise BadInput(f"{path} exists already")
+    check_writable(path)
+    shipped_elements = _elements(shipped("rules").glob("*.yaml"))
+    if name in shipped_rules() or name in {element.name.text for element in shipped_elements}:
+        raise BadInput(f"`{name}` comes with powderdsl: choose another name")
+    taken = [*shipped_elements, *_elements(folder.glob("*.yaml"))]
+    text = _pack_text(name, taken)
+    _check_names(name, text)
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    click.echo(f"wrote {path}: powderdsl run core+{path} --watch")
+
+
+def _elements(paths: Iterable[Path]) -> list[ElementDecl]:
+    """The elements of all packs among some files; files that cannot be read have none."""
+    found: list[ElementDecl] = []
+    for path in sorted(paths):
+        reporter = Reporter()
+        source = read_source(path, reporter)
+        decl = read_file(source, reporter) if source else None
+        if isinstance(decl, PackDecl):
+            found.extend(decl.elements)
+    return found
+
+
+def _pack_text(name: str, taken: list[ElementDecl]) -> str:
+    ids = {element.id for element in taken}
+    free = next((number for number in range(256) if number not in ids), None)
+    if free is None:
+        raise BadInput("all 256 element ids are taken")
+    color = _color(free, {element.color for element in taken})
+    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(name=name, id=free, color=color)
+
+
+def _color(number: int, taken: set[str]) -> str:
+    """A colour that no other element has: the hue turns by the golden angle from id to id."""
+    while True:
+        parts = colorsys.hsv_to_rgb(number * 0.381966 % 1, 0.55, 0.85)
+        color = "#" + "".join(f"{round(part * 255):02X}" for part in parts)
+        if color not in taken:
+            return color
+        number += 1
+
+
+def _check_names(name: str, text: str) -> None:
+    """Refuse a name that means something in the language or in the pack that the new one needs."""
+    reporter = Reporter()
+    packs, _ = read(["core"], reporter)
+    new = read_file(Source(f"{name}.yaml", text), reporter)
+    problems: tuple[str, ...] = ()
+    try:
+        if isinstance(new, PackDecl):
+            check([*packs, new], None, reporter)
+    except CompileError:
+        pass
+    problems = tuple(one.message for one in reporter.diagnostics if one.severity is Severity.ERROR)
+    if problems:
+        raise BadInput(f"`{name}` cannot name a pack: {problems[0]}")

@@ -1,0 +1,37 @@
+"""`powderdsl render`: a world as a picture, as it stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules
+
+
+@click.command("render")
+@click.argument("world", metavar="WORLD")
+@click.option("--rules", required=True, metavar="RULES", help="The rules whose elements the world has.")
+@click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="x.png.")
+@click.option("--size", type=SizeType(), help="Rows and columns of a scene, such as 48x64.")
+@click.option("--scale", type=WholeType(1, 64), help="Pixels a cell.  [default: about 400 a side]")
+def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
+    """Draw a world as a picture, without running it.
+
+    WORLD is a saved .npz, a .txt drawing, a .png, a scene file, or a shipped scene's name. The worlds of a
+    saved batch stand side by side.
+    """
+    if out.suffix.lower() != ".png":
+        raise BadInput(f"--out must end in .png, not `{out}`")
+    ruleset = load_rules(rules, {})
+    check_writable(out)
+    from powderdsl.cli.pictures import pictures
+    from powderdsl.cli.start_worlds import start_drawn, start_world
+    from powderdsl.simulation.media import write_png
+    from powderdsl.simulation.simulator import compile
+
+    drawn = start_drawn(ruleset, world, size, None, None)
+    # Nothing runs, so the backend that takes no compiling will do.
+    start = start_world(compile(ruleset, backend="reference"), drawn, world, None)
+    write_png(out, pictures(start, most=len(start), factor=scale))

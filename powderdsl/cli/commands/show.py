@@ -1,0 +1,224 @@
+"""`powderdsl show`: what a ruleset consists of, as tables or as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from powderdsl.analysis.reactions import reactions
+from powderdsl.cli.exits import BadInput, colour_wanted
+from powderdsl.cli.options import WholeType, layout_options, load_rules, set_option
+from powderdsl.cli.plain_table import Painted, table
+from powderdsl.diagnostics import Span
+from powderdsl.diagnostics.printable import printable, write_styled
+from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
+from powderdsl.model.types import ColorRamp, Element, Param, Pass, Property, Ruleset, Value
+from powderdsl.tasks.names import is_task
+
+
+@click.command("show")
+@click.argument("rules", metavar="RULES|TASK")
+@layout_options("One JSON object instead of tables.")
+@set_option
+@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
+@click.option("--split", default="train", show_default=True, help="Of a task: which worlds.")
+@click.option(
+    "--seeds", type=WholeType(1, 256), default=16, show_default=True, help="Of a task: how many worlds."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Of a task: draw these worlds, with regions outlined.",
+)
+def command(
+    rules: str,
+    layout: str,
+    settings: dict[str, str],
+    knobs: tuple[str, ...],
+    split: str,
+    seeds: int,
+    out: Path | None,
+) -> None:
+    """List elements, reactions, passes and parameters; or what a task is, with pictures.
+
+    TASK is a shipped task's name, or a file that begins with `task:`.
+    """
+    if is_task(rules):
+        from powderdsl.cli.task_sheets import show_task
+
+        show_task(rules, layout, settings, knobs, split, seeds, out)
+        return
+    if out is not None or knobs:
+        raise BadInput("--out and --knob go with a task")
+    ruleset = load_rules(rules, settings)
+    if layout == "json":
+        click.echo(json.dumps(_data(ruleset), indent=2, ensure_ascii=False))
+    else:
+        write_styled(sys.stdout, "\n".join(_text(ruleset, colour_wanted(sys.stdout))) + "\n")
+
+
+def rule_spans(pass_: Pass) -> tuple[Span, ...]:
+    """Where the rules of a pass stand, each line once: loops and symmetries make many rules of one."""
+    return tuple(dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules))
+
+
+# Tables
+
+
+def _text(ruleset: Ruleset, colour: bool) -> Iterator[str]:
+    yield printable(f"{ruleset.name}{': ' if ruleset.about else ''}{ruleset.about}")
+    yield f"packs: {' '.join(ruleset.packs)}"
+    for title, rows in (
+        (f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", _element_rows(ruleset, colour)),
+        ("Reactions", _reaction_rows(ruleset)),
+        ("Passes, in order", _pass_rows(ruleset)),
+        ("Parameters (--set NAME=VALUE)", _param_rows(ruleset)),
+    ):
+        yield ""
+        yield title
+        yield from table(rows)
+
+
+def _swatch(color: str, colour: bool) -> str:
+    if not colour:
+        return color
+    red, green, blue = bytes.fromhex(color[1:])
+    return Painted(f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {color}")
+
+
+def _color(element: Element, colour: bool) -> str:
+    """Its color, and both ends of its ramp with what this follows."""
+    text, ramp = _swatch(element.color, colour), element.ramp
+    if ramp is None:
+        return text
+    start, end = _swatch(ramp.start, colour), _swatch(ramp.end, colour)
+    text = f"{text}; {start} -> {end} by {ramp.field} {ramp.lo}..{ramp.hi}"
+    return Painted(text) if colour else text
+
+
+def _element_rows(ruleset: Ruleset, colour: bool) -> list[list[str]]:
+    rows = [["id", "element", "pack", "glyph", "colour", *(p.name for p in ruleset.properties), "tags"]]
+    for element in ruleset.elements:
+        values = [_property_text(ruleset, prop, element) for prop in ruleset.properties]
+        shown = _color(element, colour)
+        head = [str(element.id), element.name, element.pack, element.glyph, shown]
+        rows.append([*head, *values, " ".join(sorted(element.tags))])
+    return rows
+
+
+def _property_text(ruleset: Ruleset, prop: Property, element: Element) -> str:
+    """Its value; `*` where cells may hold one of their own."""
+    text = show_value(ruleset, prop.kind, prop.values[element.id])
+    return f"{text}*" if element.id in prop.stored else text
+
+
+def _reaction_rows(ruleset: Ruleset) -> list[list[str]]:
+    rows = [["from", "to", "pass", "rule", "where"]]
+    for one in reactions(ruleset):
+        before, after = show_set(ruleset, one.before), show_set(ruleset, one.after)
+        rows.append([before, after, one.pass_name, one_line(one.span), place_of(one.span)])
+    return rows
+
+
+def _pass_rows(ruleset: Ruleset) -> list[list[str]]:
+    rows = [["", "pass", "pack", "moments", "rules", "where"]]
+    for number, one in enumerate(ruleset.passes, 1):
+        counts = [str(len(one.moments)), str(len(rule_spans(one)))]
+        rows.append([str(number), one.name, one.pack, *counts, place_of(one.span)])
+    return rows
+
+
+def _param_rows(ruleset: Ruleset) -> list[list[str]]:
+    rows = [["name", "value", "kind", "about", "where"]]
+    for param in ruleset.params:
+        value = show_value(ruleset, param.kind, param.default)
+        rows.append([param.name, value, str(param.kind), param.about, place_of(param.span)])
+    return rows
+
+
+# JSON
+
+
+def _plain(value: Value | str) -> Any:
+    """A constant for JSON: chances as numbers in 0..1."""
+    if isinstance(value, (str, int)):
+        return value
+    return [float(part) for part in value] if isinstance(value, tuple) else float(value)
+
+
+def _data(ruleset: Ruleset) -> dict[str, Any]:
+    return {
+        "name": ruleset.name,
+        "about": ruleset.about,
+        "packs": list(ruleset.packs),
+        "slots": ruleset.slots,
+        "elements": [_element_data(ruleset, element) for element in ruleset.elements],
+        "properties": [
+            {"name": p.name, "kind": str(p.kind), "pack": p.pack, "where": place_of(p.span)}
+            for p in ruleset.properties
+        ],
+        "fields": [
+            {"name": f.name, "kind": str(f.kind), "at": f.at, "pack": f.pack, "where": place_of(f.span)}
+            for f in ruleset.fields
+        ],
+        "reactions": [
+            {
+                "from": [element_name(ruleset, number) for number in one.before],
+                "to": [element_name(ruleset, number) for number in one.after],
+                "pass": one.pass_name,
+                "pack": one.pack,
+                "rule": one_line(one.span),
+                "where": place_of(one.span),
+            }
+            for one in reactions(ruleset)
+        ],
+        "passes": [_pass_data(one) for one in ruleset.passes],
+        "params": [_param_data(param) for param in ruleset.params],
+    }
+
+
+def _element_data(ruleset: Ruleset, element: Element) -> dict[str, Any]:
+    return {
+        "id": element.id,
+        "name": element.name,
+        "pack": element.pack,
+        "glyph": element.glyph,
+        "color": element.color,
+        "color_by": _ramp_data(element.ramp),
+        "about": element.about,
+        "tags": sorted(element.tags),
+        "properties": {prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
+        "where": place_of(element.span),
+    }
+
+
+def _ramp_data(ramp: ColorRamp | None) -> dict[str, Any] | None:
+    if ramp is None:
+        return None
+    return {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": [ramp.lo, ramp.hi]}
+
+
+def _pass_data(one: Pass) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "pack": one.pack,
+        "moments": len(one.moments),
+        "rules": [{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(one)],
+        "where": place_of(one.span),
+    }
+
+
+def _param_data(param: Param) -> dict[str, Any]:
+    return {
+        "name": param.name,
+        "value": _plain(param.default),
+        "kind": str(param.kind),
+        "about": param.about,
+        "where": place_of(param.span),
+    }

@@ -1,0 +1,87 @@
+"""`powderdsl trace`: why a cell holds what it holds after a step."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from typing import Any
+
+import click
+
+from powderdsl.cli.exits import BadInput, colour_wanted, user_values
+from powderdsl.cli.options import SizeType, WholeType, backend_option, load_rules, rules_argument, set_option
+from powderdsl.diagnostics.printable import write_styled
+
+
+class CellType(click.ParamType):
+    """`3,4`: row 3, column 4, both from 0."""
+
+    name = "ROW,COLUMN"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"([0-9]{1,9}),([0-9]{1,9})", str(value))
+        if match is None:
+            self.fail(f"`{value}` is no cell: write ROW,COLUMN from 0, such as 3,4", param, ctx)
+        return int(match[1]), int(match[2])
+
+
+@click.command("trace")
+@rules_argument
+@click.option("--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml, or a scene's name.")
+@click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
+@click.option("--seed", type=WholeType(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
+@click.option("--at", "cell", type=CellType(), required=True, help="The cell, counted from 0.")
+@click.option("--step", type=WholeType(1, 10**9), required=True, help="Which step of the run, from 1.")
+@click.option(
+    "--of", "names", multiple=True, metavar="NAME", help="Only the element, or this field. May be repeated."
+)
+@click.option(
+    "--number", type=WholeType(0, 1 << 20), default=0, help="Which world of a saved batch.  [default: 0]"
+)
+@click.option("--all", "every_rule", is_flag=True, help="Every rule that did not happen, and why.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object.")
+@backend_option("auto", "What runs the steps before.")
+@set_option
+def command(
+    rules: str,
+    world: str | None,
+    size: tuple[int, int] | None,
+    seed: int | None,
+    cell: tuple[int, int],
+    step: int,
+    names: tuple[str, ...],
+    number: int,
+    every_rule: bool,
+    as_json: bool,
+    backend: str,
+    settings: dict[str, str],
+) -> None:
+    """Say why a cell holds what it holds after a step.
+
+    Which rules wrote it in that step, what they read, and which rules nearly wrote it. Worlds are those of
+    `powderdsl run` with the same --world, --size and --seed.
+    """
+    ruleset = load_rules(rules, settings)
+    from powderdsl.cli.start_worlds import start_drawn, start_world
+    from powderdsl.simulation.simulator import compile
+    from powderdsl.simulation.tracing.data import trace_data
+    from powderdsl.simulation.tracing.text import trace_text
+    from powderdsl.simulation.tracing.trace import trace
+
+    drawn = start_drawn(ruleset, world, size, None, seed)
+    start = start_world(compile(ruleset, backend=backend), drawn, world, seed)
+    with user_values():
+        try:
+            found = trace(start, *cell, step, number=number, of=names or None, every_rule=every_rule)
+        except IndexError as error:
+            raise BadInput(str(error)) from error
+    if as_json:
+        click.echo(json.dumps(trace_data(found), indent=2, ensure_ascii=False))
+    else:
+        text = trace_text(found, colour=colour_wanted(sys.stdout), every_rule=every_rule)
+        write_styled(sys.stdout, f"{text}\n")

@@ -1,0 +1,169 @@
+"""`powderdsl train`: an agent learns a task; `powderdsl evaluate` and `powderdsl watch` show what it has learned."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.options import ManyWords, WholeType, backend_option, packs_option, set_option
+from powderdsl.cli.progress import progress
+from powderdsl.cli.task_sheets import knob_values
+from powderdsl.rl.config import NETWORKS, OBSERVATIONS, PRESETS, TrainConfig, from_json, preset
+
+if TYPE_CHECKING:
+    pass
+
+KINDS = tuple(dict.fromkeys(kind for kinds in OBSERVATIONS.values() for kind in kinds))
+
+
+class CountType(click.ParamType):
+    """A whole number, also written as ``1e6`` or ``200_000``. Whether it is in range the settings say."""
+
+    name = "N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        text = str(value).replace("_", "")
+        if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
+            self.fail(f"`{value}` is no whole number: write 200000 or 2e5", param, ctx)
+        number = float(text) if "e" in text.lower() else int(text)
+        if number != int(number):
+            self.fail(f"`{value}` is no whole number", param, ctx)
+        return int(number)
+
+
+@click.command("train", cls=ManyWords)
+@click.argument("task", metavar="TASK", required=False)
+@click.option(
+    "--run", "folder", type=click.Path(path_type=Path), metavar="DIR", help="[default: runs/TASK-seedN]"
+)
+@click.option(
+    "--resume", type=click.Path(path_type=Path), metavar="DIR", help="Go on with a run, as it was asked for."
+)
+@click.option(
+    "--preset",
+    "preset_name",
+    type=click.Choice(list(PRESETS)),
+    default="paper",
+    show_default=True,
+    help="Where other options start from: the paper's figures, or a few minutes on one core.",
+)
+@click.option("--steps", type=CountType(), help="Interactions, of all worlds together, such as 2e5.")
+@click.option("--seed", type=CountType(), help="Of the run: worlds, network, and actions.")
+@click.option("--envs", type=CountType(), help="Worlds that are played at once.")
+@click.option("--split", help="Which worlds.  [default: train]")
+@click.option("--worlds", type=CountType(), help="How many of them there are to draw from.")
+@click.option(
+    "--knob",
+    "knobs",
+    multiple=True,
+    metavar="NAME=N",
+    help="Another value for a knob of the task. May be repeated.",
+)
+@click.option("--n-lines", type=WholeType(0, 10**6), help="Short for --knob lines=N.")
+@click.option("--n-disks", type=WholeType(0, 10**6), help="Short for --knob disks=N.")
+@click.option(
+    "--complexity",
+    type=WholeType(0, 10**6),
+    help="Short for --knob complexity=N: N of each, where the paper's tasks are.",
+)
+@set_option
+@packs_option
+@click.option("--slots", type=CountType(), help="Room for this many elements, for packs that come later.")
+@click.option("--observation", type=click.Choice(KINDS), help="What the network sees.")
+@click.option("--network", type=click.Choice(NETWORKS), help="The paper's, or a small one.")
+@click.option("--features", type=CountType(), help="Width of its fully connected layers.")
+@click.option("--learning-rate", type=float, help="Of Adam.")
+@click.option("--rollout", type=CountType(), help="Actions in every world between two updates.")
+@click.option("--batch", type=CountType(), help="Actions that one gradient is taken of.")
+@click.option("--epochs", type=CountType(), help="How often an update goes over a rollout.")
+@click.option("--entropy", type=float, help="Weight of the entropy.")
+@click.option("--gamma", type=float, help="Discount of later rewards.")
+@click.option("--gae-lambda", type=float, help="Of generalised advantages.")
+@click.option("--clip", type=float, help="How far an update may change chances.")
+@backend_option("auto")
+@click.option("--device", help="A torch device: cpu, cuda, cuda:1.  [default: cpu]")
+@click.option("--threads", type=CountType(), help="CPU threads.  [default: 1]")
+@click.option(
+    "--checkpoint-every",
+    "checkpoint_minutes",
+    type=float,
+    metavar="MINUTES",
+    help="How much work a kill may cost; 0: one rollout.  [default: 2]",
+)
+@click.pass_context
+def command(
+    ctx: click.Context,
+    /,
+    task: str | None,
+    folder: Path | None,
+    resume: Path | None,
+    preset_name: str,
+    settings: dict[str, str],
+    packs: tuple[str, ...],
+    knobs: tuple[str, ...],
+    n_lines: int | None,
+    n_disks: int | None,
+    complexity: int | None,
+    **given: Any,
+) -> None:
+    """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
+
+    The same command again, or --resume DIR, goes on where a run was interrupted; more --steps go on with one that is
+    done. DIR gets checkpoints, metrics.jsonl and events for TensorBoard.
+    """
+    asked = {name: value for name, value in given.items() if ctx.get_parameter_source(name) is not _DEFAULT}
+    if resume is not None:
+        if task is not None or folder is not None:
+            raise BadInput("--resume goes without TASK and --run: the run knows its task")
+        config, folder = (
+            _config_of(resume, asked, settings or packs or knobs or n_lines or n_disks or complexity),
+            resume,
+        )
+    else:
+        if task is None:
+            raise BadInput("say which TASK, or --resume DIR")
+        short = {"lines": n_lines, "disks": n_disks, "complexity": complexity}
+        chosen = {**knob_values(knobs), **{name: one for name, one in short.items() if one is not None}}
+        name = str(Path(task).absolute()) if Path(task).suffix else task
+        config = preset(preset_name, name, **asked, knobs=chosen, params=settings, packs=packs)
+        folder = folder or Path("runs") / f"{Path(task).stem}-seed{config.seed}"
+    from powderdsl.rl.training import train
+
+    try:
+        with progress(Path(config.task).stem, config.steps, lines=True) as show:
+
+            def tell(step: int, mean: float | None) -> None:
+                show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
+
+            run = train(config, folder, progress=tell)
+    except KeyboardInterrupt:
+        click.echo(f"\ninterrupted; resume with: powderdsl train --resume {folder}", err=True)
+        raise
+    found = run.checkpoint()
+    click.echo(f"{folder}: {found.step:,} interactions")
+    click.echo(f"powderdsl evaluate {folder}; powderdsl watch {folder}", err=True)
+
+
+_DEFAULT = click.core.ParameterSource.DEFAULT
+
+
+def _config_of(folder: Path, asked: dict[str, Any], more: Any) -> TrainConfig:
+    """The settings of a run, with those changed that may change."""
+    from powderdsl.experiments.runs import find_run
+    from powderdsl.rl.config import HOW
+    from powderdsl.rl.policies import config_of
+    from powderdsl.rl.training import ASKED, KIND
+
+    fixed = [name for name in asked if name not in HOW]
+    if fixed or more:
+        raise BadInput(f"--resume keeps what is trained; only {', '.join(HOW)} may change")
+    run = find_run(folder, KIND)
+    latest = run.read_json(ASKED) or {}
+    how = {name: latest[name] for name in HOW if name in latest}
+    return from_json({**config_of(run).as_json(), **how, **asked})

@@ -1,0 +1,129 @@
+"""`powderdsl watch`: a film of an agent at its task."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.cli.options import ManyWords, WholeType, check_writable, packs_option, set_option
+from powderdsl.cli.pictures import MAX_SIDE
+from powderdsl.cli.task_sheets import knob_values
+from powderdsl.compiler import BACKENDS
+from powderdsl.tasks.names import is_task
+
+SUFFIXES = (".gif", ".mp4")
+
+
+@click.command("watch", cls=ManyWords)
+@click.argument("run", metavar="RUN|TASK")
+@click.option("--split", help="Which worlds.  [default: test where the task has it, else train]")
+@click.option("--worlds", type=WholeType(1, 64), default=4, show_default=True, help="How many, side by side.")
+@click.option(
+    "--first", type=WholeType(0, 2**62), default=0, show_default=True, help="Number of the first one."
+)
+@click.option(
+    "--policy",
+    type=click.Choice(("trained", "random", "nothing")),
+    help="Who acts.  [default: trained; of a TASK: random]",
+)
+@click.option(
+    "--deterministic/--sampled", default=False, help="The likeliest action, or one drawn.  [default: sampled]"
+)
+@click.option(
+    "--seed", type=WholeType(0, 2**32 - 1), default=0, show_default=True, help="Of what the policy draws."
+)
+@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
+@set_option
+@packs_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="x.gif or x.mp4.  [default: watch.gif, in the run's folder]",
+)
+@click.option("--fps", type=WholeType(1, 240), default=15, show_default=True, help="Frames a second.")
+@click.option("--scale", type=WholeType(1, 32), default=4, show_default=True, help="Pixels a cell.")
+@click.option(
+    "--backend", type=click.Choice(list(BACKENDS)), help="What runs the rules.  [default: the run's]"
+)
+def command(
+    run: str,
+    split: str | None,
+    worlds: int,
+    first: int,
+    policy: str | None,
+    deterministic: bool,
+    seed: int,
+    knobs: tuple[str, ...],
+    settings: dict[str, str],
+    packs: tuple[str, ...],
+    out: Path | None,
+    fps: int,
+    scale: int,
+    backend: str | None,
+) -> None:
+    """Play worlds of a RUN's task with its agent, side by side, and write the film.
+
+    Regions are outlined, and so is where the agent acts; below each world stand its return so far and the action. Of a
+    TASK, at random or with nobody acting.
+    """
+    from powderdsl.rl.config import TrainConfig
+    from powderdsl.simulation.media import write_gif, write_mp4
+    from powderdsl.tasks.shipped import load_task
+
+    found = None
+    if is_task(run):
+        config = TrainConfig(run)
+        task = load_task(run, knobs=knob_values(knobs), params=settings, packs=packs)
+    else:
+        if knobs or settings:
+            raise BadInput("--knob and --set go with a task: a run has its own")
+        from powderdsl.experiments.runs import find_run
+        from powderdsl.rl.policies import config_of, task_of
+
+        found = find_run(run, "ppo")
+        config = config_of(found)
+        task = task_of(found, packs)
+    policy = policy or ("random" if found is None else "trained")
+    if policy == "trained" and found is None:
+        raise BadInput("a task has no trained policy: name a run, or choose --policy random")
+    names = [one.name for one in task.splits]
+    split = split or ("test" if "test" in names else names[0])
+    out = out or (Path("watch.gif") if found is None else found.path / "watch.gif")
+    if out.suffix.lower() not in SUFFIXES:
+        raise BadInput(f"`{out}` must end in one of {' '.join(SUFFIXES)}")
+    if max(task.size) * scale * min(worlds, 4) > MAX_SIDE:
+        raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
+    check_writable(out)
+    import torch
+
+    from powderdsl.envs.acting import Policy, random_policy
+    from powderdsl.envs.tensor_env import TensorEnv
+    from powderdsl.rl.films import film
+    from powderdsl.rl.policies import load_policy
+    from powderdsl.tasks.episodes import compile_task
+
+    program = compile_task(task, split=split, backend=backend or config.backend)
+    acts: Policy | None = None
+    with user_values():
+        if policy == "trained" and found is not None:
+            env = TensorEnv(program, 1, observation=config.observation)
+            acts = load_policy(found, env, deterministic=deterministic)
+        elif policy == "random":
+            acts = random_policy(program.action_nvec)
+    played, pictures = film(
+        program,
+        acts,
+        torch.arange(first, first + worlds),
+        observation=config.observation if policy == "trained" else "ids",
+        seed=seed,
+        factor=scale,
+    )
+    write = write_gif if out.suffix.lower() == ".gif" else write_mp4
+    write(out, pictures, fps=fps)
+    returns = ", ".join(f"{one:.2f}" for one in played.returns.tolist())
+    click.echo(
+        f"wrote {out}: {task.name}, {policy}, worlds {first} to {first + worlds - 1} of {split}: {returns}"
+    )

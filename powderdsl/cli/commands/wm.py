@@ -1,0 +1,406 @@
+"""`powderdsl wm`: train networks that predict worlds, test them, and teach them packs they have not seen."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.cli.options import (
+    Decorated,
+    ManyWords,
+    WholeType,
+    backend_option,
+    check_writable,
+    layout_options,
+    set_option,
+)
+from powderdsl.cli.progress import progress
+
+if TYPE_CHECKING:
+    from powderdsl.worldmodel.scores import Tested
+    from powderdsl.worldmodel.training import Machine, Moment, TrainConfig
+
+
+def _words(name: str, about: str) -> Callable[[Decorated], Decorated]:
+    return click.option(name, multiple=True, metavar="PACK…", help=about)
+
+
+def _data_options(function: Decorated) -> Decorated:
+    options = (
+        click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: world-model]"),
+        click.option("--split", metavar="SPLIT", help="The task's worlds to train on.  [default: train]"),
+        click.option("--rules", metavar="RULES", help="The rules of its worlds.  [default: the task's own]"),
+        _words("--packs", "Keep these packs of the rules only, or add them."),
+        _words("--held-out", "Leave these packs of the rules out."),
+        click.option("--elements", type=WholeType(0, 255), help="How many elements besides empty are drawn."),
+        click.option("--lines", type=WholeType(0, 256), help="Up to how many lines a world has."),
+        click.option("--disks", type=WholeType(0, 256), help="Up to how many disks."),
+        click.option("--squares", type=WholeType(0, 256), help="Up to how many squares."),
+        click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another knob of the task."),
+        click.option("--states", type=WholeType(1, 1 << 32), help="How many start worlds there are."),
+        click.option("--buffer", "capacity", type=WholeType(1, 1 << 32), help="Pairs that the buffer holds."),
+        click.option("--refresh", type=WholeType(1, 1 << 20), help="Pairs that each iteration replaces."),
+        set_option,
+        click.option("--rulesets", type=WholeType(0, 1024), help="Draw so many rulesets around the rules."),
+        click.option(
+            "--first-ruleset", type=WholeType(0, 1 << 31), help="The number of the first.  [default: 0]"
+        ),
+        click.option("--chances", type=float, help="Their chances differ by up to this factor."),
+        click.option("--swap", "swaps", multiple=True, metavar="PROPERTY", help="Two elements exchange it."),
+        click.option(
+            "--leave-out", type=float, metavar="CHANCE", help="How likely a pack is left out of one."
+        ),
+    )
+    return _all(options, function)
+
+
+def _training_options(function: Decorated) -> Decorated:
+    rate = click.FloatRange(min=0, min_open=True)
+    options = (
+        click.option("--iterations", type=WholeType(1, 10**9), help="Steps of Adam."),
+        click.option("--batch", type=WholeType(1, 1 << 20), help="Pairs in each."),
+        click.option("--learning-rate", type=rate, help="Of Adam."),
+        click.option("--seed", type=WholeType(0, 2**63 - 1), help="Of weights, worlds and batches."),
+        click.option(
+            "--run", "folder", metavar="DIR", type=click.Path(path_type=Path), help="The run's folder."
+        ),
+        click.option(
+            "--store",
+            type=click.Choice(["auto", "memory", "disk"]),
+            default="auto",
+            show_default=True,
+            help="Where the buffer is kept.",
+        ),
+        click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
+        click.option(
+            "--save-every",
+            type=WholeType(1, 10**6),
+            default=60,
+            show_default=True,
+            help="Seconds between checkpoints.",
+        ),
+    )
+    return _machine_options(_all(options, function))
+
+
+def _machine_options(function: Decorated) -> Decorated:
+    options = (
+        click.option("--threads", type=WholeType(1, 1024), default=1, show_default=True, help="CPU threads."),
+        click.option("--device", default="cpu", show_default=True, help="A torch device: cpu, cuda, cuda:1."),
+        backend_option("auto"),
+    )
+    return _all(options, function)
+
+
+def _all(options: tuple[Callable[[Any], Any], ...], function: Decorated) -> Decorated:
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+@click.group("wm")
+def command() -> None:
+    """World models: networks that predict what a world holds some steps later.
+
+    \b
+        powderdsl wm train --held-out PACK --run runs/less
+        powderdsl wm eval runs/less
+        powderdsl wm finetune runs/less --packs PACK --iterations 100
+    """
+
+
+@command.command("train", cls=ManyWords)
+@click.option(
+    "--preset",
+    type=click.Choice(["small", "paper"]),
+    default="small",
+    show_default=True,
+    help="What other options change: `small` is for a CPU, `paper` for a GPU.",
+)
+@_data_options
+@click.option("--width", type=WholeType(1, 1024), help="Features of the first block.")
+@click.option(
+    "--slots", type=WholeType(1, 256), help="Room for this many elements, for packs that come later."
+)
+@_training_options
+def train_command(
+    preset: str,
+    task: str | None,
+    split: str | None,
+    rules: str | None,
+    packs: tuple[str, ...],
+    held_out: tuple[str, ...],
+    elements: int | None,
+    lines: int | None,
+    disks: int | None,
+    squares: int | None,
+    knobs: tuple[str, ...],
+    settings: dict[str, str],
+    swaps: tuple[str, ...],
+    folder: Path | None,
+    **values: Any,
+) -> None:
+    """Train a network on worlds that nobody touches.
+
+    A run that was stopped goes on when the same command is given again, as if it had not been stopped.
+    """
+    from powderdsl.cli.task_sheets import knob_values
+    from powderdsl.worldmodel.rulesets import Variety
+    from powderdsl.worldmodel.training import PRESETS
+
+    if packs and held_out:
+        raise BadInput("--packs says what stays, --held-out what goes: give one of them")
+    named = {"kinds": elements, "lines": lines, "disks": disks, "squares": squares}
+    chosen = {name: value for name, value in named.items() if value is not None}
+    config = PRESETS[preset]
+    variety = _given(chances=values["chances"], swaps=swaps or None, leave_out=values["leave_out"])
+    if (variety or values["first_ruleset"]) and not values["rulesets"]:
+        raise BadInput(
+            "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
+        )
+    with user_values():
+        differ = Variety(**variety)
+    data = replace(
+        config.data,
+        **_given(task=task, split=split),
+        rules=_rules_without(rules, task or config.data.task, packs, held_out),
+        knobs={**chosen, **knob_values(knobs)},
+        params=settings,
+        variety=differ,
+        **_given(
+            **{name: values[name] for name in ("states", "capacity", "refresh", "rulesets", "first_ruleset")}
+        ),
+    )
+    changes = _given(
+        **{name: values[name] for name in ("width", "iterations", "batch", "learning_rate", "seed", "slots")}
+    )
+    config = replace(config, data=data, **changes)
+    _run(config, folder or Path("runs") / _file_word(data.task), values)
+
+
+@command.command("finetune", cls=ManyWords)
+@click.argument("run", metavar="RUN")
+@_words("--packs", "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.")
+@_training_options
+def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
+    """Go on from a run's weights, on worlds of other packs' elements alone.
+
+    RUN is a run's folder, or its name in runs/. The new run is one of its own.
+    """
+    from powderdsl.worldmodel.training import load_trained
+    from powderdsl.worldmodel.transfer import finetuned
+
+    if not packs:
+        raise BadInput("--packs names what is to be learned")
+    trained = load_trained(run, device="cpu")
+    names = ("iterations", "batch", "learning_rate", "seed")
+    config = finetuned(trained, packs, **_given(**{name: values[name] for name in names}))
+    words = "-".join(config.data.only)
+    target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
+    note = {"parent": {"path": str(trained.run.path), "iterations": trained.checkpoint.step}}
+    _run(config, target, values, parent=trained.checkpoint, note=note)
+
+
+@command.command("eval", cls=ManyWords)
+@click.argument("run", metavar="RUN")
+@click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
+@click.option(
+    "--split", metavar="SPLIT", default="designed", show_default=True, help="Its worlds to test on."
+)
+@click.option("--rules", metavar="RULES", help="Other rules than the run's.")
+@_words("--only", "Draw elements of these packs only.  [default: the run's]")
+@click.option(
+    "--knob", "knobs", multiple=True, metavar="NAME=N", help="Knobs of the task.  [default: the run's]"
+)
+@click.option(
+    "--worlds", type=WholeType(1, 1 << 20), help="Of a split, or futures of each stand.  [default: 32, 4]"
+)
+@click.option(
+    "--rulesets",
+    type=WholeType(0, 1024),
+    default=0,
+    help="Test under so many rulesets that training never saw.",
+)
+@layout_options("One JSON object instead of a table.")
+@click.option("--out", metavar="FILE", type=click.Path(path_type=Path), help="[default: RUN/evaluation.json]")
+@_machine_options
+def eval_command(
+    run: str,
+    task: str | None,
+    split: str,
+    rules: str | None,
+    only: tuple[str, ...],
+    knobs: tuple[str, ...],
+    worlds: int | None,
+    rulesets: int,
+    layout: str,
+    out: Path | None,
+    **values: Any,
+) -> None:
+    """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
+
+    RUN is a run's folder, or its name in runs/. Losses are cross-entropies a cell, in nats. The worlds have seeds
+    that no training takes. What is found is also written to the run's evaluation.json.
+    """
+    from powderdsl.cli.task_sheets import knob_values
+    from powderdsl.experiments.runs.folder import write_json
+    from powderdsl.worldmodel.scores import evaluate
+    from powderdsl.worldmodel.training import load_trained
+
+    machine = _machine(values)
+    trained = load_trained(run, device=machine.device)
+    tested = evaluate(
+        trained,
+        task=task,
+        split=split,
+        rules=rules,
+        only=only or None,
+        knobs=knob_values(knobs) if knobs else None,
+        worlds=worlds,
+        rulesets=rulesets,
+        machine=machine,
+    )
+    plain = tested.plain()
+    if out is not None:
+        write_json(out, plain, follow=True)
+    else:
+        trained.run.write_json("evaluation.json", plain)
+    if layout == "json":
+        click.echo(json.dumps(plain, indent=2, ensure_ascii=False))
+    else:
+        click.echo("\n".join(_text(tested, plain)))
+
+
+@command.command("show", cls=ManyWords)
+@click.argument("run", metavar="RUN")
+@click.option("--out", metavar="FILE", required=True, type=click.Path(path_type=Path), help="A .png file.")
+@click.option("--steps", type=WholeType(1, 4096), help="How far ahead.  [default: as it was trained]")
+@click.option(
+    "--after", type=WholeType(0, 10**6), default=0, show_default=True, help="Steps that worlds run before."
+)
+@click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
+@click.option("--split", metavar="SPLIT", default="designed", show_default=True, help="Its worlds.")
+@click.option("--rules", metavar="RULES", help="Other rules than the run's.")
+@click.option("--scale", type=WholeType(1, 16), default=2, show_default=True, help="Pixels a cell.")
+@_machine_options
+def show_command(
+    run: str,
+    out: Path,
+    steps: int | None,
+    after: int,
+    task: str | None,
+    split: str,
+    rules: str | None,
+    scale: int,
+    **values: Any,
+) -> None:
+    """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
+
+    For several times the steps that the network was trained for, it is applied to what it predicted.
+    """
+    if out.suffix.lower() != ".png":
+        raise BadInput(f"`{out}`: strips are a .png file")
+    check_writable(out)
+    from powderdsl.simulation.media import write_png
+    from powderdsl.worldmodel.scores import unseen_worlds
+    from powderdsl.worldmodel.strips import sheet, strips
+    from powderdsl.worldmodel.training import load_trained
+
+    machine = _machine(values)
+    trained = load_trained(run, device=machine.device)
+    step = trained.config.data.steps
+    if steps is not None and steps % step:
+        raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
+    worlds = unseen_worlds(trained, task=task, split=split, rules=rules, machine=machine)
+    found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after)
+    write_png(out, sheet(found, worlds.rules, factor=scale))
+    for number, strip in enumerate(found, 1):
+        click.echo(f"{number}  {strip.name}: {strip.wrong:,} of {strip.truth.size:,} cells wrong")
+    for name, lacking, _ in worlds.found.missing:
+        click.echo(f"left out: {name}, which needs {', '.join(lacking)}", err=True)
+
+
+def _given(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _file_word(task: str) -> str:
+    return Path(task).stem or "run"
+
+
+def _machine(values: Mapping[str, Any]) -> Machine:
+    from powderdsl.simulation.programs import find_device
+    from powderdsl.worldmodel.training import Machine
+
+    find_device(values["device"])
+    names = ("device", "threads", "backend", "store", "compiled")
+    import torch
+
+    torch.set_num_threads(values["threads"])
+    return Machine(**{name: values[name] for name in names if name in values})
+
+
+def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
+    """What stands for the rules of a run; nothing, if they are the task's own."""
+    if not packs and not held_out:
+        return rules or ""
+    from powderdsl.tasks.shipped import load_task
+    from powderdsl.worldmodel.rule_words import keep, leave_out
+
+    base = rules or "+".join(load_task(task).rules)
+    return keep(base, packs) if packs else leave_out(base, held_out)
+
+
+def _run(config: TrainConfig, folder: Path, values: Mapping[str, Any], **more: Any) -> None:
+    """Train, and say how it goes."""
+    from powderdsl.worldmodel.training import train
+
+    machine = _machine(values)
+    began = time.monotonic()
+    with progress("wm", config.iterations, lines=True) as show:
+
+        def tell(now: Moment) -> None:
+            show(now.done, "" if now.loss is None else f"loss {now.loss:.4f}")
+
+        try:
+            run = train(config, folder, machine=machine, tell=tell, save_seconds=values["save_every"], **more)
+        except KeyboardInterrupt:
+            click.echo(f"interrupted; the same command resumes {folder}", err=True)
+            raise
+    took = time.monotonic() - began
+    click.echo(
+        f"{run.path}: {config.iterations:,} iterations, {took:.0f} s here; powderdsl wm eval {run.path}"
+    )
+
+
+def _text(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
+    from powderdsl.cli.plain_table import table
+
+    predictors = list(plain["mean"])
+    yield f"{tested.rules}, {tested.task}/{tested.split}, after {tested.step:,} iterations: loss (accuracy; of cells that change)"
+    rows = [["", *predictors]]
+    for name, found in {**plain["tests"], "mean": plain["mean"]}.items():
+        rows.append([name, *(_figures(found[who]) for who in predictors)])
+    yield from ("", *table(rows))
+    yield ""
+    rows = [["element", "cells", "recall", "precision"]]
+    for name, one in plain["elements"].items():
+        rows.append([name, f"{one['cells']:,}", _share(one["recall"]), _share(one["precision"])])
+    yield from table(rows)
+    for name, lacking in plain["left_out"].items():
+        yield f"left out: {name}, which needs {', '.join(lacking)}"
+
+
+def _figures(one: Mapping[str, Any]) -> str:
+    return f"{one['loss']:.4f} ({_share(one['accuracy'])}; {_share(one['changed_accuracy'])})"
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f} %"

@@ -1,0 +1,101 @@
+"""The group of commands. Names and summaries stand in one table, so that `--help` imports nothing else."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any, NoReturn
+
+import click
+
+from powderdsl.cli.exits import report_failure, version
+from powderdsl.diagnostics.printable import printable_streams
+from powderdsl.system.interrupts import LIFELINE, end_with_stdin, interruptible
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    # name: (module in powderdsl.cli.commands, summary)
+    "run": ("run", "Run rules on a world: watch it, or write a picture or an animation."),
+    "check": ("check", "Find the mistakes in rule files and tasks, all at once."),
+    "compile": ("compile", "Print what a stage of the compiler makes of rules."),
+    "show": ("show", "List elements, reactions, passes and parameters; or what a task is."),
+    "test": ("test", "Run the tests of packs, and hold their invariants against the rules."),
+    "trace": ("trace", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
+    "fuzz": ("fuzz", "Compare all backends on random rules and worlds."),
+    "record": ("record", "Record episodes of a task: data for offline learning and world models."),
+    "bench": ("bench", "Measure how fast rules run, on each backend, batch and size."),
+    "train": ("train", "Train an agent on a task; go on where it was interrupted."),
+    "evaluate": ("evaluate", "Compare an agent with acting at random, and with doing nothing."),
+    "watch": ("watch", "Make a film of an agent at its task."),
+    "wm": ("wm", "World models: train networks that predict worlds, test them, teach them packs."),
+    "study": ("study", "Run many settings and seeds of training, and compare what comes out."),
+    "cache": ("cache", "List or remove compiled code that is kept on this machine."),
+    "new": ("new", "Write a first pack: an element, a rule and a test."),
+    "render": ("render", "Draw a world as a picture, without running it."),
+    "explain": ("explain", "Say what a diagnostic code means, and how to mend it."),
+}
+
+
+class CommandGroup(click.Group):
+    """Imports commands late, suggests one for an unknown name, and turns every failure into an exit code."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = import_module(f"powderdsl.cli.commands.{COMMANDS[cmd_name][0]}").command
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            from powderdsl.diagnostics import suggest
+
+            ctx.fail("; ".join([f"no command `{args[0]}`", *suggest(args[0], COMMANDS, "commands")]))
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+
+    def main(
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **options: Any
+    ) -> NoReturn:
+        """Run a command and exit with one of the codes of `exits`."""
+        # A terminal that lacks a character shows a `?` in its place.
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="replace")
+        options["standalone_mode"] = False
+        if os.environ.pop(LIFELINE, None):
+            end_with_stdin()
+        # Without arguments of a caller's, the command is all that this process does.
+        with printable_streams(), interruptible(until_exit=args is None) as over:
+            try:
+                status = super().main(args, prog_name or "powderdsl", *rest, **options)
+            except (Exception, KeyboardInterrupt) as error:
+                over()
+                status = report_failure(error)
+        sys.exit(status or 0)
+
+
+@click.group(
+    cls=CommandGroup,
+    name="powderdsl",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(version(), prog_name="powderdsl", message="%(prog)s %(version)s")
+def main() -> None:
+    """Physics as data, compiled to tensor kernels.
+
+    RULES names rules everywhere: a shipped ruleset or pack, a rule file, or several of them joined by `+`;
+    what stands behind a `-` is left out.
+
+    \b
+        powderdsl run RULES --watch
+        powderdsl new NAME && powderdsl check core+NAME.yaml
+    """

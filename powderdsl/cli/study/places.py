@@ -1,0 +1,178 @@
+"""Where mistakes in the words of a study stand: values are written in one place and used in another."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from string import Template
+from typing import Any
+
+import click
+
+from powderdsl.diagnostics import CompileError, Label, Reporter, Span
+from powderdsl.experiments.studies.paths import TEXT, confined
+from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, Step, Study
+
+Values = Mapping[str, str]
+"""What each name stands for."""
+
+
+def names_in(texts: Iterable[str]) -> set[str]:
+    """The names that texts use: ``$NAME``."""
+    return {name for text in texts for name in Template(text).get_identifiers()}
+
+
+@dataclass(frozen=True)
+class Word:
+    """A word of a step: which of its option's, and what it is with some values.
+
+    `written` has the values in place of their names; `filled` is what the command is given.
+    """
+
+    step: str
+    option: str
+    number: int
+    text: str
+    written: str
+    filled: str
+
+
+class Places:
+    """A study's words with all of its values, and reports of what is wrong with them."""
+
+    def __init__(self, study: Study, reporter: Reporter):
+        self.study, self.reporter = study, reporter
+        self.steps = {step.name: step for step in study.steps}
+        self.set_by = {axis.name: axis.name for axis in study.axes}
+        """Which setting gives each name its value."""
+        for axis in study.axes:
+            self.set_by |= {name: axis.name for values in axis.sets.values() for name in values}
+        self.wrong: set[str] = set()
+        """Steps with mistakes: consequences of those are not reported."""
+
+    def known(self, names: set[str]) -> bool:
+        """Whether all names have values; others are reported by whoever reads the file."""
+        return names <= {*self.set_by, SEED, SIZE}
+
+    def values(self, names: set[str]) -> Iterator[Values]:
+        """All values that names can have together, at any size."""
+        axes = [axis for axis in self.study.axes if axis.name in {self.set_by.get(name) for name in names}]
+        seen = set()
+        for size in SIZES:
+            for chosen in itertools.product(*(axis.values[size] for axis in axes)):
+                found = {SEED: "0", SIZE: size}
+                for axis, value in zip(axes, chosen, strict=True):
+                    found |= {axis.name: value, **axis.sets.get(value, {})}
+                key = tuple(sorted((name, value) for name, value in found.items() if name in names))
+                if key not in seen:
+                    seen.add(key)
+                    yield found
+
+    def words(self, step: Step, values: Values) -> dict[str, list[Word]]:
+        """The words of a step's options, and of ``on`` where that is not a step."""
+        texts = dict(step.options)
+        if step.on is not None and not step.on_step:
+            texts["on"] = (step.on,)
+        return {
+            option: [self._word(step, option, number, text, values) for number, text in enumerate(words)]
+            for option, words in texts.items()
+        }
+
+    def _word(self, step: Step, option: str, number: int, text: str, values: Values) -> Word:
+        written, folder = Template(text).safe_substitute(values), self.study.folder
+        filled = confined(step.means.get(option, TEXT), written, folder, folder)
+        return Word(step.name, option, number, text, written, filled)
+
+    def maker(self, step: Step) -> Step:
+        """The step whose run is meant by a step's ``on``."""
+        found = self.steps[step.on or ""]
+        while not found.makes_run and found.on_step:
+            found = self.steps[found.on or ""]
+        return found
+
+    def names_of(self, step: Step) -> set[str]:
+        """The names that a step uses, and what it works on."""
+        found = names_in([step.on or "", *(word for _, words in step.options for word in words)])
+        return found | (self.names_of(self.steps[step.on or ""]) if step.on_step else set())
+
+    def place(self, *key: str) -> Span | None:
+        return self.study.places.get(key)
+
+    def report(
+        self,
+        word: Word | None,
+        step: Step,
+        message: str,
+        label: str = "",
+        *,
+        code: str = "PD806",
+        **more: Any,
+    ) -> None:
+        """Report a mistake in a word: where its value is written, and where it is used."""
+        self.wrong.add(step.name)
+        if word is None:
+            self.reporter.error(code, message, self.place("step", step.name), label, **more)
+            return
+        span = self.place("word", step.name, word.option, str(word.number))
+        names = sorted(names_in([word.text]))
+        written = [self._written(name, word) for name in names] if len(names) == 1 else []
+        if written and written[0] is not None:
+            used = Label(span, f"as `{word.written}`")
+            self.reporter.error(code, message, written[0], label, secondary=(used,), **more)
+        else:
+            self.reporter.error(code, message, span, label, **more)
+
+    def _written(self, name: str, word: Word) -> Span | None:
+        """Where the value of a name stands that makes a word what it is."""
+        for axis in self.study.axes:
+            for size in SIZES:
+                for value in axis.values[size]:
+                    found = {axis.name: value, **axis.sets.get(value, {})}.get(name)
+                    if (
+                        found is not None
+                        and Template(word.text).safe_substitute({name: found}) == word.written
+                    ):
+                        at = (
+                            ("value", axis.name, value)
+                            if name == axis.name
+                            else ("set", axis.name, value, name)
+                        )
+                        return self.place(*at)
+        return None
+
+    @contextmanager
+    def told(self, word: Word | None, step: Step, *, here: bool = False) -> Iterator[list[Exception]]:
+        """Report what the block raises, which the list then holds.
+
+        Args:
+            here: a value of the study is wrong, even where that shows in another file. Otherwise mistakes of other files
+                are shown there.
+        """
+        failed: list[Exception] = []
+        try:
+            yield failed
+        except CompileError as error:
+            failed.append(error)
+            self.wrong.add(step.name)
+            found = error.diagnostics
+            if here:
+                found = tuple(one for one in found if one.primary.span is None) or found[:1]
+            for one in found:
+                if one.primary.span is not None and not here:
+                    self.reporter.error(
+                        one.code,
+                        one.message,
+                        one.primary.span,
+                        one.primary.text,
+                        secondary=one.secondary,
+                        notes=one.notes,
+                        helps=one.helps,
+                    )
+                else:
+                    self.report(word, step, one.message, code=one.code, notes=one.notes, helps=one.helps)
+        except (click.ClickException, ValueError, TypeError) as error:
+            failed.append(error)
+            said = error.format_message() if isinstance(error, click.ClickException) else str(error)
+            self.report(word, step, " ".join(said.split()))

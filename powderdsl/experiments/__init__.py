@@ -1,0 +1,1 @@
+"""Experiments: measuring speed, the folders of runs, and studies over many of them."""

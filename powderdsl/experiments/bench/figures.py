@@ -1,0 +1,211 @@
+"""What was measured, as values: events, the figures of each cell, and the report as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any
+
+from powderdsl.experiments.bench.machine import Machine
+from powderdsl.experiments.bench.memory import Memory
+from powderdsl.experiments.bench.plan import Cell, Plan
+
+FORMAT_VERSION = 1
+"""Of `report_data`: raised when a key changes its meaning."""
+
+
+@dataclass(frozen=True)
+class Started:
+    """A cell is about to be compiled or profiled (`what`), which may take a while."""
+
+    cell: Cell
+    what: str
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A cell whose first calls are done. `compile_seconds` are its backend's, shared by all cells that have it.
+
+    `state_bytes` are those of the worlds' tensors in storage dtypes. A sample is `calls` calls of `steps` steps.
+    """
+
+    cell: Cell
+    compile_seconds: float
+    first_step_seconds: float
+    memory: Memory
+    state_bytes: int
+    steps: int
+    calls: int
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Seconds of a cell's calls in one round, and the processor's seconds that this process had in them."""
+
+    cell: Cell
+    round: int
+    seconds: float
+    processor_seconds: float
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Seconds a world and step by pass, in the order they run; empty if the backend cannot say."""
+
+    cell: Cell
+    passes: tuple[tuple[str, float], ...]
+
+
+Event = Started | Ready | Sample | Costs
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The middle of the rounds, and their ends."""
+
+    median: float
+    min: float
+    max: float
+
+
+@dataclass(frozen=True)
+class CellFigures:
+    """A cell that was measured in at least one round. `seconds` and `processor_seconds` have one value a round."""
+
+    ready: Ready
+    seconds: tuple[float, ...]
+    processor_seconds: tuple[float, ...]
+    passes: tuple[tuple[str, float], ...]
+
+    @property
+    def cell(self) -> Cell:
+        return self.ready.cell
+
+    @property
+    def world_steps(self) -> int:
+        """Steps of single worlds in a sample."""
+        return self.cell.batch * self.ready.steps * self.ready.calls
+
+    @property
+    def to_first_step(self) -> float:
+        """Seconds from the checked rules to the state after one step."""
+        return self.ready.compile_seconds + self.ready.first_step_seconds
+
+    @property
+    def processors(self) -> float:
+        """CPUs that this process had: less than its threads where others were at work."""
+        return sum(self.processor_seconds) / max(sum(self.seconds), 1e-9)
+
+    @property
+    def rate(self) -> Spread:
+        """World-steps a second."""
+        return _spread(self.world_steps / seconds for seconds in self.seconds)
+
+    @property
+    def world_step_seconds(self) -> Spread:
+        """Seconds a world and step."""
+        return _spread(seconds / self.world_steps for seconds in self.seconds)
+
+    @property
+    def processor_step_seconds(self) -> Spread:
+        """The processor's seconds a world and step, all threads together: what others do hardly changes them."""
+        return _spread(seconds / self.world_steps for seconds in self.processor_seconds)
+
+
+@dataclass(frozen=True)
+class Report:
+    """A plan and what came of it. `load_after` is the load average of the last minute of measuring."""
+
+    plan: Plan
+    machine: Machine
+    cells: tuple[CellFigures, ...]
+    interrupted: bool
+    load_after: float | None
+
+
+def make_report(
+    plan: Plan,
+    machine: Machine,
+    events: Sequence[Event],
+    load_after: float | None = None,
+    *,
+    interrupted: bool = False,
+) -> Report:
+    """The report of the events so far; cells that no round has reached are left out."""
+    cells = []
+    for ready in (event for event in events if isinstance(event, Ready)):
+        own = [event for event in events if event.cell == ready.cell]
+        samples = [event for event in own if isinstance(event, Sample)]
+        passes = next((event.passes for event in own if isinstance(event, Costs)), ())
+        if samples:
+            seconds = tuple(sample.seconds for sample in samples)
+            busy = tuple(sample.processor_seconds for sample in samples)
+            cells.append(CellFigures(ready, seconds, busy, passes))
+    return Report(plan, machine, tuple(cells), interrupted, load_after)
+
+
+def report_data(report: Report) -> dict[str, Any]:
+    """A report as plain data for JSON: every figure, and the seconds of every round."""
+    plan = report.plan
+    return {
+        "format": "powderdsl bench",
+        "version": FORMAT_VERSION,
+        "machine": {**asdict(report.machine), "load_after": report.load_after},
+        "rules": plan.ruleset.name,
+        "workload": plan.workload,
+        "device": plan.device,
+        "seed": plan.seed,
+        "rounds": plan.rounds,
+        "interrupted": report.interrupted,
+        "cells": [_cell_data(figures) for figures in report.cells],
+    }
+
+
+def _cell_data(figures: CellFigures) -> dict[str, Any]:
+    cell, ready = figures.cell, figures.ready
+    seconds = figures.world_step_seconds
+    return {
+        "backend": cell.backend,
+        "batch": cell.batch,
+        "rows": cell.size[0],
+        "columns": cell.size[1],
+        "elements": list(cell.elements),
+        "threads": cell.threads,
+        "compile_seconds": ready.compile_seconds,
+        "first_step_seconds": ready.first_step_seconds,
+        "peak_memory_bytes": ready.memory.growth,
+        "peak_memory_how": ready.memory.how,
+        "peak_memory_bytes_per_cell": None
+        if ready.memory.growth is None
+        else ready.memory.growth / (cell.batch * cell.world_cells),
+        "state_bytes_per_cell": ready.state_bytes / (cell.batch * cell.world_cells),
+        "steps_per_call": ready.steps,
+        "calls_per_round": ready.calls,
+        "round_seconds": list(figures.seconds),
+        "round_processor_seconds": list(figures.processor_seconds),
+        "world_steps_per_second": asdict(figures.rate),
+        "cell_updates_per_second": asdict(_scaled(figures.rate, cell.world_cells)),
+        "microseconds_per_world_step": asdict(_scaled(seconds, 1e6)),
+        "processor_microseconds_per_world_step": asdict(_scaled(figures.processor_step_seconds, 1e6)),
+        "nanoseconds_per_cell_step": asdict(_scaled(seconds, 1e9 / cell.world_cells)),
+        "passes": [
+            {"name": name, "microseconds_per_world_step": spent * 1e6, "share": share}
+            for name, spent, share in pass_shares(figures)
+        ],
+    }
+
+
+def pass_shares(figures: CellFigures) -> list[tuple[str, float, float]]:
+    """(pass, seconds a world and step, its part of all passes)."""
+    total = sum(spent for _, spent in figures.passes)
+    return [(name, spent, spent / total if total else 0.0) for name, spent in figures.passes]
+
+
+def _spread(values: Iterable[float]) -> Spread:
+    found = list(values)
+    return Spread(median(found), min(found), max(found))
+
+
+def _scaled(spread: Spread, factor: float) -> Spread:
+    return Spread(spread.median * factor, spread.min * factor, spread.max * factor)

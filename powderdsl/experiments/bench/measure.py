@@ -1,0 +1,170 @@
+"""Measuring a plan: every cell made ready, then all of them in turn, round after round.
+
+Rounds are interleaved, so that a machine that is slow for a while is slow for all cells alike.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from powderdsl.experiments.bench.figures import Costs, Event, Ready, Report, Sample, Started, make_report
+from powderdsl.experiments.bench.machine import load_average, this_machine
+from powderdsl.experiments.bench.memory import Memory, peak_growth
+from powderdsl.experiments.bench.plan import Cell, Plan
+from powderdsl.experiments.bench.workloads import start_worlds
+
+if TYPE_CHECKING:
+    from powderdsl.simulation.simulator import Simulator, World
+
+Clock = Callable[[], float]
+"""Seconds since some moment."""
+
+
+def measure(plan: Plan, on_event: Callable[[Event], None] | None = None) -> Report:
+    """Measure a plan to its end; `on_event` is called with each part of the result when it is there.
+
+    Raises:
+        CompileError: PD701 for a backend or device that is not there.
+    """
+    machine = this_machine(plan.device)
+    events = []
+    for event in measure_events(plan):
+        events.append(event)
+        if on_event is not None:
+            on_event(event)
+    return make_report(plan, machine, events, load_average())
+
+
+def measure_events(plan: Plan) -> Iterator[Event]:
+    """The parts of a measurement, as they come in: whoever stops early has what came so far.
+
+    Torch's number of threads is that of each cell while this runs.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    try:
+        simulators: dict[tuple[str, int], tuple[Simulator, float]] = {}
+        runs = []
+        for cell in plan.cells:
+            yield Started(cell, "compile")
+            run, ready = _make_ready(plan, cell, simulators, time.perf_counter)
+            runs.append(run)
+            yield ready
+        for number, index, seconds, busy in interleaved([run.sample for run in runs], plan.rounds):
+            yield Sample(plan.cells[index], number, seconds, busy)
+        for cell, run in zip(plan.cells, runs if plan.profile else (), strict=plan.profile):
+            yield Started(cell, "profile")
+            yield Costs(cell, run.costs())
+    finally:
+        torch.set_num_threads(threads)
+
+
+def interleaved(
+    works: Sequence[Callable[[], None]],
+    rounds: int,
+    clock: Clock = time.perf_counter,
+    processor: Clock = time.process_time,
+) -> Iterator[tuple[int, int, float, float]]:
+    """Each work once, then each once more, and so on: (round, index of the work, seconds, processor seconds)."""
+    for number in range(rounds):
+        for index, work in enumerate(works):
+            began, used = clock(), processor()
+            work()
+            yield number, index, clock() - began, processor() - used
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A cell that is ready: `calls` calls of `steps` steps, each from the same worlds."""
+
+    sim: Simulator
+    world: World
+    threads: int
+    steps: int
+    calls: int
+
+    def sample(self) -> None:
+        import torch
+
+        torch.set_num_threads(self.threads)
+        for _ in range(self.calls):
+            self.sim.step(self.world, self.steps)
+        synchronise(self.sim)
+
+    def costs(self) -> tuple[tuple[str, float], ...]:
+        """Seconds a world and step of each pass."""
+        import torch
+
+        torch.set_num_threads(self.threads)
+        self.sim.profile(self.world, 1)  # what has to be compiled for it is compiled now
+        seconds = dict.fromkeys(self.sim.passes, 0.0)
+        for _ in range(self.calls):
+            for name, spent in self.sim.profile(self.world, self.steps).items():
+                seconds[name] += spent
+        world_steps = len(self.world) * self.steps * self.calls
+        return (
+            tuple((name, spent / world_steps) for name, spent in seconds.items())
+            if any(seconds.values())
+            else ()
+        )
+
+
+def synchronise(sim: Simulator) -> None:
+    """Wait for what a GPU still has to do."""
+    import torch
+
+    if sim.device.type == "cuda":
+        torch.cuda.synchronize(sim.device)
+
+
+def _make_ready(
+    plan: Plan, cell: Cell, simulators: dict[tuple[str, int], tuple[Simulator, float]], clock: Clock
+) -> tuple[_Run, Ready]:
+    """Compile a cell's backend unless another cell has, run the first calls, and choose how many fit into a sample.
+
+    Samples start from the worlds after the first step: they are in the backend's own form by then.
+    """
+    import torch
+
+    from powderdsl.simulation.simulator import compile
+
+    torch.set_num_threads(cell.threads)
+    key = (cell.backend, cell.threads)
+    if key not in simulators:
+        began = clock()
+        sim = compile(plan.ruleset, cell.backend, plan.device, cell.threads)
+        simulators[key] = (sim, clock() - began)
+    sim, compiling = simulators[key]
+    start = start_worlds(sim, cell, plan.workload, plan.seed)
+    state_bytes = sum(value.numel() * value.element_size() for value in start.state.values())
+    synchronise(sim)
+    timed = _FirstCalls(sim, start, plan.steps, plan.seconds / plan.rounds, clock)
+    memory: Memory = peak_growth(timed.go, plan.device)
+    run = _Run(sim, timed.after, cell.threads, timed.steps, timed.calls)
+    ready = Ready(cell, compiling, timed.first, memory, state_bytes, timed.steps, timed.calls)
+    return run, ready
+
+
+class _FirstCalls:
+    """The first step, and calls to find out how many fit into `budget` seconds."""
+
+    def __init__(self, sim: Simulator, start: World, steps: int, budget: float, clock: Clock):
+        self._sim, self._clock, self._budget = sim, clock, budget
+        self.after, self.steps, self.calls, self.first = start, steps, 1, 0.0
+
+    def go(self) -> None:
+        self.first = self._seconds(1, keep=True)
+        self.steps = max(1, min(self.steps, int(self._budget / self._seconds(1))))
+        self.calls = max(1, int(self._budget / self._seconds(self.steps)))
+
+    def _seconds(self, steps: int, keep: bool = False) -> float:
+        began = self._clock()
+        after = self._sim.step(self.after, steps)
+        synchronise(self._sim)
+        if keep:
+            self.after = after
+        return max(self._clock() - began, 1e-9)

@@ -1,0 +1,104 @@
+"""Checkpoints: files that are there whole or not at all, and carry their own digest in their names."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from powderdsl.system.pickles import checked
+from powderdsl.system.reading import read_bytes
+from powderdsl.system.writing import failure, replacing
+
+NAME = re.compile(r"([0-9]{12})-([0-9a-f]{16})\.pt")
+
+
+MAX_BYTES = 1 << 33
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What was saved after `step` steps: nested dicts, lists and tuples of tensors, numbers, text and None."""
+
+    step: int
+    state: Any
+    path: Path
+
+
+def save_checkpoint(folder: Path, step: int, state: Any) -> Path:
+    """Write a checkpoint, and remove all others but the last one before it. Returns its path.
+
+    Raises:
+        CompileError: PD613 if the folder cannot be written to, or the disk is full.
+    """
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    data = buffer.getbuffer()
+    path = folder / f"{step:012d}-{hashlib.sha256(data).hexdigest()[:16]}.pt"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        _sync(folder)
+    except OSError as error:
+        raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
+    others = [(number, old) for number, _, old in _named(folder) if old != path]
+    # Later ones are left by a run that had to go back; they must not be taken for newer.
+    spare = next((old for number, old in others if number < step), None)
+    for _, old in others:
+        if old != spare:
+            with suppress(OSError):
+                old.unlink()
+    return path
+
+
+def latest_checkpoint(folder: Path, device: str | torch.device = "cpu") -> Checkpoint | None:
+    """The newest checkpoint whose digest is right; None if there is none. Damaged ones are passed over.
+
+    Loading executes nothing: only tensors and plain values are read, and they take no more memory than the file.
+
+    Raises:
+        CompileError: PD620 for a file that is whole and holds something else.
+    """
+    for step, digest, path in _named(folder):
+        try:
+            data = read_bytes(path, MAX_BYTES)
+        except OSError:
+            continue
+        if hashlib.sha256(data).hexdigest()[:16] == digest:
+            try:
+                state = torch.load(checked(data), map_location=device, weights_only=True)
+            except Exception as error:  # a crafted file raises whatever it likes
+                why = (str(error).strip().partition("\n")[0] or type(error).__name__)[:300]
+                raise failure("PD620", f"{path} is not a checkpoint of a run", notes=(why,)) from None
+            return Checkpoint(step, state, path)
+    return None
+
+
+def _named(folder: Path) -> list[tuple[int, str, Path]]:
+    """Step, digest and path of all checkpoints, the newest first."""
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return []
+    found = [(match, folder / name) for name in names if (match := NAME.fullmatch(name))]
+    return sorted(((int(match[1]), match[2], path) for match, path in found), reverse=True)
+
+
+def _sync(folder: Path) -> None:
+    """Make the new name last: without it, a power cut may leave the old one."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some file systems cannot
+            os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,273 @@
+"""A run's folder: `run.json` says what it is; checkpoints and metrics how far it got."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock, Timeout
+
+from powderdsl.diagnostics import CompileError, suggest
+from powderdsl.experiments.runs.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
+from powderdsl.experiments.runs.metrics import Metrics
+from powderdsl.system.reading import check_links, read_json
+from powderdsl.system.scratch import sweep
+from powderdsl.system.writing import failure, replacing
+
+ABOUT = "run.json"
+FORMAT = 2
+FIRST_FORMAT = 1
+FINGERPRINTS = ("rules_fingerprint", "task_fingerprint", "worlds")
+"""Settings that are hashes of what files said."""
+PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A folder of one training run.
+
+    `kind` is what was trained; `config` all that decides how, as JSON has it; `about` the whole of ``run.json``: also
+    versions, the command line and the time when it began.
+    """
+
+    path: Path
+    kind: str
+    config: Mapping[str, Any]
+    about: Mapping[str, Any]
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from training here. The lock of a process that dies is gone with it.
+
+        Raises:
+            CompileError: PD622 if another one does.
+        """
+        with held(self.path):
+            yield
+
+    def latest_checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint | None:
+        """The newest checkpoint that is whole; None if there is none."""
+        return latest_checkpoint(self.path / "checkpoints", device)
+
+    def checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint:
+        """The same, for those who need one. Raises CompileError (PD620)."""
+        found = self.latest_checkpoint(device)
+        if found is None:
+            raise _no_run(self.path, "it has no checkpoint that can be read")
+        return found
+
+    def save_checkpoint(self, step: int, state: Any) -> Path:
+        """Save nested dicts, lists and tuples of tensors, numbers, text and None. Raises CompileError (PD613)."""
+        return save_checkpoint(self.path / "checkpoints", step, state)
+
+    def metrics(self, step: int = 0) -> Metrics:
+        """Where to write numbers from `step` on; those of later steps are dropped."""
+        return Metrics(self.path, step)
+
+    def write_json(self, name: str, value: Any) -> Path:
+        """Write a file of the folder whole or not at all."""
+        return write_json(self.path / name, value)
+
+    def read_json(self, name: str) -> Any:
+        """A file of the folder; None if there is none or it is damaged."""
+        return read_json(self.path / name)
+
+
+def open_run(
+    path: str | Path, kind: str, config: Mapping[str, Any], *, note: Mapping[str, Any] | None = None
+) -> RunFolder:
+    """Begin a run, or come back to it with the same configuration.
+
+    Args:
+        config: what JSON can hold. note: more to keep in ``run.json``, which takes no part in the comparison.
+
+    Raises:
+        CompileError: PD621 where the folder holds another run, or other files; PD620 where its ``run.json`` is damaged;
+            PD613 where nothing can be written.
+    """
+    folder, plain = Path(path), json.loads(json.dumps(config))
+    if (folder / ABOUT).exists():
+        found = read_run(folder)
+        differences = _differences(found, kind, plain)
+        if differences:
+            raise failure(
+                "PD621",
+                f"{folder} holds another run",
+                notes=differences,
+                helps=("choose another folder with `--run`, or go on with that run's own settings",),
+            )
+        return found
+    new_folder(folder)
+    about = {
+        "format": FORMAT,
+        "kind": kind,
+        "config": plain,
+        **(note or {}),
+        "versions": versions(),
+        "command": sys.argv,
+        "began": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_json(folder / ABOUT, about)
+    return read_run(folder, kind)
+
+
+@contextmanager
+def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
+    """Keep other processes from writing to a folder. What killed ones have left there is removed.
+
+    Args:
+        patience: seconds to wait for another process.
+
+    Raises:
+        CompileError: PD622 if another one does; PD613 if the folder cannot be written to.
+    """
+    check_folder(folder)
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=patience)
+    except Timeout:
+        raise failure(
+            "PD622",
+            f"another process works on {folder}",
+            helps=("wait for it, or choose another folder",),
+        ) from None
+    except OSError as error:
+        raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
+    try:
+        sweep(folder)
+        for inner in sorted(folder.iterdir()):
+            sweep(inner)
+        yield
+    finally:
+        lock.release()
+
+
+def new_folder(folder: Path) -> None:
+    """Make a folder for something that will be written there, unless it is there and empty.
+
+    Raises:
+        CompileError: PD621 where it holds files; PD613 where it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        others = sorted(name for name in os.listdir(folder) if not name.startswith("."))
+    except OSError as error:
+        raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
+    if others:
+        raise failure(
+            "PD621",
+            f"{folder} holds other files",
+            notes=(f"such as {others[0]}",),
+            helps=("choose a folder that is empty or not there yet",),
+        )
+
+
+def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
+    """A run that is there already.
+
+    Raises:
+        CompileError: PD620 if there is none, it is damaged, or of another kind than `kind`.
+    """
+    folder = Path(path)
+    if not (folder / ABOUT).exists():
+        raise _no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
+    check_folder(folder)
+    about = read_json(folder / ABOUT)
+    whole = isinstance(about, dict) and isinstance(about.get("kind"), str)
+    if not whole or not isinstance(about.get("config"), dict):
+        raise _no_run(folder, f"its {ABOUT} is damaged")
+    if about.get("format") not in (FIRST_FORMAT, FORMAT):
+        raise _no_run(folder, f"its format is {about.get('format')!r}; this version reads {FORMAT}")
+    if kind is not None and about["kind"] != kind:
+        raise _no_run(folder, f"it is a run of the kind `{about['kind']}`; `{kind}` is needed here")
+    return RunFolder(folder, about["kind"], about["config"], about)
+
+
+def find_run(text: str | Path, kind: str | None = None) -> RunFolder:
+    """A run by the path of its folder, or by its name in ``runs/``. Raises CompileError (PD620)."""
+    folder, kept = Path(text), Path("runs")
+    if not folder.exists() and folder.name == str(text) and kept.is_dir():
+        if (kept / text / ABOUT).exists():
+            return read_run(kept / text, kind)
+        names = sorted(one.parent.name for one in kept.glob(f"*/{ABOUT}"))
+        raise _no_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
+    return read_run(folder, kind)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that may come from a stranger and has links that lead out of it. Raises CompileError (PD112)."""
+    try:
+        check_links(folder)
+    except OSError as error:
+        helps = ("move what it leads to into the folder; the folder itself may be a link",)
+        raise failure("PD112", f"{error.filename}: {error.strerror}", helps=helps) from None
+
+
+def does_not_fit(folder: Path, *why: str) -> CompileError:
+    """What to raise where a run's model or data was made for something else (PD623)."""
+    return failure("PD623", f"{folder} does not fit", notes=why)
+
+
+def versions() -> dict[str, str]:
+    """What a run's numbers may hang on: Python, the system, and packages that are installed."""
+    found = {
+        "powderdsl": str(sys.modules["powderdsl"].__version__),  # our own package, so it has been imported
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
+    """Write a file whole or not at all. `follow`: write to where a link leads. Raises CompileError (PD613)."""
+    try:
+        with replacing(path, follow=follow) as temporary, temporary.open("w", encoding="utf-8") as file:
+            json.dump(value, file, indent=1, ensure_ascii=False)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
+    return path
+
+
+def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tuple[str, ...]:
+    if found.kind != kind:
+        return (f"it is of the kind `{found.kind}`, not `{kind}`",)
+    there, here = dict(_flat(found.config)), dict(_flat(config))
+    # Runs of the first format lack settings that came later, and have fingerprints that are no longer made.
+    first = found.about["format"] == FIRST_FORMAT
+    names = ({*there} & {*here}) - {*FINGERPRINTS} if first else {*there, *here}
+    return tuple(
+        f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
+        for name in sorted(names)
+        if there.get(name) != here.get(name)
+    )
+
+
+def _flat(config: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, str]]:
+    """Each setting by its dotted name, as JSON."""
+    for name, value in config.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{within}{name}.")
+        else:
+            yield within + name, json.dumps(value)
+
+
+def _no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
+    return failure("PD620", f"{folder} is no run that can be used here", notes=(why,), helps=helps)

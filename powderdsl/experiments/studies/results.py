@@ -1,0 +1,181 @@
+"""What a study found: means over seeds with intervals, a table, and whether it went as expected."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from powderdsl.experiments.studies.run import Outcome
+from powderdsl.experiments.studies.study import Measure, Study
+
+T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
+"""97.5 % quantiles of Student's t for 1 to 10 degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over seeds, and the ends of its 95 % interval by Student's t: not finite for a single value.
+
+    On the scale ``log`` the mean is the geometric one, and the ends are as many times smaller and larger.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A measure at one combination: over seeds, and the value of each."""
+
+    values: tuple[tuple[str, str], ...]
+    over_seeds: Interval
+    samples: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A measure over all combinations. `trend` compares the last with the first, seed by seed: their difference, on the
+    scale ``log`` their ratio. `agreeing`: in how many seeds it goes as expected, and how many have both. `ordered`: all
+    means do."""
+
+    measure: Measure
+    cells: tuple[Cell, ...]
+    trend: Interval | None
+    ordered: bool
+    agreeing: tuple[int, int] = (0, 0)
+
+    @property
+    def verdict(self) -> str:
+        """Whether it went as expected, in words."""
+        if self.measure.expect is None or self.trend is None:
+            return ""
+        sign = 1 if self.measure.expect == "rises" else -1
+        log = self.measure.scale == "log"
+        same = 1.0 if log else 0.0
+        plus = "+" if not log and self.trend.mean > 0 else ""
+        ends = f"last {'/' if log else '−'} first: {plus}{shown(self.trend, self.measure.scale)}"
+        if sign * (self.trend.mean - same) <= 0:
+            return f"does not {self.measure.expect[:-1]} ({ends})"
+        sure = f", but the interval holds {same:.0f}" if self.trend.low <= same <= self.trend.high else ""
+        every = "at every point" if self.ordered else "not at every point"
+        seeds = "{} of {} seeds".format(*self.agreeing)
+        return f"{self.measure.expect} {every}, in {seeds}{sure} ({ends})"
+
+
+def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
+    """Mean and 95 % interval of samples, which are above 0 on the scale ``log``."""
+    if scale == "log":
+        found = interval([math.log(sample) for sample in samples])
+        return Interval(math.exp(found.mean), math.exp(found.low), math.exp(found.high))
+    mean = statistics.fmean(samples)
+    if len(samples) < 2:
+        return Interval(mean, -math.inf, math.inf)
+    quantile = T_975[min(len(samples) - 1, len(T_975)) - 1]  # a little wide for more than 11
+    half = quantile * statistics.stdev(samples) / math.sqrt(len(samples))
+    return Interval(mean, mean - half, mean + half)
+
+
+def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
+    """What finished points say. Combinations stand in the order in which values were written."""
+    good = [one for one in outcomes if one.problem is None]
+    return [_finding(measure, good) for measure in study.measures]
+
+
+def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
+    groups: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
+    for one in outcomes:
+        groups.setdefault(one.point.values, {})[one.point.seed] = one.values[measure.name]
+    cells = []
+    for values, by_seed in groups.items():
+        samples = tuple(value for _, value in sorted(by_seed.items()))
+        cells.append(Cell(values, interval(samples, measure.scale), samples))
+    trend, ordered, agreeing = None, False, (0, 0)
+    if len(cells) > 1 and measure.expect is not None:
+        first, *_, last = groups.values()
+        both = sorted(first.keys() & last.keys())
+        sign = 1 if measure.expect == "rises" else -1
+        if both:
+            agreeing = sum(sign * (last[seed] - first[seed]) > 0 for seed in both), len(both)
+            if measure.scale == "log":
+                trend = interval([last[seed] / first[seed] for seed in both], "log")
+            else:
+                trend = interval([last[seed] - first[seed] for seed in both])
+        means = [sign * cell.over_seeds.mean for cell in cells]
+        ordered = all(one < two for one, two in itertools.pairwise(means))
+    return Finding(measure, tuple(cells), trend, ordered, agreeing)
+
+
+def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """All of it, for JSON."""
+    return {
+        "study": study.name,
+        "size": size,
+        "points": [
+            {
+                "values": dict(one.point.values),
+                "seed": one.point.seed,
+                "measures": dict(one.values),
+                "problem": one.problem,
+            }
+            for one in outcomes
+        ],
+        "findings": [
+            {
+                "measure": one.measure.name,
+                "verdict": one.verdict,
+                "cells": [
+                    {
+                        "values": dict(cell.values),
+                        **{key: _finite(value) for key, value in asdict(cell.over_seeds).items()},
+                        "samples": cell.samples,
+                    }
+                    for cell in one.cells
+                ],
+            }
+            for one in findings(study, outcomes)
+        ],
+    }
+
+
+def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
+    """A table of means and intervals, and what was expected."""
+    found = findings(study, outcomes)
+    names = [axis.name for axis in study.axes]
+    head = [*names, *(one.measure.about for one in found), "seeds"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    counts: dict[tuple[tuple[str, str], ...], int] = {}
+    for one in found:
+        for cell in one.cells:
+            rows.setdefault(cell.values, []).append(shown(cell.over_seeds, one.measure.scale))
+            counts[cell.values] = len(cell.samples)
+    for values, numbers in rows.items():
+        words = [*(value for _, value in values), *numbers, str(counts[values])]
+        lines.append("| " + " | ".join(words) + " |")
+    verdicts = [f"- {one.measure.about}: {one.verdict}" for one in found if one.verdict]
+    failed = [f"- {one.point.name}: {one.problem}" for one in outcomes if one.problem]
+    text = [f"{study.about} Size: {size}.", "", *lines]
+    text += ["", *verdicts] if verdicts else []
+    text += ["", "Not finished:", "", *failed] if failed else []
+    return "\n".join(text) + "\n"
+
+
+def shown(found: Interval, scale: str = "linear") -> str:
+    """`0.1234 ± 0.0056`, as many places as the interval deserves; `0.123 (0.118 to 0.129)` on the scale ``log``."""
+    half = (found.high - found.low) / 2
+    if not math.isfinite(half):
+        return f"{found.mean:.4g}"
+    if scale == "log":
+        mean, low, high = (f"{one:#.3g}".rstrip(".") for one in (found.mean, found.low, found.high))
+        return f"{mean} ({low} to {high})"
+    places = 4 if half <= 0 else min(max(1 - math.floor(math.log10(half)), 0), 6)
+    return f"{found.mean:.{places}f} ± {half:.{places}f}"
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

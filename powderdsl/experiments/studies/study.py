@@ -1,0 +1,108 @@
+"""What a study is, once checked."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from string import Template
+
+from powderdsl.diagnostics import Span
+
+SIZES = ("small", "paper")
+EXPECTED = ("rises", "falls")
+SCALES = ("linear", "log")
+SEED, SIZE = "seed", "size"
+
+
+@dataclass(frozen=True)
+class Step:
+    """A call of a command: what it works on, and its options as text, in which ``$NAME`` stands for a value.
+
+    `on` is the argument of the command: a step before it, whose run is meant, or text. `means` says what the argument
+    (``on``) and each option are: see `powderdsl.experiments.studies.paths`.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    on: str | None
+    on_step: bool
+    options: tuple[tuple[str, tuple[str, ...]], ...]
+    makes_run: bool
+    means: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A setting that is varied, and its values for each of `SIZES`.
+
+    `sets`: for each value, other names and what they stand for with it; empty if the values stand for themselves.
+    """
+
+    name: str
+    about: str
+    values: Mapping[str, tuple[str, ...]]
+    sets: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number out of the ``evaluation.json`` of a step's run: the keys that lead to it, with ``$NAME`` as above.
+
+    `scale` is one of `SCALES`. On ``log`` numbers are compared by their ratios: means are geometric ones.
+    """
+
+    name: str
+    step: str
+    keys: tuple[str, ...]
+    about: str
+    expect: str | None
+    scale: str = "linear"
+
+
+@dataclass(frozen=True)
+class Point:
+    """One combination of values, and a seed. `sets`: other names, and what they stand for with these values."""
+
+    values: tuple[tuple[str, str], ...]
+    seed: int
+    sets: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Names its folder."""
+        return ",".join([*(f"{name}={value}" for name, value in self.values), f"seed={self.seed}"])
+
+
+@dataclass(frozen=True)
+class Study:
+    """A checked study. `text` is what its file says, `folder` is where the file lies, `places` where its parts stand."""
+
+    name: str
+    about: str
+    seeds: int
+    axes: tuple[Axis, ...]
+    steps: tuple[Step, ...]
+    measures: tuple[Measure, ...]
+    text: str
+    folder: Path = Path()
+    places: Mapping[tuple[str, ...], Span] = field(default_factory=dict, repr=False, compare=False)
+
+    def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
+        """All combinations, each with every seed; the seeds outside, so that early ends leave whole sets."""
+        names = [axis.name for axis in self.axes]
+        for seed in range(self.seeds if seeds is None else seeds):
+            for values in itertools.product(*(axis.values[size] for axis in self.axes)):
+                chosen = tuple(zip(names, values, strict=True))
+                sets = [
+                    axis.sets.get(value, {}).items() for axis, value in zip(self.axes, values, strict=True)
+                ]
+                yield Point(chosen, seed, tuple(itertools.chain.from_iterable(sets)))
+
+
+def filled(text: str, point: Point, size: str) -> str:
+    """A text with the values of a point in it."""
+    return Template(text).safe_substitute(
+        {**dict(point.values), **dict(point.sets), SEED: str(point.seed), SIZE: size}
+    )

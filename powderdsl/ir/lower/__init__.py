@@ -1,0 +1,1 @@
+"""The checked model -> IR: the one door between them."""

@@ -1,0 +1,50 @@
+"""The pipeline between lowering and backends: an ordered list, a reason for each place, the verifier in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from powderdsl.ir.ops import PassGraph, Program
+from powderdsl.ir.rewrite import Rewrite, rewrite_pass
+from powderdsl.ir.stages.fold import FOLD
+from powderdsl.ir.stages.prune import prune
+from powderdsl.ir.stages.resolve import RESOLVE, specialise
+from powderdsl.ir.stages.share import SHARE
+from powderdsl.ir.verify import verify
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A pass of the compiler: its name, one line of help, and what it does to one pass of a program."""
+
+    name: str
+    about: str
+    run: Callable[[PassGraph], PassGraph]
+
+
+def _rewriting(*rules: Rewrite) -> Callable[[PassGraph], PassGraph]:
+    return lambda graph: rewrite_pass(graph, rules)
+
+
+PIPELINE: tuple[Stage, ...] = (
+    Stage("fold", "constants, and flags that say the same", _rewriting(*FOLD)),
+    # Before sharing: what a neighbour's property decides becomes a question about its element.
+    Stage("specialise", "properties of a cell whose element is known", specialise),
+    Stage("resolve", "questions about properties become sets of elements", _rewriting(*RESOLVE, *FOLD)),
+    # After resolving: only now is it clear which neighbours are read.
+    Stage("share", "one read a neighbour and value", _rewriting(*SHARE, *FOLD)),
+    # Last: moments whose rules turned out never to fire write nothing any more.
+    Stage("prune", "moments that change nothing", prune),
+)
+
+
+def run_passes(program: Program, until: str | None = None) -> Program:
+    """The optimised program; `until` names the last stage to run. The IR is verified after every stage."""
+    verify(program, "lower")
+    for stage in PIPELINE:
+        program = replace(program, passes=tuple(stage.run(graph) for graph in program.passes))
+        verify(program, stage.name)
+        if stage.name == until:
+            break
+    return program

@@ -1,0 +1,1 @@
+"""Declarations of several packs -> one composition: names, ids, orders, and who speaks of what."""

@@ -1,0 +1,81 @@
+"""What invariants and tests speak of: the packs that their authors knew of. Packs that others add lie outside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from powderdsl.model.composition.names import Names
+from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.syntax.ast import Syntax
+
+
+class ClaimScopes:
+    """The scopes of what loaded packs and rulesets claim. A scope is a tuple of loaded packs, in load order."""
+
+    def __init__(self, packs: Sequence[PackDecl], ruleset: RulesetDecl | None, names: Names) -> None:
+        self._packs = [pack.name.text for pack in packs]
+        self._lineage = ruleset.lineage if ruleset else ()
+        self._names = names
+
+    def of_pack(self, pack: str, words: Iterable[str] = ()) -> tuple[str, ...]:
+        """The pack, what it needs, the ruleset that lists it, and the packs of some words that it uses."""
+        home = next((lister for one in self._lineage if (lister := one.lister(pack))), None)
+        return self._closed([pack, *(home.members if home else ()), *self._definers(pack, words)])
+
+    def of_ruleset(self, ruleset: RulesetDecl, words: Iterable[str] = ()) -> tuple[str, ...]:
+        """The ruleset's packs, what they need, and the packs of some words that it uses."""
+        return self._closed([*ruleset.members, *self._definers("", words)])
+
+    def _definers(self, pack: str, words: Iterable[str]) -> list[str]:
+        owners = self._names.owners
+        names = [self._names.of(pack, word) for word in words]
+        return [owners[name][0] for name in names if name in owners]
+
+    def _closed(self, packs: Iterable[str]) -> tuple[str, ...]:
+        reached = {need for pack in packs for need in self._names.needs.get(pack, (pack,))}
+        return tuple(pack for pack in self._packs if pack in reached)
+
+
+def title_of(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
+    """What is loaded, in words: a ruleset, what is left out of it, what is added: ``ruleset-pack+pack``."""
+    loaded = [pack.name.text for pack in packs]
+    if ruleset is None:
+        return "+".join(loaded)
+    named = [ruleset]
+    for one in reversed(ruleset.beside):  # those that a later one takes over say nothing of their own
+        if all(one.source.name not in {base.source.name for base in known.lineage} for known in named):
+            named.insert(0, one)
+    members = list(dict.fromkeys(name for one in named for name in one.members))
+    gone = [f"-{name}" for name in members if name not in loaded]
+    added = [f"+{name}" for name in loaded if name not in members]
+    return "".join(["+".join(one.name.text for one in named), *gone, *added])
+
+
+def names_left_out(ruleset: RulesetDecl | None) -> frozenset[str]:
+    """What the packs define that are left out of a ruleset: its own lines may ask for it as if there were a `?`."""
+    found: set[str] = set()
+    for pack in ruleset.left_out if ruleset else ():
+        found |= {decl.name.text for decl in pack.elements}
+        found |= {decl.name.text for decl in (*pack.properties, *pack.fields)}
+        found |= {decl.name.text for decl in pack.streams} | {decl.name.text for decl in pack.kernels}
+        found |= {scalar.text for scalar, _ in pack.tags} | {scalar.text for scalar, _ in pack.sets}
+    return frozenset(found)
+
+
+def with_optional(syntax: Syntax, names: frozenset[str]) -> Syntax:
+    """The expression with a `?` behind some names."""
+    kind = "optional_name" if syntax.kind == "name" and syntax.text in names else syntax.kind
+    return replace(
+        syntax, kind=kind, children=tuple(with_optional(child, names) for child in syntax.children)
+    )
+
+
+def words_of(syntax: Syntax) -> Iterator[str]:
+    """All words of an expression, without the `?` of those that may be absent."""
+    waiting = [syntax]
+    while waiting:
+        one = waiting.pop()
+        if one.text:
+            yield one.text.removesuffix("?")
+        waiting += one.children

@@ -1,0 +1,1 @@
+"""Syntax of expressions -> typed operands."""

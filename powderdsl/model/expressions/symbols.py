@@ -1,0 +1,209 @@
+"""Every global name of a composition, resolved: what the checker looks words up in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS, grid_kernel
+from powderdsl.model.composition.compose import Composition, Named
+from powderdsl.model.declarations import TypedDecl
+from powderdsl.model.expressions.literals import read_bounds
+from powderdsl.model.expressions.operands import Coercer, Items, Operand, Place, SetOf
+from powderdsl.model.state import SNAP
+from powderdsl.model.types import (
+    CHANCE,
+    DIRECTION,
+    ELEMENT,
+    FLAG,
+    Expr,
+    Field,
+    Kind,
+    Param,
+    Property,
+    Stream,
+    Value,
+    integer,
+)
+from powderdsl.syntax.ast import Syntax
+
+
+def stream_ident(name: str) -> int:
+    """The number under which a stream enters the hash: FNV-1a of its name, 32 bits. Packs never shift it."""
+    ident = 0x811C9DC5
+    for byte in name.encode():
+        ident = (ident ^ byte) * 0x01000193 & 0xFFFFFFFF
+    return ident
+
+
+@dataclass
+class Symbols:
+    """Names known everywhere. Filled in order by `resolve_symbols`; frozen in use afterwards."""
+
+    composition: Composition
+    properties: dict[str, Property] = field(default_factory=dict)
+    fields: dict[str, Field] = field(default_factory=dict)
+    streams: dict[str, Stream] = field(default_factory=dict)
+    params: dict[str, Param] = field(default_factory=dict)
+    constants: dict[str, Operand] = field(default_factory=dict)
+    """Elements, tags, sets, kernels, directions."""
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        return tuple(element.id for element in self.composition.elements.values())
+
+    @property
+    def first_id(self) -> int:
+        """The element that fields of elements hold unless their file says otherwise."""
+        return min(self.ids, key=self.composition.order.__getitem__)
+
+    def names(self, *, after_dot: bool = False) -> list[str]:
+        """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbour."""
+        if after_dot:
+            return [*self.properties, *self.fields, *self.streams, *DIRECTIONS]
+        return [
+            *self.constants,
+            *self.properties,
+            *self.fields,
+            *self.streams,
+            *(p.split(".")[1] for p in self.params),
+        ]
+
+    def is_declared(self, name: str, pack: str) -> bool:
+        """Whether some pack declares the name, even if its declaration is wrong."""
+        found = self.composition
+        tables = (
+            found.properties,
+            found.fields,
+            found.streams,
+            found.kernels,
+            found.sets,
+            found.element_decls,
+        )
+        meant = found.names.of(pack, name)
+        return any(meant in table for table in tables) or f"{pack}.{name}" in found.params
+
+
+def base_symbols(composition: Composition) -> Symbols:
+    """Symbols with what needs no evaluation: directions, kernels, elements, tags, streams."""
+    symbols = Symbols(composition)
+    constants = symbols.constants
+    constants |= {name: Place(offset) for name, offset in DIRECTIONS.items()}
+    constants |= {name: Items(tuple(Place(o) for o in offsets)) for name, offsets in DIRECTION_SETS.items()}
+    constants |= KERNELS
+    constants |= {
+        name: grid_kernel(name, k.decl.rows, k.decl.wrap)
+        for name, k in composition.kernels.items()
+        if k.decl.shape is None
+    }
+    constants |= {name: SetOf((element.id,), name) for name, element in composition.elements.items()}
+    constants |= {name: SetOf(tuple(sorted(ids))) for name, ids in composition.tags.items()}
+    symbols.streams |= {
+        name: Stream(name, stream_ident(name), s.decl.bits) for name, s in composition.streams.items()
+    }
+    return symbols
+
+
+_KINDS_ELSEWHERE = {
+    "int": "0..9",
+    "integer": "0..9",
+    "number": "0..9",
+    "uint8": "0..255",
+    "float": "real(0..1)",
+    "float32": "real(0..1)",
+    "double": "real(0..1)",
+    "bool": "flag",
+    "boolean": "flag",
+    "vector": "vec2(-100..100)",
+    "vec": "vec2(-100..100)",
+    "probability": "chance",
+}
+"""Kinds by the names that other languages give them, and how they are written here."""
+
+
+def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
+    """A kind as written: ``0..7``, ``flag``, ``element``, ``chance``, ``real(0..1)``, ``vec2(-10..10)``."""
+    helps: tuple[str, ...] = (
+        "kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",
+    )
+    if syntax.kind == "range":
+        lo, hi = read_bounds(syntax, coercer)
+        return integer(lo, hi)
+    if syntax.kind == "name":
+        plain = {"flag": FLAG, "element": ELEMENT, "direction": DIRECTION, "chance": CHANCE}.get(syntax.text)
+        if plain is not None:
+            return plain
+        if syntax.text in ("real", "vec2"):
+            raise coercer.fail(
+                "PD401",
+                f"`{syntax.text}` needs bounds",
+                syntax.span,
+                "no bounds",
+                helps=(f"write `{syntax.text}(-100..100)`",),
+            )
+    if syntax.kind == "call" and syntax.text in ("real", "vec2") and len(syntax.children) == 1:
+        lo, hi = read_bounds(syntax.children[0], coercer)
+        return Kind(syntax.text, lo, hi)
+    word = syntax.text if syntax.kind in ("name", "call") else ""
+    close = suggest(word, KIND_WORDS) if word else ()
+    if word in _KINDS_ELSEWHERE:
+        helps = (f"write `{_KINDS_ELSEWHERE[word]}`",)
+    elif close and close[0].startswith("did"):
+        helps = close
+    raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", helps)
+
+
+def default_of(kind: Kind, first_id: int = 0) -> Value:
+    """The value of something whose file gives no default: zero or the nearest bound to it; the first element."""
+    if kind.name in ("int", "real", "vec2"):
+        zero = min(max(0, kind.lo), kind.hi)
+        return int(zero) if kind.name == "int" else float(zero) if kind.name == "real" else (zero, zero)
+    return first_id if kind.name == "element" else 0
+
+
+def settled(default: Value, kind: Kind) -> Value:
+    """A field's default as steps leave it: real numbers within bounds, and zero where they are smaller than SNAP."""
+    if kind.name not in ("real", "vec2"):
+        return default
+    parts = default if isinstance(default, tuple) else (default,)
+    kept = [min(max(float(part), kind.lo), kind.hi) for part in parts]
+    row, *column = [part if abs(part) >= SNAP else 0.0 for part in kept]
+    return (row, column[0]) if column else row
+
+
+def field_from(named: Named[TypedDecl], kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
+    decl = named.decl
+    return Field(named.name, kind, default, decl.at, decl.resets, of, named.pack, decl.name.span)
+
+
+def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
+    """A parameter may not hide a global word that its pack knows: a rule would read the other one without a sign."""
+    composition = symbols.composition
+    spans: dict[str, Span] = {name: element.span for name, element in composition.elements.items()}
+    spans |= composition.tag_spans
+    tables: tuple[dict[str, Named[TypedDecl]], ...] = (composition.properties, composition.fields)
+    for table in tables:
+        spans |= {name: named.decl.name.span for name, named in table.items()}
+    spans |= {name: named.decl.name.span for name, named in composition.streams.items()}
+    spans |= {name: named.decl[0].span for name, named in composition.sets.items()}
+    spans |= {name: named.decl.name.span for name, named in composition.kernels.items()}
+    for named in composition.params.values():
+        name = composition.names.of(named.pack, named.decl.name.text)
+        if name in spans and composition.names.knows(named.pack, name):
+            reporter.error(
+                "PD308",
+                f"the parameter `{name}` hides another `{name}`",
+                named.decl.name.span,
+                "the same word",
+                secondary=[Label(spans[name], "this one")],
+                helps=["rename the parameter"],
+            )
+
+
+def number_value(expr: Expr, kind: Kind) -> Value:
+    """The constant in an expression that `Coercer.of_kind` accepted."""
+    if kind.name == "vec2":
+        parts = [arg.value for arg in expr.args]
+        return (float(parts[0]), float(parts[1]))
+    assert expr.op == "const"
+    return expr.value

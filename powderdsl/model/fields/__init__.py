@@ -1,0 +1,1 @@
+"""Values of fields as written: by element, as words, cell by cell."""

@@ -1,0 +1,241 @@
+"""What is written and decides nothing: comparisons that always come out alike, rules that others always overrule.
+
+Rules are legal with these, so they are warnings. Loops and symmetries write a rule out many times: a warning is
+given only if all its copies deserve it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
+from powderdsl.model.logic.budget import Budget
+from powderdsl.model.logic.satisfy import Facts, satisfiable
+from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule, Ruleset, Transform
+from powderdsl.syntax.ast import Syntax
+
+HERE: Offset = (0, 0)
+
+BUDGET = 100_000
+"""Nodes evaluated for these warnings: a quarter of a second. After that nothing more is found."""
+
+MAX_RULES = 100
+"""Rules of a moment, up to which each is compared with the others."""
+
+SILENT = ("PD503", "PD506", "PD509")
+"""Who reads that a rule never happens does not want to read why twice."""
+
+
+def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) -> None:
+    """Report comparisons that ranges decide, and rules that others always overrule."""
+    quick = replace(facts, budget=Budget(BUDGET))
+    known = silent_rules(reporter)
+    _report_decided(passes, known, reporter)
+    _report_overruled(passes, quick, known, reporter)
+
+
+def silent_rules(reporter: Reporter) -> list[Span]:
+    """The rules of which it was reported already that they never happen."""
+    return [one.primary.span for one in reporter.diagnostics if one.code in SILENT and one.primary.span]
+
+
+# Comparisons
+
+
+def _report_decided(passes: tuple[Pass, ...], known: Sequence[Span], reporter: Reporter) -> None:
+    outcomes: dict[Span, set[bool | None]] = {}
+    for expr in _expressions(passes):
+        for node in expr.walk():
+            if node.op in ("eq", "lt", "le") and node.span is not None:
+                outcomes.setdefault(node.span, set()).add(decided(node))
+    for span, found in outcomes.items():
+        if found in ({True}, {False}) and not any(_inside(span, other) for other in known):
+            reporter.report(
+                "PD513", "this comparison decides nothing", span, "it comes out the same in every world",
+                helps=["look at the bounds of both sides", "remove it, if it is meant so"],
+            )  # fmt: skip
+
+
+def _expressions(passes: tuple[Pass, ...]) -> Iterator[Expr]:
+    for pass_ in passes:
+        for moment in pass_.moments:
+            yield from (let.value for let in moment.lets)
+            for rule in moment.rules:
+                yield from _parts(rule)
+
+
+def _parts(rule: Rule) -> Iterator[Expr]:
+    """The expressions of a rule."""
+    if rule.mask is not None:
+        yield rule.mask
+    if isinstance(rule, Assign):
+        yield rule.value
+        return
+    if isinstance(rule, Transform):
+        yield rule.target
+    yield from (effect.value for effect in rule.effects)
+
+
+def decided(node: Expr) -> bool | None:
+    """What a comparison of whole numbers comes to by their ranges alone; None if it depends on the world."""
+    a, b = node.args
+    if a.kind.name != "int" or b.kind.name != "int" or a.op == b.op == "const":
+        return None
+    if node.op == "eq":
+        return False if a.kind.hi < b.kind.lo or b.kind.hi < a.kind.lo else None
+    if node.op == "lt":
+        return True if a.kind.hi < b.kind.lo else False if a.kind.lo >= b.kind.hi else None
+    return True if a.kind.hi <= b.kind.lo else False if a.kind.lo > b.kind.hi else None
+
+
+def _inside(span: Span, other: Span) -> bool:
+    return span.source == other.source and other.start <= span.start and span.end <= other.end
+
+
+def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:
+    """Report that parts of a condition, a comparison or a choice are the same words twice."""
+    texts = [" ".join(child.span.text.split()) for child in children]
+    for number, child in enumerate(children):
+        if texts[number] in texts[:number]:
+            reporter.report(
+                "PD513", "the same is said twice", child.span, "this stands there already",
+                helps=["look for a word that should be another one", "remove it, if it is meant so"],
+            )  # fmt: skip
+
+
+# Rules that others overrule
+
+
+def _report_overruled(
+    passes: tuple[Pass, ...], facts: Facts, known: Sequence[Span], reporter: Reporter
+) -> None:
+    found: dict[Span, Rule | None] = {}
+    for pass_ in passes:
+        for moment in pass_.moments:
+            if len(moment.rules) > MAX_RULES:
+                continue
+            lets = {let.name: let.value for let in moment.lets}
+            for place, rule in enumerate(moment.rules):
+                if found.get(rule.span, rule) is None:
+                    continue  # some copy of it matters
+                found[rule.span] = _overruling(rule, place, moment, facts, lets)
+    for span, winner in found.items():
+        if winner is None or winner.span == span or any(_inside(span, other) for other in known):
+            continue
+        words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
+        reporter.report(
+            "PD514", "this rule is always overruled", span, "nothing comes of it",
+            secondary=[Label(winner.span, words)],
+            helps=["make their conditions exclude each other", "or remove one of them"],
+        )  # fmt: skip
+
+
+def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: dict[str, Expr]) -> Rule | None:
+    """One of the rules of a moment that never leave anything to this one; None if it matters."""
+    if rule.mask is None:
+        return None
+    rivals = [other for other in _rivals(rule, place, moment) if other.mask is not None]
+    if not rivals or not satisfiable(facts, [(rule.mask, HERE)], lets):
+        return None
+    conditions = [(rule.mask, HERE), *((negation(other.mask), HERE) for other in rivals if other.mask)]
+    return None if satisfiable(facts, conditions, lets) else rivals[0]
+
+
+def _rivals(rule: Rule, place: int, moment: Moment) -> Iterator[Rule]:
+    """The rules of a moment that keep this one from having an effect where they happen."""
+    if isinstance(rule, Assign):
+        for other in moment.rules[place + 1 :]:
+            if not isinstance(other, Assign) or other.op != ":=" or other.span == rule.span:
+                continue
+            if (other.field, other.offset) == (rule.field, rule.offset):
+                yield other
+        return
+    if not isinstance(rule, Transform):
+        return
+    for number, other in enumerate(moment.rules):
+        if not isinstance(other, Transform) or number == place or other.span == rule.span:
+            continue
+        same = other.target == rule.target and other.effects == rule.effects
+        if moment.policy == "drop_both" or (number < place and (same or moment.policy == "first_wins")):
+            yield other
+
+
+# Chances that nothing draws
+
+
+def report_undrawn(
+    ruleset: Ruleset, given: Sequence[tuple[str, int, Span]], facts: Facts, reporter: Reporter
+) -> None:
+    """Report chances of elements against which no rule draws there: mostly a tag is missing.
+
+    Args:
+        given: property, element id, and where an element's value of it stands.
+    """
+    quick = replace(facts, budget=Budget(BUDGET))
+    chances = {prop.name: prop for prop in ruleset.properties if prop.kind.name == "chance"}
+    for name, number, span in given:
+        prop = chances.get(name)
+        if (
+            prop is None
+            or any(name == channel.source for channel in ruleset.matrix)
+            or prop.values[number] == 0
+        ):
+            continue
+        if not _drawn(prop, number, ruleset, quick):
+            element = facts.names.get(number, "?")
+            reporter.report(
+                "PD507", f"`{name}` of `{element}` is never used", span, f"no rule asks `{element}` for it",
+                helps=["look for a tag that it lacks, or remove the value"],
+            )  # fmt: skip
+
+
+def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> bool:
+    """Whether some rule that reads the property may happen where this element stands. False is a proof."""
+    for pass_ in ruleset.passes:
+        everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
+        for moment in pass_.moments:
+            lets = {let.name: let.value for let in moment.lets}
+            for rule in moment.rules:
+                reads = _Reads(prop.name, lets, everywhere)
+                for part in _parts(rule):
+                    reads.find(part, HERE)
+                if reads.places and (reads.many or rule.mask is None):
+                    return True
+                for at in reads.places:
+                    here = (member(ELEMENT_HERE, (number,)), at)
+                    if satisfiable(facts, [(rule.mask, HERE), here], lets):  # type: ignore[list-item]
+                        return True
+    return False
+
+
+@dataclass
+class _Reads:
+    """Where expressions read a property. `many`: also of cells whose places or moments are not told apart."""
+
+    name: str
+    lets: dict[str, Expr]
+    everywhere: dict[str, Expr]
+    places: dict[Offset, None] = field(default_factory=dict)
+    many: bool = False
+    _opened: set[tuple[str, Offset, bool]] = field(default_factory=set)
+
+    def find(self, expr: Expr, at: Offset, unclear: bool = False) -> None:
+        """Add the places of one expression that is asked at `at`."""
+        args = expr.args
+        if expr.op == "property" and expr.value == self.name:
+            self.places[at] = None
+            self.many |= unclear
+        elif expr.op == "let":
+            name = str(expr.value)
+            unclear |= name not in self.lets  # fixed before: what stood there then may be elsewhere now
+            if (name, at, unclear) in self._opened:
+                return
+            self._opened.add((name, at, unclear))
+            args = (self.everywhere[name],)
+        elif expr.op == "look":
+            at = (at[0] + expr.value[0], at[1] + expr.value[1])
+        unclear |= expr.op in ("count", "sum")
+        for arg in args:
+            self.find(arg, at, unclear)

@@ -1,0 +1,496 @@
+"""Can these conditions hold at once? A small constraint search over elements, properties, fields, counts and draws.
+
+The answer errs to one side only: False is a proof, True may mean "could not tell". What it cannot enumerate
+(float comparisons, parameters, large ranges) it treats as free, the same expression at the same place once.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from powderdsl.model.logic.budget import QUESTION, Budget, Exhausted
+from powderdsl.model.types import Expr, Offset, Property
+
+Key = tuple[str, object, Offset]
+Assignment = dict[Key, object]
+Bounds = tuple[Any, Any]
+
+MAX_DOMAIN = 256
+MAX_LET = 150
+"""Nodes of a let's value that are looked through; a larger one is taken for free."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of cells: which ids exist, and what the elements' properties are."""
+
+    ids: tuple[int, ...]
+    properties: dict[str, Property]
+    field_sets: dict[str, frozenset[int]]
+    """Fields that exist only on some elements: elsewhere they read their default."""
+    field_defaults: dict[str, object]
+    side_multiple: int = 1
+    """The sides of all worlds are multiples of this number."""
+    names: dict[int, str] = field(default_factory=dict, compare=False, repr=False)
+    """Names of the elements by id, for examples in messages."""
+    budget: Budget = field(default_factory=Budget, compare=False, repr=False)
+
+    def relaxed(self) -> Facts:
+        """The same cells, but with any element's properties: what a rule could meet in other packs."""
+        free = {
+            name: replace(p, values=("?",) * len(p.values)) if p.kind.name == "chance" else replace(p, stored=frozenset(self.ids))
+            for name, p in self.properties.items()
+        }  # fmt: skip
+        return replace(self, properties=free)
+
+
+class _Unknown(Exception):
+    """The value hangs on something free."""
+
+
+class _Joint(NamedTuple):
+    """A condition on several variables. `compares`: bounds may decide it before all of them are chosen."""
+
+    condition: Expr
+    at: Offset
+    keys: dict[Key, None]
+    compares: bool
+
+
+class Search:
+    """One question. Conditions are given with the place they are asked at."""
+
+    def __init__(self, facts: Facts, lets: dict[str, Expr] | None = None):
+        self.facts = facts
+        self.lets = lets or {}
+        self.conditions: list[tuple[Expr, Offset]] = []
+        self._chosen: Assignment = {}
+        self._domains: dict[Key, list[object]] = {}
+        self._opened: dict[str, tuple[Expr, int]] = {}
+
+    def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
+        """Add a condition; conjunctions are split, lets of this moment are looked through."""
+        self._split(self._resolve(condition)[0], at)
+
+    def _split(self, condition: Expr, at: Offset) -> None:
+        if condition.op == "and":
+            for arg in condition.args:
+                self._split(arg, at)
+        elif condition.op == "look":
+            self._split(condition.args[0], _plus(at, condition.value))
+        else:
+            self.conditions.append((condition, at))
+
+    def _resolve(self, expr: Expr) -> tuple[Expr, int]:
+        """The expression with this moment's lets looked through, and how many nodes it has then."""
+        if expr.op == "let" and expr.value in self.lets:
+            name = str(expr.value)
+            if name not in self._opened:
+                value, size = self._resolve(self.lets[name])
+                self._opened[name] = (value, size) if size <= MAX_LET else (expr, 1)
+            return self._opened[name]
+        self.facts.budget.spend(1)
+        if not expr.args:
+            return expr, 1
+        parts = [self._resolve(arg) for arg in expr.args]
+        args = tuple(part for part, _ in parts)
+        same = all(new is old for new, old in zip(args, expr.args, strict=True))
+        return expr if same else replace(expr, args=args), 1 + sum(size for _, size in parts)
+
+    @cached_property
+    def thresholds(self) -> dict[object, list[float]]:
+        """Constants that each stream is compared with: between two of them all draws are alike."""
+        found: dict[object, set[float]] = {}
+        for condition, _ in self.conditions:
+            for node in condition.walk():
+                if node.op == "lt" and any(arg.kind.name == "draw" for arg in node.args):
+                    draws = [n.value for arg in node.args for n in arg.walk() if n.op == "draw"]
+                    numbers = [
+                        float(n.value)
+                        for arg in node.args
+                        for n in arg.walk()
+                        if n.op == "const" and isinstance(n.value, (int, Fraction))
+                    ]
+                    for stream in draws:
+                        found.setdefault(stream, set()).update(number % 1 for number in numbers)
+        return {stream: sorted(values) for stream, values in found.items()}
+
+    def possible(self) -> bool:
+        """False if no assignment satisfies all conditions."""
+        joint = self._narrow()
+        if joint is None:
+            return False
+        # Small domains first; what is equally small in the order in which the conditions name it.
+        order = sorted(
+            {key: None for one in joint for key in one.keys}, key=lambda key: len(self._domains[key])
+        )
+        return self._assign(order, 0, joint, self._chosen)
+
+    def alone(self) -> dict[Key, frozenset[object]] | None:
+        """What conditions on one variable leave of it, draws left out; None if one of them leaves nothing."""
+        if self._narrow() is None:
+            return None
+        cut = {key: values for key, values in self._domains.items() if key[0] != "draw"}
+        return {key: frozenset(values) for key, values in cut.items() if len(values) < len(self._domain(key))}
+
+    def _narrow(self) -> list[_Joint] | None:
+        """Apply the conditions on one variable; the others, or None if no assignment is left."""
+        variables = [self._variables(condition, at) for condition, at in self.conditions]
+        domains = self._domains = {}
+        for keys in variables:
+            for key in keys or ():
+                if key not in domains:
+                    domains[key] = self._domain(key)
+        joint = []
+        for (condition, at), keys in zip(self.conditions, variables, strict=True):
+            if keys is None:
+                continue
+            if not keys and not self._holds(condition, at, {}):
+                return None
+            if len(keys) == 1:
+                (key,) = keys
+                domains[key] = [v for v in domains[key] if self._holds(condition, at, {key: v})]
+                if not domains[key]:
+                    return None
+            if len(keys) > 1:
+                compares = any(node.op in ("eq", "lt", "le") for node in condition.walk())
+                joint.append(_Joint(condition, at, keys, compares))
+        return joint
+
+    def example(self) -> dict[Offset, int]:
+        """After `possible`: an element for each place that the conditions ask about."""
+        keys = [key for key in self._domains if key[0] == "element"]
+        return {key[2]: int(str(self._chosen.get(key, self._domains[key][0]))) for key in keys}
+
+    def _assign(self, order: list[Key], index: int, joint: list[_Joint], chosen: Assignment) -> bool:
+        if index == len(order):
+            return True
+        key = order[index]
+        ready, waiting = [], []
+        for one in joint:
+            if key in one.keys:
+                if all(k in chosen or k == key for k in one.keys):
+                    ready.append(one)
+                elif one.compares:
+                    waiting.append(one)
+        for value in self._domains[key]:
+            chosen[key] = value
+            if (
+                all(self._holds(one.condition, one.at, chosen) for one in ready)
+                and all(self._bounds(one.condition, one.at, chosen)[1] for one in waiting)
+                and self._assign(order, index + 1, joint, chosen)
+            ):
+                return True
+        chosen.pop(key, None)
+        return False
+
+    def _holds(self, condition: Expr, at: Offset, chosen: Assignment) -> bool:
+        try:
+            return bool(self._value(condition, at, chosen))
+        except _Unknown:
+            return True
+
+    def _domain(self, key: Key) -> list[object]:
+        what, name, _ = key
+        if what == "element":
+            return list(self.facts.ids)
+        if what == "side":
+            return list(range(self.facts.side_multiple))
+        if what == "property":
+            kind = self.facts.properties[str(name)].kind
+            return [0, 1] if kind.name == "flag" else list(range(int(kind.lo), int(kind.hi) + 1))
+        if what == "draw":
+            cuts = [0.0, *self.thresholds.get(name, []), 1.0]
+            between = ((a + b) / 2 for a, b in itertools.pairwise(cuts) if a < b)
+            # A draw of 16 or 32 bits may be a threshold itself: neither above nor below it.
+            return [*between, *(c for c in cuts if (c * 2**17) % 2 == 1 or (c * 2**33) % 2 == 1)]
+        assert isinstance(name, Expr)
+        if name.kind.name in ("element", "direction"):
+            return list(self.facts.ids) if name.kind.name == "element" else list(range(8))
+        if name.kind.name == "flag":
+            return [0, 1]
+        return list(range(int(name.kind.lo), int(name.kind.hi) + 1))
+
+    def _variables(self, expr: Expr, at: Offset) -> dict[Key, None] | None:
+        """What the value depends on, in the order it is named; None if some of it cannot be enumerated."""
+        found: dict[Key, None] = {}
+
+        def visit(node: Expr, at: Offset) -> None:
+            self.facts.budget.spend(1)
+            match node.op:
+                case "element":
+                    found[("element", None, at)] = None
+                case "property":
+                    prop = self.facts.properties[str(node.value)]
+                    found[("element", None, at)] = None
+                    if prop.stored:
+                        found[("property", prop.name, at)] = None
+                    if any(isinstance(value, str) for value in prop.values):
+                        raise _Unknown
+                case "field" if node.value in self.facts.field_sets:
+                    found[("element", None, at)] = None
+                    found[_opaque(node, at)] = None
+                case "draw":
+                    found[("draw", node.value, at)] = None
+                case "coordinate":
+                    found[_coordinate(node, at, self.facts.side_multiple)[0]] = None
+                case "look":
+                    visit(node.args[0], _plus(at, node.value))
+                case "const":
+                    pass
+                case _ if _is_opaque(node):
+                    found[_opaque(node, at)] = None
+                case _:
+                    for arg in node.args:
+                        visit(arg, at)
+
+        try:
+            visit(expr, at)
+        except _Unknown:
+            return None
+        return found
+
+    def _value(self, node: Expr, at: Offset, chosen: Assignment):  # type: ignore[no-untyped-def]
+        budget = self.facts.budget  # `spend` written out: this is where the time goes
+        budget.left -= 1
+        if budget.left < 0:
+            raise Exhausted
+        match node.op:
+            case "const":
+                return node.value
+            case "element":
+                return chosen[("element", None, at)]
+            case "property":
+                prop = self.facts.properties[str(node.value)]
+                element = chosen[("element", None, at)]
+                assert isinstance(element, int)
+                return chosen[("property", prop.name, at)] if element in prop.stored else prop.values[element]
+            case "field" if node.value in self.facts.field_sets:
+                if chosen[("element", None, at)] not in self.facts.field_sets[str(node.value)]:
+                    return self.facts.field_defaults[str(node.value)]
+                return chosen[_opaque(node, at)]
+            case "draw":
+                return chosen[("draw", node.value, at)]
+            case "coordinate":
+                key, shift = _coordinate(node, at, self.facts.side_multiple)
+                return (int(str(chosen[key])) + shift) % node.value[1]
+            case "look":
+                return self._value(node.args[0], _plus(at, node.value), chosen)
+            case _ if _is_opaque(node):
+                return chosen[_opaque(node, at)]
+            case "and":
+                return all(self._value(arg, at, chosen) for arg in node.args)
+            case "or":
+                return any(self._value(arg, at, chosen) for arg in node.args)
+            case "choose":
+                condition, yes, no = node.args
+                return self._value(yes if self._value(condition, at, chosen) else no, at, chosen)
+        args = [self._value(arg, at, chosen) for arg in node.args]
+        return _EVALUATE[node.op](node, *args)
+
+    def _bounds(self, node: Expr, at: Offset, chosen: Assignment) -> Bounds:
+        """Between which numbers the value lies while some variables are open: a flag lies between 0 and 1."""
+        self.facts.budget.spend(1)
+        match node.op:
+            case "const":
+                return (node.value, node.value) if isinstance(node.value, (int, float, Fraction)) else _ANY
+            case "element":
+                return self._span(("element", None, at), chosen)
+            case "member":
+                known = self._bounds(node.args[0], at, chosen)
+                return (0, 1) if known[0] != known[1] else (known[0] in node.value,) * 2
+            case "property":
+                prop = self.facts.properties[str(node.value)]
+                key: Key = ("element", None, at)
+                elements = [chosen[key]] if key in chosen else self._domains[key]
+                values = [prop.values[int(str(one))] for one in elements if one not in prop.stored]
+                numbers = [value for value in values if isinstance(value, (int, float, Fraction))]
+                if len(values) < len(elements):
+                    numbers += self._span(("property", prop.name, at), chosen)
+                self.facts.budget.spend(len(elements))
+                return min(numbers), max(numbers)
+            case "field" if node.value in self.facts.field_sets:
+                default = self.facts.field_defaults[str(node.value)]
+                if not isinstance(default, (int, float)):
+                    return _ANY
+                key = ("element", None, at)
+                if key in chosen and chosen[key] not in self.facts.field_sets[str(node.value)]:
+                    return default, default
+                low, high = self._span(_opaque(node, at), chosen)
+                return (low, high) if key in chosen else (min(low, default), max(high, default))
+            case "draw":
+                return self._span(("draw", node.value, at), chosen)
+            case "coordinate":
+                key, shift = _coordinate(node, at, self.facts.side_multiple)
+                if key not in chosen:
+                    return 0, node.value[1] - 1
+                return ((int(str(chosen[key])) + shift) % node.value[1],) * 2
+            case "look":
+                return self._bounds(node.args[0], _plus(at, node.value), chosen)
+            case _ if _is_opaque(node):
+                return self._span(_opaque(node, at), chosen)
+        args = [self._bounds(arg, at, chosen) for arg in node.args]
+        return _BOUNDS[node.op](node, *args)
+
+    def _span(self, key: Key, chosen: Assignment) -> Bounds:
+        """The least and the greatest value of a variable: domains ascend."""
+        if key in chosen:
+            return chosen[key], chosen[key]
+        domain = self._domains[key]
+        return (domain[0], domain[-1]) if key[0] != "draw" else (0.0, 1.0)
+
+
+_EVALUATE: dict[str, Callable] = {
+    "member": lambda node, a: a in node.value,
+    "not": lambda node, a: not a,
+    "eq": lambda node, a, b: a == b,
+    "lt": lambda node, a, b: a < b,
+    "le": lambda node, a, b: a <= b,
+    "add": lambda node, a, b: a + b,
+    "sub": lambda node, a, b: a - b,
+    "mul": lambda node, a, b: a * b,
+    "quotient": lambda node, a, b: a // b if b else 0,
+    "neg": lambda node, a: -a,
+    "abs": lambda node, a: abs(a),
+    "min": lambda node, a, b: min(a, b),
+    "max": lambda node, a, b: max(a, b),
+    "mod": lambda node, a: a % node.value,
+}
+"""Exact evaluation of discrete operations."""
+
+
+def _chosen_bounds(node: Expr, condition: Bounds, yes: Bounds, no: Bounds) -> Bounds:
+    if condition[0] == condition[1]:
+        return yes if condition[0] else no
+    return min(yes[0], no[0]), max(yes[1], no[1])
+
+
+def _product_bounds(node: Expr, a: Bounds, b: Bounds) -> Bounds:
+    products = [x * y for x in a for y in b]
+    return min(products), max(products)
+
+
+def _abs_bounds(node: Expr, a: Bounds) -> Bounds:
+    return (0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))), max(abs(a[0]), abs(a[1]))
+
+
+def _quotient_bounds(node: Expr, a: Bounds, b: Bounds) -> Bounds:
+    if a[0] == a[1] and b[0] == b[1]:
+        return (a[0] // b[0] if b[0] else 0,) * 2
+    return node.kind.lo, node.kind.hi
+
+
+_ANY: Bounds = (-math.inf, math.inf)
+_BOUNDS: dict[str, Callable[..., Bounds]] = {
+    "and": lambda node, a, b: (a[0] and b[0], a[1] and b[1]),
+    "or": lambda node, a, b: (a[0] or b[0], a[1] or b[1]),
+    "not": lambda node, a: (1 - a[1], 1 - a[0]),
+    "eq": lambda node, a, b: (a[0] == a[1] == b[0] == b[1], a[0] <= b[1] and b[0] <= a[1]),
+    "lt": lambda node, a, b: (a[1] < b[0], a[0] < b[1]),
+    "le": lambda node, a, b: (a[1] <= b[0], a[0] <= b[1]),
+    "add": lambda node, a, b: (a[0] + b[0], a[1] + b[1]),
+    "sub": lambda node, a, b: (a[0] - b[1], a[1] - b[0]),
+    "neg": lambda node, a: (-a[1], -a[0]),
+    "min": lambda node, a, b: (min(a[0], b[0]), min(a[1], b[1])),
+    "max": lambda node, a, b: (max(a[0], b[0]), max(a[1], b[1])),
+    "mod": lambda node, a: (a[0] % node.value,) * 2 if a[0] == a[1] else (0, node.value - 1),
+    "mul": _product_bounds,
+    "abs": _abs_bounds,
+    "quotient": _quotient_bounds,
+    "choose": _chosen_bounds,
+}
+"""The same between bounds. Flags are 0, 1, False or True."""
+
+
+def _plus(at: Offset, offset: object) -> Offset:
+    assert isinstance(offset, tuple)
+    return (at[0] + offset[0], at[1] + offset[1])
+
+
+def _opaque(node: Expr, at: Offset) -> Key:
+    return ("value", node, at)
+
+
+def _coordinate(node: Expr, at: Offset, sides: int) -> tuple[Key, int]:
+    """The variable that a coordinate depends on, and what is added to it.
+
+    The step is the same everywhere. A row or column is known from that of another place if no seam comes between:
+    where the sides of the world are multiples of its modulus. Elsewhere it is free at every place.
+    """
+    axis, modulus = node.value
+    if axis == "step":
+        return _opaque(node, (0, 0)), 0
+    if sides % modulus:
+        return _opaque(node, at), 0
+    return ("side", axis, (0, 0)), at[axis == "column"]
+
+
+def _is_opaque(node: Expr) -> bool:
+    """Whether a node is a variable of its own: a count, a field, or something that floats decide."""
+    if node.op in ("field", "let", "count", "sum", "inside", "octant", "param"):
+        if (
+            node.kind.name in ("real", "vec2", "chance", "draw", "number")
+            or node.kind.hi - node.kind.lo >= MAX_DOMAIN
+        ):
+            raise _Unknown
+        return True
+    if node.op in ("eq", "lt", "le") and any(
+        arg.kind.name in ("real", "vec2", "chance") and arg.op != "const" for arg in node.args
+    ):
+        return True
+    if node.op in ("to_real", "length", "vector", "row_part", "column_part", "div"):
+        raise _Unknown
+    return False
+
+
+def satisfiable(
+    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None
+) -> bool:
+    """False only if the conditions, each at its place, can never hold together."""
+    return decide(facts, conditions, lets) is not False
+
+
+def decide(
+    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None
+) -> bool | None:
+    """Whether the conditions may hold together; None if that takes too much work. False is a proof."""
+    try:
+        with facts.budget.question():
+            return _search(facts, conditions, lets).possible()
+    except Exhausted:
+        return None
+
+
+def alone(facts: Facts, condition: Expr, lets: dict[str, Expr]) -> dict[Key, frozenset[object]]:
+    """What a condition leaves of variables that parts of it decide alone: an element, a field, a count at a place."""
+    try:
+        with facts.budget.question():
+            return _search(facts, [(condition, (0, 0))], lets).alone() or {}
+    except Exhausted:
+        return {}
+
+
+def example(
+    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr]
+) -> dict[Offset, int]:
+    """Elements by place with which the conditions hold together, or nothing where none can be told."""
+    try:
+        with facts.budget.question():
+            search = _search(facts, conditions, lets)
+            return search.example() if search.possible() else {}
+    except Exhausted:
+        return {}
+
+
+def _search(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None) -> Search:
+    facts.budget.spend(QUESTION)
+    search = Search(facts, lets)
+    for condition, at in conditions:
+        search.require(condition, at)
+    return search

@@ -1,0 +1,101 @@
+"""Definitions that nothing uses, sets without elements, elements that no rule makes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from powderdsl.diagnostics import Reporter, Span
+from powderdsl.model.composition.claim_scopes import words_of
+from powderdsl.model.composition.compose import Composition
+from powderdsl.model.declarations import Block, PackDecl
+from powderdsl.model.expressions.typer import Typer
+
+
+def report_unused(composition: Composition, typer: Typer, produced: frozenset[int]) -> None:
+    """Report what no rule uses (warnings), and what the loaded packs lack (notes)."""
+    reporter = typer.reporter
+    values = [str(value) for prop in typer.symbols.properties.values() for value in prop.values]
+    for qualified, param in composition.params.items():
+        if qualified not in typer.used and qualified not in values:
+            _unused("parameter", qualified, param.decl.name.span, reporter)
+    for name, named_set in composition.sets.items():
+        if name not in typer.used:
+            _unused("set", name, named_set.decl[0].span, reporter)
+        elif not typer.set_of(typer.symbols.constants[name], named_set.decl[0].span).ids:
+            reporter.report(
+                "PD505", f"the set `{name}` is empty", named_set.decl[1].span, "no element of the loaded packs is in it",
+                helps=["load a pack with such elements, or widen the set"],
+            )  # fmt: skip
+    for name, kernel in composition.kernels.items():
+        if name not in typer.used:
+            _unused("kernel", name, kernel.decl.name.span, reporter)
+    _report_unwritten(composition, reporter)
+    for element in composition.elements.values():
+        if element.id not in produced:
+            reporter.report(
+                "PD504",
+                f"no rule produces `{element.name}`",
+                element.span,
+                "it only comes from the start world, or by painting",
+            )
+
+
+def _unused(what: str, name: str, span: Span, reporter: Reporter) -> None:
+    reporter.report(
+        "PD507", f"the {what} `{name}` is never used", span, "no rule reads it", helps=["remove it"]
+    )
+
+
+def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
+    """Report fields and values under `let` whose names stand in no rule, not even in one that is asleep.
+
+    Tasks and programs may read a field that a ruleset lists as a channel. Streams and tags are left out: packs declare
+    them for others.
+    """
+    names = composition.names
+    words = {names.of(pack.name.text, word) for pack in composition.packs for word in pack_words(pack)}
+    for ruleset in composition.ruleset.lineage if composition.ruleset else ():
+        words |= {word for line in ruleset.invariants for word in words_of(line)}
+        words |= {scalar.text.removesuffix("?").partition(".")[0] for scalar in ruleset.matrix}
+    for name, field in composition.fields.items():
+        if name not in words and field.decl.name.text not in words:
+            _unused("field", name, field.decl.name.span, reporter)
+    for pack in composition.packs:
+        for pass_ in pack.passes:
+            _report_lets(pass_.block, reporter)
+
+
+def _report_lets(block: Block, reporter: Reporter) -> None:
+    later: set[str] = set(_block_words(block, with_lets=False))
+    for scalar, value in reversed(block.lets):
+        if scalar.text not in later:
+            _unused("value", scalar.text, scalar.span, reporter)
+        later |= set(words_of(value))
+    for inner in (*block.blocks, *block.then):
+        _report_lets(inner, reporter)
+
+
+def pack_words(pack: PackDecl) -> Iterator[str]:
+    """Every name in a pack's rules, sets, invariants, tests and color ramps."""
+    for ramp in (*(one.ramp for one in pack.elements), *(one.ramp for one in pack.also)):
+        if ramp is not None:
+            yield ramp.field.text.removesuffix("?").rpartition(".")[2]
+    for pass_ in pack.passes:
+        yield from _block_words(pass_.block)
+    for lines in (
+        pack.invariants,
+        [syntax for _, syntax in pack.sets],
+        [line for test in pack.tests for line in test.always],
+        [decl.of for decl in pack.fields if decl.of is not None],
+    ):
+        for line in lines:
+            yield from words_of(line)
+
+
+def _block_words(block: Block, with_lets: bool = True) -> Iterator[str]:
+    for syntax in (*block.rules, *([block.header] if block.header else [])):
+        yield from words_of(syntax)
+    for _, value in block.lets if with_lets else ():
+        yield from words_of(value)
+    for inner in (*block.blocks, *block.then):
+        yield from _block_words(inner)

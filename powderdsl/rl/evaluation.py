@@ -1,0 +1,236 @@
+"""How good a policy is: its return in many worlds of each split, beside acting at random and doing nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.envs.acting import Policy, action_keys, random_policy
+from powderdsl.envs.observations import observation_of
+from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.experiments.runs import RunFolder, find_run
+from powderdsl.rl.config import TrainConfig
+from powderdsl.rl.policies import config_of, load_policy, task_of
+from powderdsl.simulation.simulator import World
+from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.shipped import check_split
+from powderdsl.tasks.task import Task
+
+POLICIES = ("trained", "random", "nothing")
+BASELINES = ("random", "nothing")
+EVALUATION = "evaluation.json"
+BATCH = 256
+"""Episodes that are played at once."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """Episodes that were played: `returns` float64 [n]; `lengths` int64 [n], actions; `success` bool [n], at the end."""
+
+    returns: Tensor
+    lengths: Tensor
+    success: Tensor
+
+
+@dataclass(frozen=True)
+class Score:
+    """A policy on a split. `interval` is half of the 95 % interval of `mean`: 1.96 standard errors; None of one episode.
+
+    `above` has the mean difference to each of BASELINES in the same worlds, with its own interval, as far as they were
+    played and are others. `success` is None for tasks that do not say what success is.
+    """
+
+    split: str
+    policy: str
+    episodes: int
+    mean: float
+    interval: float | None
+    success: float | None
+    length: float
+    above: Mapping[str, tuple[float, float | None]]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of policies on splits. `step`: the interactions that the trained one had learned from."""
+
+    task: str
+    step: int | None
+    deterministic: bool
+    seed: int
+    scores: tuple[Score, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """For JSON: scores by split and policy."""
+        splits: dict[str, dict[str, Any]] = {}
+        for score in self.scores:
+            numbers = asdict(score)
+            del numbers["split"], numbers["policy"]
+            numbers["above"] = {
+                other: {"mean": mean, "interval": half} for other, (mean, half) in score.above.items()
+            }
+            splits.setdefault(score.split, {})[score.policy] = numbers
+        about = {name: value for name, value in asdict(self).items() if name != "scores"}
+        return {**about, "splits": splits}
+
+
+def play(
+    program: TaskProgram,
+    policy: Policy | None,
+    worlds: Tensor,
+    *,
+    observation: str = "ids",
+    numbers: Tensor | None = None,
+    seed: int = 0,
+    begun: Callable[[Any], None] | None = None,
+    seen: Callable[[World], None] | None = None,
+    acted: Callable[[Tensor | None, Tensor, Tensor], None] | None = None,
+) -> Played:
+    """One episode in each of some worlds.
+
+    Args:
+        policy: None does nothing at all: the worlds run by themselves.
+        worlds: which, int64 [n]. numbers: of the episodes, int64 [n], which a policy's random numbers hang on together
+            with `seed`; 0, 1, … otherwise.
+        begun: called with the episodes at their start. seen: with the worlds after each action and step, see
+            `TaskProgram.act`. acted: after each action, with the actions, the returns so far and which episodes are over.
+    """
+    sight = observation_of(observation, program.simulator, program.task.size)
+    episodes = program.start(worlds)
+    device = episodes.seed.device
+    numbers = torch.arange(len(worlds)) if numbers is None else numbers
+    numbers = numbers.to(device)
+    returns = torch.zeros(len(worlds), dtype=torch.float64, device=device)
+    lengths, going = torch.zeros_like(episodes.seed), torch.ones_like(episodes.failed)
+    succeeded = torch.zeros_like(going)
+    if begun is not None:
+        begun(episodes)
+    for step in range(program.task.agent.actions):
+        actions = None
+        if policy is not None:
+            actions = policy(sight.of(episodes.world), action_keys(seed, numbers, step))
+        # Episodes that are over run on, and no longer count.
+        episodes, reward, success, over = program.act(episodes, actions, reuse=seen is None, seen=seen)
+        returns += torch.where(going, reward.double(), 0.0)
+        lengths += going
+        succeeded |= success & going
+        going = going & ~over
+        if acted is not None:
+            acted(actions, returns, ~going)
+        if not bool(going.any()):
+            break
+    return Played(returns.cpu(), lengths.cpu(), succeeded.cpu())
+
+
+def evaluate(
+    run_or_task: RunFolder | Task | str | Path,
+    *,
+    splits: Sequence[str] | None = None,
+    policies: Sequence[str] | None = None,
+    episodes: int = 256,
+    deterministic: bool = False,
+    seed: int = 0,
+    backend: str | None = None,
+    device: str | None = None,
+    said: Callable[[Score], None] | None = None,
+    packs: Sequence[str] = (),
+) -> Evaluation:
+    """Play policies on splits; for a run, write ``evaluation.json`` into its folder.
+
+    Episode i is played in world i of a split, by all policies; in the run's own split in world i mod the number of
+    worlds that it trained on.
+
+    Args:
+        run_or_task: a run, or the path or name of one, or a task as `Task`, which has no trained policy.
+        splits: all of the task's unless given. policies: some of POLICIES; all that there are unless given.
+        deterministic: the trained policy takes the likeliest action, instead of drawing one.
+        backend, device: those of the run unless given. said: called with each score as it is known.
+        packs: names or files of packs that are added to the rules of a run's task.
+
+    Raises:
+        CompileError: PD620 for a run that is not there, PD801 for a split. ValueError: another argument is wrong.
+    """
+    if isinstance(run_or_task, Task):
+        run, config, task = None, TrainConfig(run_or_task.name), run_or_task
+    else:
+        run = run_or_task if isinstance(run_or_task, RunFolder) else find_run(run_or_task, "ppo")
+        config = config_of(run)
+        task = task_of(run, packs)
+    names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
+    for name in names:
+        check_split(task, name)
+    there = [one for one in POLICIES if run is not None or one != "trained"]
+    chosen = there if policies is None else [one for one in there if one in policies]
+    unknown = [one for one in policies or () if one not in there]
+    if unknown or not chosen or not names:
+        raise ValueError(f"policies are {', '.join(there)}; found {unknown[0] if unknown else 'none'}")
+    if episodes < 1:
+        raise ValueError(f"episodes is {episodes}: it takes a whole number from 1")
+    first = compile_task(
+        task,
+        split=names[0],
+        backend=backend or config.backend,
+        device=device or config.device,
+        threads=config.threads,
+    )
+    acts: dict[str, Policy | None] = {"random": random_policy(first.action_nvec), "nothing": None}
+    step = None
+    if run is not None and "trained" in chosen:
+        env = TensorEnv(first, 1, observation=config.observation)
+        trained = load_policy(run, env, deterministic=deterministic)
+        acts["trained"], step = trained, trained.step
+    scores: list[Score] = []
+    for name in names:
+        program = first if name == first.split else TaskProgram(task, name, first.simulator)
+        count = config.worlds if run is not None and name == config.split else episodes
+        played = {
+            policy: _play_all(program, acts[policy], episodes, min(count, episodes), config.observation, seed)
+            for policy in chosen
+        }
+        for policy in chosen:
+            scores.append(_score(name, policy, played, task))
+            if said is not None:
+                said(scores[-1])
+    found = Evaluation(task.name, step, deterministic, seed, tuple(scores))
+    if run is not None:
+        run.write_json(EVALUATION, found.as_json())
+    return found
+
+
+def _play_all(
+    program: TaskProgram, policy: Policy | None, episodes: int, worlds: int, observation: str, seed: int
+) -> Played:
+    parts = []
+    for start in range(0, episodes, BATCH):
+        numbers = torch.arange(start, min(start + BATCH, episodes))
+        kind = observation if policy is not None else "ids"
+        parts.append(play(program, policy, numbers % worlds, observation=kind, numbers=numbers, seed=seed))
+    return Played(
+        torch.cat([one.returns for one in parts]),
+        torch.cat([one.lengths for one in parts]),
+        torch.cat([one.success for one in parts]),
+    )
+
+
+def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task) -> Score:
+    played = all_played[policy]
+    above = {
+        other: _mean(played.returns - all_played[other].returns)
+        for other in BASELINES
+        if other != policy and other in all_played
+    }
+    success = float(played.success.double().mean()) if task.goal.success is not None else None
+    length = float(played.lengths.double().mean())
+    return Score(split, policy, len(played.returns), *_mean(played.returns), success, length, above)
+
+
+def _mean(values: Tensor) -> tuple[float, float | None]:
+    """The mean, and half of its 95 % interval."""
+    half = 1.96 * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else None
+    return float(values.mean()), half

@@ -1,0 +1,260 @@
+"""PPO of Stable-Baselines3's in a run folder. A run that is killed goes on as if nothing had happened.
+
+What decides how a run goes on is saved between two rollouts: the policy and its optimizer, the worlds, all random
+numbers. Files are read with ``weights_only``: networks are built from the settings, so loading executes nothing.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from powderdsl.compiler import whole_palette
+from powderdsl.envs.observations import channels_of
+from powderdsl.envs.sb3 import PowderVecEnv
+from powderdsl.envs.tensor_env import check_cells
+from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run, read_run
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.rl.config import TrainConfig, check_config
+from powderdsl.rl.policies import policy_kwargs, recorded_palette
+from powderdsl.simulation.observe import Observer
+from powderdsl.system.writing import failure
+from powderdsl.tasks.episodes import compile_task
+from powderdsl.tasks.shipped import check_split, load_task
+from powderdsl.tasks.task import Task
+
+KIND = "ppo"
+ASKED = "asked.json"
+"""The settings of the latest call, with those that may change."""
+
+Progress = Callable[[int, float | None], None]
+"""Called after every action with the interactions so far, and the mean return of the last 100 episodes."""
+
+
+def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None = None) -> RunFolder:
+    """Train until `config.steps` interactions are reached: begin a run in `folder`, or go on with the one there.
+
+    Rollouts are whole: a run ends with the first that reaches `steps`. A run that is interrupted and goes on gives the
+    same weights as one that was not, bit by bit, on a processor; so does one whose `steps` are raised.
+
+    Raises:
+        CompileError: PD640 for settings, all mistakes at once; what `load_task` says of the task; PD621 if the folder
+            holds another run; PD622 if another process trains there.
+        KeyboardInterrupt: after the state before the rollout that was going on has been saved.
+    """
+    check_config(config)
+    task, palette = _task_and_palette(config, Path(folder))
+    check_split(task, config.split)
+    try:
+        check_cells(config.envs, task.size)
+    except ValueError as error:
+        raise failure("PD640", f"`envs`: {error}") from None
+    plain = {
+        **config.identity,
+        "task_fingerprint": fingerprint(task),
+        "palette": palette,
+        "channels": channels_of(config.observation, Observer(task.ruleset, torch.device("cpu"))),
+    }
+    run = open_run(folder, KIND, plain)
+    with run.locked(), _own_random_numbers(config.threads):
+        run.write_json(ASKED, config.as_json())
+        found = run.latest_checkpoint()
+        step = 0 if found is None else found.step
+        if step >= config.steps:
+            return run
+        program = compile_task(
+            task, split=config.split, backend=config.backend, device=config.device, threads=config.threads
+        )
+        env = PowderVecEnv(program, config.envs, observation=config.observation, worlds=config.worlds)
+        model = _model(config, env)
+        with run.metrics(step) as metrics:
+            model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
+            if found is not None:
+                try:
+                    _restore(model, env, found.state)
+                except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
+                    why = " ".join(str(error).split())[:300]
+                    raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
+            keeper = _Keeper(run, env, config.checkpoint_minutes, progress)
+            try:
+                model.learn(config.steps - step, callback=keeper, reset_num_timesteps=found is None)
+            except KeyboardInterrupt:
+                keeper.save_kept()
+                raise
+            run.save_checkpoint(model.num_timesteps, _state(model, env))
+    return run
+
+
+def _task_and_palette(config: TrainConfig, folder: Path) -> tuple[Task, tuple[str | None, ...] | None]:
+    """The task, with the ids of the network's slots: those that its rules need, and free ones as asked for.
+
+    A run that began before palettes were kept has the ids that the rules give.
+    """
+    how: dict[str, Any] = {
+        "knobs": dict(config.knobs),
+        "params": dict(config.params),
+        "packs": config.packs,
+    }
+    if (folder / "run.json").exists():
+        recorded = recorded_palette(read_run(folder))
+        if recorded is None:
+            return load_task(config.task, **how), None
+    found = list(whole_palette(*load_task(config.task, **how).rules))
+    palette = (*found, *[None] * (config.slots - len(found)))
+    return load_task(config.task, **how, palette=palette), palette
+
+
+def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
+    with warnings.catch_warnings():
+        # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
+        warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
+        return PPO(
+            "CnnPolicy",
+            env,
+            learning_rate=config.learning_rate,
+            n_steps=config.rollout,
+            batch_size=config.batch,
+            n_epochs=config.epochs,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            clip_range=config.clip,
+            ent_coef=config.entropy,
+            policy_kwargs=policy_kwargs(config, env.tensors),
+            device=config.device,
+            seed=config.seed,
+        )
+
+
+class _Keeper(BaseCallback):
+    """Saves between rollouts, and keeps in memory what has not been saved."""
+
+    def __init__(self, run: RunFolder, env: PowderVecEnv, minutes: float, progress: Progress | None):
+        super().__init__()
+        self.model: PPO
+        self.run, self.worlds, self.seconds, self.progress = run, env, minutes * 60, progress
+        self.saved_at = time.monotonic()
+        self.kept: tuple[int, dict[str, Any]] | None = None
+        self.mean: float | None = None
+
+    def _on_rollout_start(self) -> None:
+        step, state = self.model.num_timesteps, _state(self.model, self.worlds)
+        if step and time.monotonic() - self.saved_at >= self.seconds:
+            self.run.save_checkpoint(step, state)
+            self.saved_at, self.kept = time.monotonic(), None
+        else:
+            self.kept = step, deepcopy(state)
+        recent = [one["r"] for one in self.model.ep_info_buffer or ()]
+        self.mean = sum(recent) / len(recent) if recent else None
+
+    def _on_step(self) -> bool:
+        if self.progress is not None:
+            self.progress(self.model.num_timesteps, self.mean)
+        return True
+
+    def save_kept(self) -> None:
+        """Save the state before the rollout that is going on, unless that has been done."""
+        if self.kept is not None and self.kept[0]:
+            self.run.save_checkpoint(*self.kept)
+
+
+class _MetricsWriter(KVWriter):
+    """What Stable-Baselines3 logs, as metrics of the run."""
+
+    def __init__(self, metrics: Metrics):
+        self.metrics = metrics
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, Any], step: int = 0) -> None:
+        self.metrics.write(step, _numbers(key_values))
+
+    def close(self) -> None:
+        """The run closes its metrics."""
+
+
+# State
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    """What is a number among them: Python's or NumPy's."""
+    return {
+        name: float(value) for name, value in values.items() if isinstance(value, int | float | np.number)
+    }
+
+
+def _state(model: PPO, env: PowderVecEnv) -> dict[str, Any]:
+    """All that decides how training goes on. Tensors of the model are not copied."""
+    return {
+        "policy": model.policy.state_dict(),
+        "optimizer": model.policy.optimizer.state_dict(),
+        "env": env.state(),
+        "starts": torch.as_tensor(np.asarray(model._last_episode_starts)),
+        "episodes": [[one["r"], one["l"], one["t"]] for one in model.ep_info_buffer or ()],
+        "successes": [bool(one) for one in model.ep_success_buffer or ()],
+        "updates": model._n_updates,
+        "logged": _numbers(model.logger.name_to_value),  # of the update that is shown after the next rollout
+        "steps": model.num_timesteps,
+        "random": _random_state(),
+    }
+
+
+def _restore(model: PPO, env: PowderVecEnv, state: Mapping[str, Any]) -> None:
+    model.policy.load_state_dict(state["policy"])
+    model.policy.optimizer.load_state_dict(state["optimizer"])
+    model._last_obs = env.restore(state["env"])
+    model._last_episode_starts = state["starts"].numpy()
+    size = model._stats_window_size
+    model.ep_info_buffer = deque(
+        ({"r": r, "l": length, "t": t} for r, length, t in state["episodes"]), maxlen=size
+    )
+    model.ep_success_buffer = deque(state["successes"], maxlen=size)
+    model._n_updates, model.num_timesteps = state["updates"], state["steps"]
+    for name, value in state["logged"].items():
+        model.logger.record(name, value)
+    _set_random_state(state["random"])
+
+
+def _random_state() -> dict[str, Any]:
+    """The global generators, which Stable-Baselines3 draws from."""
+    name, keys, *rest = np.random.get_state(legacy=True)
+    found = {
+        "python": random.getstate(),
+        "numpy": [name, torch.from_numpy(np.asarray(keys).astype(np.int64)), *rest],
+        "torch": torch.get_rng_state(),
+    }
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        found["cuda"] = torch.cuda.get_rng_state_all()
+    return found
+
+
+def _set_random_state(state: Mapping[str, Any]) -> None:
+    random.setstate(state["python"])
+    name, keys, *rest = state["numpy"]
+    np.random.set_state((name, keys.numpy().astype(np.uint32), *rest))
+    torch.set_rng_state(state["torch"])
+    # A run may go on with other devices than it had.
+    if torch.cuda.is_available() and len(state.get("cuda", ())) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(state["cuda"])
+
+
+@contextmanager
+def _own_random_numbers(threads: int) -> Iterator[None]:
+    """The caller's generators and number of threads are afterwards what they were."""
+    before, used = _random_state(), torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(used)
+        _set_random_state(before)

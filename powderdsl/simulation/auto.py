@@ -1,0 +1,183 @@
+"""The backend `auto`: torch at once, native code as soon as it is there. Both give the same worlds, bit for bit.
+
+Code that was compiled before is loaded when the program is made. Otherwise torch runs, and once the work done and asked
+for is worth it, a thread compiles in the background. The change comes between two steps: long calls are cut into slices
+for it. Short scripts never start a compiler.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextvars import copy_context
+from dataclasses import replace
+
+from torch import Tensor
+
+from powderdsl.targets.cpp.compilers import CURE, NoCompiler
+from powderdsl.targets.dense.mixed import Part
+from powderdsl.targets.job import Job
+from powderdsl.targets.laps import profile_of
+
+WORTH = 2.0
+"""Seconds of torch, done or still to come in the call that runs, from which native code is compiled. Compiling takes
+longer than that, but on a processor of its own, and only once: what comes out is kept."""
+
+SLICE = 0.25
+"""Seconds of torch between two looks at whether native code is there."""
+
+
+class Build:
+    """Native code on its way, in a thread that waits for the compiler and ends with the process."""
+
+    def __init__(self, make: Callable[[], Part]):
+        self._make = make
+        self._began = time.perf_counter()
+        self._took: float | None = None
+        self.program: Part | None = None
+        self.problem = ""
+        self._thread = threading.Thread(target=copy_context().run, args=(self._run,), daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.program = self._make()
+        except NoCompiler as error:
+            self.problem = str(error)
+        except Exception as error:  # torch goes on; `--backend native` shows what is wrong
+            self.problem = f"{type(error).__name__}: {error}"
+        self._took = time.perf_counter() - self._began
+
+    @property
+    def seconds(self) -> float:
+        """How long it took, or has taken so far."""
+        return time.perf_counter() - self._began if self._took is None else self._took
+
+    @property
+    def lost(self) -> bool:
+        """Whether nothing will come of it: a fork has its parent's memory, but not its threads."""
+        return self._took is None and not self._thread.is_alive()
+
+
+class AutoProgram:
+    """Torch until native code is there.
+
+    Args:
+        torch_program: gives the program on torch, the same at each call.
+        ready: native code that was compiled before, or None; raises NoCompiler if none could be made.
+        make: native code, compiled; raises NoCompiler.
+    """
+
+    def __init__(
+        self, torch_program: Callable[[], Part], ready: Callable[[], Part | None], make: Callable[[], Part]
+    ):
+        self._torch, self._make = torch_program, make
+        self._build: Build | None = None
+        self._native: Part | None = None
+        self._problem = ""
+        self._beginning = threading.Lock()
+        self._spent = 0.0
+        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on torch
+        self._steps = {"torch": 0, "native": 0, "asked": 0}
+        try:
+            self._native = ready()
+        except NoCompiler as error:
+            self._problem = str(error)
+        if self._native is None:
+            torch_program()
+
+    @property
+    def running(self) -> str:
+        """What the next step runs on: ``torch`` or ``native``."""
+        return "torch" if self._arrived() is None else "native"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What ran, and why, in sentences for people."""
+        native, steps, build = self._arrived(), self._steps, self._build
+        found = []
+        if native is not None and build is None:
+            found.append("native: it was compiled before")
+        elif native is not None and build is not None:
+            found.append(
+                f"torch for {steps['torch']} steps while native was made ready ({build.seconds:.0f} s), "
+                f"then native for {steps['native']}"
+            )
+        elif self._problem:
+            found.append(f"torch: {self._problem}")
+            found.append(f"native code is faster: {CURE}")
+        elif build is not None and not build.lost:
+            found.append(
+                f"torch for {steps['torch']} steps; native is being made ready ({build.seconds:.0f} s)"
+            )
+        else:
+            found.append(f"torch: native is compiled from {WORTH:g} s of work, or by --backend native")
+        if steps["asked"]:
+            found.append(f"torch for {steps['asked']} steps with given draws or chosen passes")
+        return tuple(found)
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        if job.draws or job.passes is not None:
+            self._steps["asked"] += job.steps
+            return self._torch().run(job)
+        seed, index, start = job.clock
+        state, done = job.state, 0
+        while True:
+            part = replace(job, state=state, clock=(seed, index, start + done) if done else job.clock)
+            native = self._arrived()
+            if native is not None:
+                self._steps["native"] += job.steps - done
+                return native.run(replace(part, steps=job.steps - done))
+            count = self._slice(job, job.steps - done)
+            began = time.perf_counter()
+            state = self._torch().run(replace(part, steps=count))
+            done += count
+            self._account(job, count, job.steps - done, time.perf_counter() - began)
+            if done == job.steps:
+                return state
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`, of what runs now."""
+        return profile_of(self._arrived() or self._torch(), job)
+
+    def _slice(self, job: Job, left: int) -> int:
+        """How many steps to make on torch before looking again: one while nobody knows how long they take."""
+        if self._problem:
+            return left
+        cells = job.state["element"].numel()
+        if self._pace is None or self._pace[0] != cells:
+            return min(left, 1)
+        return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
+
+    def _account(self, job: Job, count: int, left: int, seconds: float) -> None:
+        """Take note of steps made on torch, and begin to compile if that has become worth it."""
+        if count == 0:
+            return
+        self._steps["torch"] += count
+        self._spent += seconds
+        cells = job.state["element"].numel()
+        # The first step makes what later ones use again: how long it takes says nothing of them.
+        first = self._pace is None or self._pace[0] != cells
+        self._pace = (cells, seconds / count)
+        expected = 0.0 if first else left * self._pace[1]
+        if self._spent + expected >= WORTH:
+            self._begin()
+
+    def _begin(self) -> None:
+        """Start to compile, unless that has been done. Threads that come at the same time do not wait."""
+        if self._problem or not self._beginning.acquire(blocking=False):
+            return
+        try:
+            if self._native is None and (self._build is None or self._build.lost):
+                self._build = Build(self._make)
+        finally:
+            self._beginning.release()
+
+    def _arrived(self) -> Part | None:
+        """The native program if it is there."""
+        build = self._build
+        if self._native is None and build is not None:
+            self._native, self._problem = build.program, build.problem or self._problem
+        return self._native

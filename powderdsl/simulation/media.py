@@ -1,0 +1,164 @@
+"""Pictures and animations on disk: PNG, GIF, MP4. Frames are uint8 [H, W, 3]. Files appear whole or not."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from powderdsl.simulation.draw import to_numpy
+from powderdsl.system.interrupts import held_back
+from powderdsl.system.writing import failure, replacing
+
+MIN_GIF_DELAY = 20
+"""Milliseconds. Browsers slow down GIFs whose frames are shorter."""
+
+
+def write_png(path: str | Path, image: Any) -> None:
+    """Write one picture, uint8 [H, W, 3] (array or tensor). Raises ValueError for another shape or type."""
+    with replacing(Path(path), follow=True) as temporary:
+        Image.fromarray(_frame(image)).save(temporary, format="PNG", optimize=True)
+
+
+def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop: bool = True) -> None:
+    """Write an animation as GIF, from an iterable that may be lazy. At most 50 frames a second.
+
+    Frames of up to 256 colours keep them exactly; others are reduced, without dithering.
+    Raises ValueError for no frames, for frames of different sizes, and for a bad `fps`.
+    """
+    delay = max(round(100 / _checked_rate(fps)) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
+    images = (_indexed(frame) for frame in _same_size(frames))
+    first = next(images)
+    endless = {"loop": 0} if loop else {}
+    with replacing(Path(path), follow=True) as temporary:
+        first.save(
+            temporary,
+            format="GIF",
+            save_all=True,
+            append_images=images,
+            duration=delay,
+            optimize=False,
+            **endless,
+        )
+
+
+def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:
+    """Write an animation as H.264, from an iterable that may be lazy. Odd sizes grow by one row or column.
+
+    Raises CompileError (PD612) if imageio-ffmpeg is not installed, ValueError as `write_gif` does, and
+    OSError with the encoder's own words if it fails.
+    """
+    _checked_rate(fps)
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise failure(
+            "PD612",
+            "writing MP4 needs imageio-ffmpeg, which is not installed",
+            helps=("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing"),
+        ) from None
+    checked = _same_size(frames)
+    first = _even(next(checked))
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command += ["-s", size, "-r", str(fps), "-i", "-", *_ENCODING]
+    with replacing(Path(path), follow=True) as temporary:
+        _encode([*command, str(temporary)], chain([first], map(_even, checked)))
+
+
+_ENCODING = (
+    *(
+        "-an",
+        "-vcodec",
+        "libx264",
+        "-crf",
+        "18",
+        "-pix_fmt",
+        "yuv420p",
+        "-f",
+        "mp4",
+        "-movflags",
+        "+faststart",
+    ),
+    # Without these words players guess how to turn the colours back, and get them slightly wrong.
+    *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709"),
+    *("-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"),
+)
+
+
+def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
+    """Feed frames to an encoder and raise OSError if it fails.
+
+    Not imageio_ffmpeg's own writer, which ignores the exit status: a full disk would leave a broken file.
+    """
+    with tempfile.TemporaryFile() as log:
+        encoder = None
+        try:
+            # A session of its own: Ctrl-C reaches us alone, and we end the encoder.
+            with held_back():
+                encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
+            assert encoder.stdin is not None
+            with suppress(BrokenPipeError), encoder.stdin as pipe:  # the encoder died: its words say why
+                for frame in frames:
+                    pipe.write(np.ascontiguousarray(frame).data)
+            status = encoder.wait()
+        except BaseException:
+            if encoder is not None:
+                encoder.kill()
+                encoder.wait()
+            raise
+        if status != 0:
+            log.seek(0)
+            words = log.read(2000).decode(errors="replace").strip()
+            raise OSError(f"the video encoder failed (status {status}): {words}")
+
+
+def _frame(image: Any) -> NDArray[np.uint8]:
+    picture = to_numpy(image)
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or 0 in picture.shape:
+        raise ValueError(f"a picture must be uint8 [H, W, 3], not {picture.dtype} {picture.shape}")
+    return np.ascontiguousarray(picture)
+
+
+def _same_size(frames: Iterable[Any]) -> Iterator[NDArray[np.uint8]]:
+    """Checked frames, one by one. The first one is checked when it is asked for."""
+    shape = None
+    for number, frame in enumerate(frames):
+        picture = _frame(frame)
+        if shape is not None and picture.shape != shape:
+            raise ValueError(f"frame {number} has shape {picture.shape}, the first one {shape}")
+        shape = picture.shape
+        yield picture
+    if shape is None:
+        raise ValueError("an animation needs at least one frame")
+
+
+def _checked_rate(fps: float) -> float:
+    if not 0 < fps <= 1000:
+        raise ValueError(f"fps={fps} must lie above 0, up to 1000")
+    return fps
+
+
+def _indexed(frame: NDArray[np.uint8]) -> Image.Image:
+    """A frame with a palette of its own, exact where it has at most 256 colours."""
+    packed = frame.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    colors, index = np.unique(packed, return_inverse=True)
+    if len(colors) > 256:
+        return Image.fromarray(frame).quantize(256, dither=Image.Dither.NONE)
+    image = Image.fromarray(index.reshape(packed.shape).astype(np.uint8))
+    image.putpalette(b"".join(int(color).to_bytes(3, "big") for color in colors))
+    return image
+
+
+def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """H.264 stores colour at half the size, so both sides must be even: the last row or column is doubled."""
+    height, width = frame.shape[:2]
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

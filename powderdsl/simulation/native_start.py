@@ -1,0 +1,95 @@
+"""From a checked model to running native code: at once if the same has been compiled before, else by lowering it.
+
+What is remembered hangs on the model, on every source file that turns models into C++, on the compiler and the
+processor. Values of parameters are inputs of a step, so they take no part.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from powderdsl.ir.ops import Program
+from powderdsl.ir.segments import segments
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.targets.cache import turn
+from powderdsl.targets.cpp.build import cache_key, current
+from powderdsl.targets.cpp.code import NativeCode, compile_program, recall, remember
+from powderdsl.targets.cpp.compilers import find_compiler, flags_for
+from powderdsl.targets.cpp.program import NativeProgram
+from powderdsl.targets.dense.mixed import Part, mixed_program
+
+Lowered = Callable[[], Program]
+"""Gives a ruleset in IR; the work is done when it is first called."""
+
+SOURCES = ("compiler.py", "simulation/native_start.py", "model", "analysis", "ir", "targets")
+
+
+def start_key(ruleset: Ruleset) -> str:
+    """What native code of a ruleset is remembered under. Raises NoCompiler if none could be made here."""
+    compiler = find_compiler()
+    params = tuple(replace(param, default=0, about="") for param in ruleset.params)
+    said = fingerprint(replace(ruleset, params=params))
+    return cache_key(said + generator(), compiler, flags_for(compiler, current().level))
+
+
+@lru_cache(maxsize=1)
+def generator() -> str:
+    """A hash of the source files that take part in making C++."""
+    here = Path(__file__).resolve().parents[1]
+    found = hashlib.sha256()
+    for name in SOURCES:
+        files = sorted(p for p in (here / name).rglob("*") if p.suffix in (".py", ".hpp")) or [here / name]
+        for path in files:
+            found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Part | None:
+    """A program that has been compiled before, None if there is none. Raises NoCompiler if none could be made."""
+    code = recall(start_key(ruleset))
+    return None if code is None else _whole(code, lowered, threads)
+
+
+def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Part:
+    """A program compiled unless it has been before; passes that planes cannot carry run on cells.
+
+    Raises:
+        NoCompiler: there is no C++ compiler, or it failed.
+    """
+    key = start_key(ruleset)
+    code = recall(key)
+    if code is not None:
+        return _whole(code, lowered, threads)
+    with turn(current().place(), key):
+        code = recall(key)  # from another process, while this one waited
+        if code is not None:
+            return _whole(code, lowered, threads)
+        found = segments(lowered())
+        if len(found) == 1 and found[0].planes is not None:
+            code = compile_program(found[0].program, found[0].planes)
+            remember(key, code)
+            return _whole(code, lowered, threads)
+        return mixed_program(
+            found, torch.device("cpu"), lambda cells, planes: _compiled(cells, planes, threads)
+        )
+
+
+def _whole(code: NativeCode, lowered: Lowered, threads: int) -> Part:
+    def with_clocks() -> NativeCode:
+        (whole,) = segments(lowered())
+        assert whole.planes is not None
+        return compile_program(whole.program, whole.planes, clocks=True)
+
+    return NativeProgram(code, threads, with_clocks)
+
+
+def _compiled(cells: Program, planes: Program, threads: int) -> Part:
+    code = compile_program(cells, planes)
+    return NativeProgram(code, threads, lambda: compile_program(cells, planes, clocks=True))

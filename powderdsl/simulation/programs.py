@@ -1,0 +1,197 @@
+"""Backends by name: what each makes of a checked model. All of them run the same signature (`Runnable`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext, suppress
+from functools import cache
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.ir.ops import Program
+from powderdsl.model import reference
+from powderdsl.model.types import Ruleset
+from powderdsl.targets.job import Job
+from powderdsl.targets.laps import Laps, profile_of, unwatched
+
+
+class Runnable(Protocol):
+    """A ruleset made executable."""
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        ...
+
+
+class ReferenceProgram:
+    """The oracle behind the common signature."""
+
+    def __init__(self, ruleset: Ruleset):
+        self.ruleset = ruleset
+        self._bits = {stream.name: stream.bits for stream in ruleset.streams}
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        return self._run(job, unwatched)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`. The first pass is charged with what a step begins with."""
+        laps = Laps(torch.device("cpu"))
+        self._run(job, laps)
+        return laps.passes()
+
+    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
+        device = job.state["element"].device
+        seed, index, start = (part.cpu().numpy() for part in job.clock)
+        arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
+        numbers = {name: value.cpu().numpy() for name, value in job.params.items()}
+        kinds = {param.name: param.kind.name for param in self.ruleset.params}
+        dtypes = {"int": "int64", "flag": "bool", "real": "float32", "chance": "float64"}
+        numbers = {name: value.astype(dtypes[kinds[name]]) for name, value in numbers.items()}
+        given = {
+            name: (value.cpu().numpy() + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()
+        }
+        for i in range(job.steps):
+            at = reference.Clock(seed, index, start + i)
+            lap("")
+            arrays = reference.step(
+                self.ruleset, arrays, at, numbers, passes=job.passes, draws=given, lap=lap
+            )
+        return {name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()}
+
+
+def find_device(name: str | torch.device) -> torch.device:
+    """The torch device of a name. Raises CompileError (PD701) if it is not there."""
+    try:
+        device = torch.device(name)
+        if device.type == "meta":
+            raise RuntimeError("a meta device has shapes and no values")
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError, ValueError, ImportError) as error:
+        reporter = Reporter()
+        problem = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        reporter.error("PD701", f"no device `{name}`", None, notes=[problem], helps=["run on `cpu`"])
+        raise CompileError(reporter.diagnostics) from None
+    return device
+
+
+PLANES_FROM = 1 << 16
+"""Cells of a batch from which packed words beat one tensor element a cell on a device. On the CPU they always do."""
+
+
+class TorchProgram:
+    """Torch in its two forms, which give the same worlds: cells for little work on a device, else packed planes."""
+
+    running = "torch"
+
+    def __init__(self, program: Program, device: torch.device):
+        self.program = program
+        self.device = device
+        self._cells: Runnable | None = None
+        self._planes: Runnable | None = None
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        return self._fit_for(job).run(job)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`."""
+        return profile_of(self._fit_for(job), job)
+
+    def _fit_for(self, job: Job) -> Runnable:
+        if self.device.type == "cpu" or job.state["element"].numel() >= PLANES_FROM:
+            return self.planes()
+        if self._cells is None:
+            from powderdsl.targets.dense.program import DenseProgram
+
+            self._cells = DenseProgram(self.program, self.device)
+        return self._cells
+
+    def planes(self) -> Runnable:
+        """The program on packed words, made when first needed; passes that planes cannot carry run on cells."""
+        from powderdsl.targets.arrays.program import ArrayProgram
+        from powderdsl.targets.dense.mixed import packed_program
+        from powderdsl.targets.planes.program import PlanesProgram
+
+        def packed(cells: Program, planes: Program) -> Runnable:
+            if self.device.type == "cpu":
+                return ArrayProgram(cells, planes)
+            return PlanesProgram(cells, planes, self.device)
+
+        if self._planes is None:
+            self._planes = packed_program(self.program, self.device, packed)
+        return self._planes
+
+
+class CompiledProgram:
+    """Native code or kernels for whole steps; torch where draws are given or passes chosen."""
+
+    def __init__(self, native: Runnable, rest: Callable[[], Runnable], running: str = "native"):
+        self._native, self._rest, self.running = native, rest, running
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        runnable = self._rest() if job.draws or job.passes is not None else self._native
+        return runnable.run(job)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`, of the native code."""
+        return profile_of(self._native, job)
+
+
+def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: int = 1) -> Runnable:
+    """The program of a ruleset on a backend, for a device that is there.
+
+    Raises:
+        CompileError: PD701 if the backend needs what is not there.
+    """
+    if backend == "reference":
+        return ReferenceProgram(ruleset)
+    from powderdsl.compiler import lower
+    from powderdsl.targets.dense.program import DenseProgram
+
+    # Both are made when first needed: code that was compiled before needs neither.
+    lowered = cache(lambda: lower(ruleset))
+    torch_program = cache(lambda: TorchProgram(lowered(), device))
+    if backend == "dense":
+        return DenseProgram(lowered(), device)
+    if backend == "planes":
+        return torch_program().planes()
+    if backend == "native":
+        return CompiledProgram(_native(ruleset, lowered, device, threads), torch_program)
+    if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
+        from powderdsl.targets.cuda.program import cuda_program
+
+        with suppress(CompileError) if backend == "auto" else nullcontext():
+            return CompiledProgram(cuda_program(lowered(), device), torch_program, "cuda")
+    if backend == "auto" and device.type == "cpu":
+        from powderdsl.simulation.auto import AutoProgram
+        from powderdsl.simulation.native_start import native_program, ready_program
+
+        return AutoProgram(
+            torch_program,
+            lambda: ready_program(ruleset, lowered, threads),
+            lambda: native_program(ruleset, lowered, threads),
+        )
+    return torch_program()
+
+
+def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
+    from powderdsl.simulation.native_start import native_program
+    from powderdsl.targets.cpp.compilers import CURE, NoCompiler
+
+    problem = "native code runs on the CPU" if device.type != "cpu" else ""
+    try:
+        if not problem:
+            return native_program(ruleset, lowered, threads)
+    except NoCompiler as error:
+        problem = str(error)
+    reporter = Reporter()
+    helps = [f"run on the backend `torch`, or {CURE}"]
+    reporter.error(
+        "PD701", "the native backend is not available", None, notes=problem.splitlines(), helps=helps
+    )
+    raise CompileError(reporter.diagnostics)

@@ -1,0 +1,147 @@
+"""Provenance: which rule last wrote the element of each cell in a step, on any backend and device.
+
+The rules are given one more field, which every rule that writes elements sets to its number where it does. That is all:
+backends know nothing of it, and a simulator that nobody asks for provenance is as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.diagnostics import Span
+from powderdsl.model.text import place_of
+from powderdsl.model.types import Assign, Expr, Field, Move, Pass, Rule, Ruleset, Swap, integer
+from powderdsl.simulation.simulator import Simulator, World, compile
+
+SLOT = "last writer"
+"""The field of the numbers. No rule file can have a name with a blank, so none is in the way."""
+
+
+@dataclass(frozen=True)
+class NumberedRule:
+    """A rule of the checked model. One line of a file makes several under loops and symmetries.
+
+    `number` counts from 1 in the order in which they run; `moment` counts the pass's moments from 0; `label` has the
+    loop variables, such as ``side = left``.
+    """
+
+    number: int
+    pack: str
+    pass_name: str
+    moment: int
+    label: str
+    rule: Rule
+
+    @property
+    def span(self) -> Span:
+        return self.rule.span
+
+    @property
+    def place(self) -> str:
+        """`file:line`."""
+        return place_of(self.span)
+
+
+def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
+    """All rules in the order in which they run; rule number n is at index n − 1."""
+    found: list[NumberedRule] = []
+    for pass_ in ruleset.passes:
+        for position, moment in enumerate(pass_.moments):
+            for rule in moment.rules:
+                found.append(
+                    NumberedRule(len(found) + 1, pass_.pack, pass_.name, position, moment.label, rule)
+                )
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Worlds after a step, and what wrote their elements in it.
+
+    `numbers` is int16 [B, H, W] on the worlds' device: the number of the rule in `rules` that last wrote the element
+    of a cell in the last step, 0 where none did. A rule that writes the element that was there counts too.
+    """
+
+    world: World
+    numbers: Tensor
+    rules: tuple[NumberedRule, ...]
+
+    def rule_at(self, row: int, column: int, world: int = 0) -> NumberedRule | None:
+        """The rule that last wrote a cell's element; None if there is none. Raises IndexError outside the grid."""
+        number = int(self.numbers[world, row, column])
+        return self.rules[number - 1] if number else None
+
+
+class Recorder:
+    """Steps worlds of a simulator and keeps which rules wrote their elements. Compiles the rules once more."""
+
+    def __init__(self, sim: Simulator):
+        self.sim = sim
+        self.rules = numbered_rules(sim.ruleset)
+        self._marked = compile(marked(sim.ruleset), backend=sim.backend, device=str(sim.device))
+
+    def step(
+        self,
+        world: World,
+        steps: int = 1,
+        *,
+        random: Mapping[str, Any] | None = None,
+        passes: Sequence[str] | None = None,
+        params: Mapping[str, Any] | None = None,
+    ) -> Provenance:
+        """Like `Simulator.step`, which gives the same worlds and raises the same errors. Without steps nothing wrote."""
+        if world.sim.ruleset is not self.sim.ruleset and world.sim.ruleset != self.sim.ruleset:
+            raise ValueError(
+                f"this world belongs to {world.sim.ruleset.name}, not to {self.sim.ruleset.name}"
+            )
+        dtype = next(getattr(torch, slot.dtype) for slot in self._marked.slots if slot.name == SLOT)
+        nothing = torch.zeros(world.shape, dtype=dtype, device=self.sim.device)
+        start = replace(world, sim=self._marked, state={**world.state, SLOT: nothing})
+        end = self._marked.step(start, steps, random=random, passes=passes, params=params)
+        state = dict(end.state)
+        numbers = state.pop(SLOT).to(torch.int16)
+        return Provenance(replace(end, sim=self.sim, state=state), numbers, self.rules)
+
+
+def writers(world: World, steps: int = 1, **options: Any) -> Provenance:
+    """The worlds some steps later, and which rules wrote their elements in the last of these steps.
+
+    It compiles the rules for this one call; whoever asks often keeps a `Recorder`.
+
+    Args:
+        options: as `Simulator.step` takes them.
+    """
+    return Recorder(world.sim).step(world, steps, **options)
+
+
+def marked(ruleset: Ruleset) -> Ruleset:
+    """The same rules, with a field that holds the number of the rule that last wrote a cell's element in this step."""
+    rules = numbered_rules(ruleset)
+    numbers = iter(rules)
+    passes = tuple(_marked_pass(pass_, numbers) for pass_ in ruleset.passes)
+    kind = integer(0, max(1, len(rules)))
+    slot = Field(SLOT, kind, 0, "place", True, None, ruleset.elements[0].pack, ruleset.elements[0].span)
+    return replace(ruleset, fields=(*ruleset.fields, slot), passes=passes)
+
+
+def _marked_pass(pass_: Pass, numbers: Iterator[NumberedRule]) -> Pass:
+    moments = []
+    for moment in pass_.moments:
+        rules = tuple(_marked_rule(rule, next(numbers).number) for rule in moment.rules)
+        moments.append(replace(moment, rules=rules))
+    return replace(pass_, moments=tuple(moments))
+
+
+def _marked_rule(rule: Rule, number: int) -> Rule:
+    """The rule with effects that leave its number in every cell whose element it writes."""
+    if isinstance(rule, Assign):
+        return rule  # assignments never write elements
+    value = Expr("const", integer(number, number), value=number)
+    places = [(0, 0)] if not isinstance(rule, (Swap, Move)) else [rule.offset, (0, 0)]
+    marks = tuple(Assign(SLOT, place, ":=", value, None, rule.span) for place in places)
+    return replace(rule, effects=(*rule.effects, *marks))

@@ -1,0 +1,468 @@
+"""Worlds and the simulator: state in, state out. Worlds are immutable; every method returns a new one.
+
+All arrays are torch tensors on the simulator's device, in the storage dtypes of `model.state`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from operator import index
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.compiler import BACKENDS, load
+from powderdsl.diagnostics import CompileError, Reporter, suggest
+from powderdsl.model.state import Slot
+from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import check_sides
+from powderdsl.simulation.observe import Observer
+from powderdsl.simulation.programs import find_device, make_program
+from powderdsl.simulation.state_checks import check_ids, checked_integers, checked_reals, looked_up
+from powderdsl.targets.job import Job
+from powderdsl.targets.laps import profile_of
+
+MAX_CELLS = 1 << 31
+
+
+@dataclass(frozen=True)
+class World:
+    """A batch of worlds of one ruleset.
+
+    `state` has one tensor a slot; `seed`, `index` and `step` (int64 [B]) are what the random numbers hang on: the
+    same three give the same future, whatever stands beside a world in its batch.
+    """
+
+    sim: Simulator
+    state: Mapping[str, Tensor]
+    seed: Tensor
+    index: Tensor
+    step: Tensor
+
+    @property
+    def ids(self) -> Tensor:
+        """Element ids, uint8 [B, H, W]."""
+        return self.state["element"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(worlds, rows, columns)."""
+        batch, height, width = self.ids.shape
+        return batch, height, width
+
+    def __len__(self) -> int:
+        return len(self.seed)  # without unpacking anything
+
+    def __getitem__(self, name: str) -> Tensor:
+        """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""
+        return self.sim.read(self, name)
+
+    def select(self, worlds: int | slice | Sequence[int] | Tensor) -> World:
+        """Some worlds of the batch, with their random futures unchanged."""
+        keys = [worlds] if isinstance(worlds, int) else worlds
+        chosen = {name: value[keys] for name, value in self.state.items()}
+        return replace(self, state=chosen, seed=self.seed[keys], index=self.index[keys], step=self.step[keys])
+
+    def read(self, name: str, out: Tensor | None = None) -> Tensor:
+        """`world[name]`, written into `out`. This and the methods below are those of `Simulator`."""
+        return self.sim.read(self, name, out)
+
+    def matrix(self, out: Tensor | None = None) -> Tensor:
+        """All channels of the ruleset's `matrix:` as float32 [B, C, H, W]: elements one-hot, then fields."""
+        return self.sim.matrix(self, out)
+
+    def rgb(self, out: Tensor | None = None) -> Tensor:
+        """Pictures, a pixel a cell: uint8 [B, H, W, 3]."""
+        return self.sim.rgb(self, out)
+
+    def compact(self, out: Tensor | None = None) -> Tensor:
+        """All that lasts, in small numbers: uint8 [B, C, H, W]; `sim.observer.compact_names` says what they are."""
+        return self.sim.observer.compact(self.state, out)
+
+    def planes(self, out: Tensor | None = None) -> Tensor:
+        """The packed planes int64 [B, P, H, ⌈W/64⌉]; `Simulator.plane_names` says what they are."""
+        return self.sim.planes(self, out)
+
+
+class Simulator:
+    """Runs one ruleset on one backend and device. Made by `powderdsl.compile`."""
+
+    def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device, threads: int = 1):
+        self.ruleset = ruleset
+        self.backend = backend
+        self.device = find_device(device)
+        self.observer = Observer(ruleset, self.device)
+        self._slots: dict[str, Slot] = self.observer.slots
+        self._program = make_program(ruleset, backend, self.device, threads)
+        self._defaults: tuple[int, dict[str, Tensor]] | None = None
+        self._known = torch.zeros(256, dtype=torch.bool, device=self.device)
+        self._known[[element.id for element in ruleset.elements]] = True
+
+    @property
+    def running(self) -> str:
+        """The backend that the next step runs on: for ``auto``, ``torch`` or ``native``."""
+        return str(getattr(self._program, "running", self.backend))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For ``auto``: what ran and why, in sentences."""
+        return tuple(getattr(self._program, "notes", ()))
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names in id order."""
+        return tuple(element.name for element in self.ruleset.elements)
+
+    @property
+    def passes(self) -> tuple[str, ...]:
+        """Names in the order they run."""
+        return tuple(p.name for p in self.ruleset.passes)
+
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        """What a world's state holds."""
+        return tuple(self._slots.values())
+
+    # Making worlds
+
+    def world(self, ids: Any, seed: Any = 0, *, index: Any = None) -> World:
+        """Fresh worlds from element ids.
+
+        Args:
+            ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
+            seed: one whole number for all, or one a world.
+            index: which world of its seed each is; 0, 1, … for one common seed, 0 for seeds of their own.
+
+        Raises:
+            TypeError: ids are no integers. ValueError: wrong shape, or ids that the ruleset does not have.
+        """
+        tensor = self._integers(ids, "ids")
+        if tensor.ndim == 2:
+            tensor = tensor[None]
+        if tensor.ndim != 3 or 0 in tensor.shape:
+            raise ValueError(f"ids must have the shape [worlds, rows, columns], found {list(tensor.shape)}")
+        check_sides(self.ruleset, (int(tensor.shape[1]), int(tensor.shape[2])))
+        if tensor.numel() > MAX_CELLS:
+            raise ValueError(f"{tensor.numel():,} cells are more than {MAX_CELLS:,}")
+        self._check_ids(tensor, "ids")
+        element = tensor.to(torch.uint8)
+        batch = len(element)
+        one_seed = (not isinstance(seed, Tensor) and not hasattr(seed, "__len__")) or getattr(
+            seed, "ndim", 1
+        ) == 0
+        if index is None:
+            index = range(batch) if one_seed else [0] * batch
+        return World(
+            self,
+            {name: self._fresh(slot, element) for name, slot in self._slots.items()},
+            self._numbers(seed, "seed", batch),
+            self._numbers(index, "index", batch),
+            torch.zeros(batch, dtype=torch.int64, device=self.device),
+        )
+
+    def _fresh(self, slot: Slot, ids: Tensor) -> Tensor:
+        """A slot's tensor as new cells of these elements have it."""
+        if slot.name == "element":
+            return ids.clone()
+        prop = self.ruleset.property(slot.name)
+        dtype = getattr(torch, slot.dtype)
+        if prop is not None:
+            return looked_up(self.observer.table(prop.name), ids, dtype)
+        values = torch.tensor([slot.fresh(i) for i in range(256)], dtype=dtype, device=self.device)
+        return looked_up(values, ids, dtype)
+
+    def _tensor(self, value: Any, name: str) -> Tensor:
+        flags = getattr(value, "flags", None)
+        if getattr(flags, "writeable", True) is False:
+            value = value.copy()  # torch warns of arrays that it could write to and may not
+        try:
+            return torch.as_tensor(value, device=self.device)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
+
+    def _integers(self, value: Any, name: str) -> Tensor:
+        tensor = self._tensor(value, name)
+        if tensor.dtype.is_floating_point or tensor.dtype.is_complex or tensor.dtype == torch.bool:
+            raise TypeError(f"{name} must be integers, found {tensor.dtype}")
+        return tensor
+
+    def _numbers(self, value: Any, name: str, batch: int) -> Tensor:
+        tensor = self._integers(list(value) if isinstance(value, range) else value, name).to(torch.int64)
+        if tensor.ndim == 0:
+            tensor = tensor.expand(batch)
+        if tensor.shape != (batch,) or bool((tensor < 0).any()):
+            raise ValueError(
+                f"{name} must be one number of 0 or more, or {batch} of them, found shape {list(tensor.shape)}"
+            )
+        return tensor.clone()
+
+    def _check_ids(self, ids: Tensor, name: str) -> None:
+        check_ids(ids, self._known, name, self.ruleset)
+
+    # Reading and changing worlds
+
+    def read(self, world: World, name: str, out: Tensor | None = None) -> Tensor:
+        """What `World.__getitem__` returns.
+
+        Args:
+            out: written to and returned, instead of a new tensor or the world's own: of the same shape, dtype and
+                device, each of its worlds contiguous. `matrix`, `rgb` and `planes` take one too.
+
+        Raises:
+            KeyError: an unknown name. TypeError, ValueError: `out` is no tensor, or does not fit.
+        """
+        return self.observer.read(world.state, name, out)
+
+    def matrix(self, world: World, out: Tensor | None = None) -> Tensor:
+        """What `World.matrix` returns."""
+        return self.observer.matrix(world.state, out)
+
+    def rgb(self, world: World, out: Tensor | None = None) -> Tensor:
+        """Pictures uint8 [B, H, W, 3] in the elements' colours, a pixel a cell."""
+        return self.observer.rgb(world.state, out)
+
+    def planes(self, world: World, out: Tensor | None = None) -> Tensor:
+        """Flags and whole numbers in bits: int64 [B, P, H, ⌈W/64⌉].
+
+        Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of `plane_names`.
+        Real fields have none: `read` them.
+        """
+        return self.observer.planes(world.state, out)
+
+    @property
+    def plane_names(self) -> tuple[str, ...]:
+        """What the planes are: a flag's name, or ``name:bit`` from bit 0; the last bit of a signed number is its sign."""
+        return self.observer.plane_names
+
+    def replace(self, world: World, **fields: Any) -> World:
+        """The world with these fields set. New ids make fresh cells; other fields are set after that.
+
+        Args:
+            fields: by name: [B, H, W] (or [H, W], or one number for all); vectors [B, 2, H, W] as (rows, columns).
+
+        Raises:
+            KeyError: an unknown field. TypeError, ValueError: wrong dtype, shape, range, NaN, or a value where the
+                element cannot hold one.
+        """
+        state = dict(world.state)
+        if "ids" in fields or "element" in fields:
+            given = fields.pop("ids", None) if "ids" in fields else fields.pop("element")
+            ids = self._shaped(self._integers(given, "ids"), "ids", world.shape, False)
+            self._check_ids(ids, "ids")
+            element = ids.to(torch.uint8)
+            fresh = self.world(element).state
+            changed = element != state["element"]
+            for name, slot in self._slots.items():
+                if slot.travels:
+                    state[name] = torch.where(
+                        changed[:, None] if slot.planes == 2 else changed, fresh[name], state[name]
+                    )
+        for name, value in fields.items():
+            if name not in self._slots:
+                prop = self.ruleset.property(name)
+                if prop is None:
+                    self.read(world, name)
+                if not torch.equal(
+                    self._shaped(value, name, world.shape, False).double(),
+                    self.observer.table(name)[state["element"].long()],
+                ):
+                    raise ValueError(
+                        f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
+                    )
+                continue
+            state[name] = self._checked(self._slots[name], value, state["element"])
+        return replace(world, state=state)
+
+    def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool) -> Tensor:
+        tensor = self._tensor(value, name)
+        target = (shape[0], 2, *shape[1:]) if vector else shape
+        if vector and tensor.ndim == 1 and len(tensor) == 2:
+            tensor = tensor[None, :, None, None]
+        try:
+            return tensor.broadcast_to(target)
+        except RuntimeError:
+            raise ValueError(
+                f"{name} must have the shape {list(target)}, found {list(tensor.shape)}"
+            ) from None
+
+    def _checked(self, slot: Slot, value: Any, ids: Tensor) -> Tensor:
+        tensor = self._shaped(value, slot.name, tuple(ids.shape), slot.planes == 2)
+        if tensor.dtype.is_complex:
+            raise TypeError(f"{slot.name} takes real numbers, found {tensor.dtype}")
+        if slot.is_real:
+            return checked_reals(tensor, slot)
+        usual = None if self.ruleset.property(slot.name) is None else self.observer.table(slot.name)
+        return checked_integers(tensor, ids, slot, usual, self._known, self.ruleset)
+
+    def paint(self, world: World, *, where: Any, element: str | None = None, **fields: Any) -> World:
+        """Set cells of a mask: fresh cells of an element, and values of fields.
+
+        Args:
+            where: bool [B, H, W] or [H, W].
+            element: the element's name, plain or qualified.
+            fields: values by field name; vectors as (rows, columns).
+
+        Raises:
+            KeyError: an unknown element or field. ValueError: a wrong shape or value.
+        """
+        mask = self._shaped(where, "where", world.shape, False)
+        if mask.dtype != torch.bool:
+            raise TypeError(f"where must be a bool mask, found {mask.dtype}")
+        if element is not None:
+            found = self.ruleset.element(element)
+            if found is None:
+                raise KeyError(
+                    f"no element `{element}`; {'; '.join(suggest(element, self.elements, 'elements'))}"
+                )
+            fresh = self.world(torch.full_like(world.ids, found.id)).state
+            state = {
+                name: torch.where(mask[:, None] if slot.planes == 2 else mask, fresh[name], world.state[name])
+                if slot.travels
+                else world.state[name]
+                for name, slot in self._slots.items()
+            }
+            world = replace(world, state=state)
+        for name, value in fields.items():
+            if name not in self._slots:
+                self.read(world, name)
+                raise ValueError(f"`{name}` follows from the element: it cannot be painted")
+            slot = self._slots[name]
+            old = world.state[name]
+            new = self._shaped(value, name, world.shape, slot.planes == 2)
+            painted = torch.where(
+                mask[:, None] if slot.planes == 2 else mask, new.to(torch.float64), old.to(torch.float64)
+            )
+            world = self.replace(world, **{name: painted})
+        return world
+
+    # Running
+
+    def step(
+        self,
+        world: World,
+        steps: int = 1,
+        *,
+        random: Mapping[str, Any] | None = None,
+        passes: Sequence[str] | None = None,
+        params: Mapping[str, Any] | None = None,
+        reuse: bool = False,
+    ) -> World:
+        """The world some steps later; the argument stays as it was.
+
+        Args:
+            steps: how many, 0 or more.
+            random: draws to use instead of our own, by stream: [B, H, W] in [0, 1). A draw r counts as the draw of
+                the stream's resolution that it falls into. The same draws serve every step.
+            passes: run only these passes, in the ruleset's order.
+            params: parameter values for this call, one number each or [B] values, one a world.
+            reuse: the memory of `world` may be written to, and it must not be used afterwards: saves a copy.
+
+        Raises:
+            KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
+        """
+        if not isinstance(world, World):
+            raise TypeError(f"world must be a World, found {type(world).__name__}")
+        if isinstance(passes, str):
+            raise TypeError(f"passes takes a list of names: [{passes!r}]")
+        for name, given in (("random", random), ("params", params)):
+            if given is not None and not isinstance(given, Mapping):
+                raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
+        if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
+            raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
+        steps = _whole(steps, "steps")
+        unknown = [name for name in passes or () if name not in self.passes]
+        if unknown:
+            raise KeyError(f"no pass `{unknown[0]}`; {'; '.join(suggest(unknown[0], self.passes, 'passes'))}")
+        draws = self._draws(random or {}, world)
+        chosen = None if passes is None else frozenset(passes)
+        clock = (world.seed, world.index, world.step)
+        job = Job(world.state, clock, steps, self.parameters(params or {}, len(world)), draws, chosen, reuse)
+        state = self._program.run(job)
+        return replace(world, sim=self, state=state, step=world.step + steps)
+
+    def profile(self, world: World, steps: int = 1) -> dict[str, float]:
+        """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot say.
+
+        Native code counts processor time on one thread, and is compiled once more for it.
+        """
+        clock = (world.seed, world.index, world.step)
+        job = Job(world.state, clock, _whole(steps, "steps"), self.parameters({}, len(world)), {}, None)
+        seconds = profile_of(self._program, job)
+        return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
+
+    def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Tensor]:
+        """Draws as whole numbers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
+        bits = {stream.name: stream.bits for stream in self.ruleset.streams}
+        draws = {}
+        for name, value in random.items():
+            if name not in bits:
+                raise KeyError(f"no stream `{name}`; {'; '.join(suggest(name, bits, 'streams'))}")
+            tensor = self._shaped(value, f"random[{name!r}]", world.shape, False).to(torch.float64)
+            if not bool(((tensor >= 0) & (tensor < 1)).all()):
+                raise ValueError(f"random[{name!r}] must lie in [0, 1)")
+            draws[name] = (tensor * float(1 << bits[name])).floor().to(torch.int64)
+        return draws
+
+    def _default_params(self, batch: int) -> dict[str, Tensor]:
+        """The defaults as [B] tensors; the same tensors for the same batch size, which programs may rely on."""
+        if self._defaults is None or self._defaults[0] != batch:
+            full = partial(torch.full, (batch,), dtype=torch.float64, device=self.device)
+            self._defaults = (batch, {p.name: full(float(p.default)) for p in self.ruleset.params})
+        return self._defaults[1]
+
+    def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Tensor]:
+        """All parameters as float64 [B], those given as they are. Raises KeyError, TypeError, ValueError."""
+        known = {param.name: param for param in self.ruleset.params}
+        values = dict(self._default_params(batch))
+        for name, value in params.items():
+            if name not in known:
+                raise KeyError(f"no parameter `{name}`; {'; '.join(suggest(name, known, 'parameters'))}")
+            kind = known[name].kind
+            lo, hi = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
+            tensor = self._tensor(value, name).to(torch.float64)
+            if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) != batch):
+                raise ValueError(f"{name} takes one value or {batch}, found shape {list(tensor.shape)}")
+            if not bool(((tensor >= lo) & (tensor <= hi)).all()):
+                raise ValueError(f"{name} takes {lo:g}..{hi:g}")
+            if kind.name in ("int", "flag") and not bool((tensor == tensor.round()).all()):
+                raise ValueError(f"{name} takes whole numbers")
+            values[name] = tensor.expand(batch).clone()
+        return values
+
+
+def _whole(value: Any, name: str) -> int:
+    """A whole number of 0 or more, Python's or NumPy's."""
+    try:
+        number = index(value)
+    except TypeError:
+        number = -1
+    if number < 0 or isinstance(value, bool):
+        raise ValueError(f"{name} must be a whole number of 0 or more, found {value!r}")
+    return number
+
+
+def compile(
+    ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu", threads: int = 1
+) -> Simulator:
+    """A simulator that runs a ruleset.
+
+    Args:
+        ruleset: from `load` (or a name to load).
+        backend: one of `BACKENDS`; all give the same worlds, bit for bit.
+        device: a torch device: ``"cpu"``, ``"cuda"``, ``"cuda:1"``.
+        threads: for native code, which shares a batch out among them. Torch has its own setting.
+
+    Raises:
+        CompileError: PD701 if the backend or the device is not there.
+    """
+    model = load(ruleset) if isinstance(ruleset, str) else ruleset
+    if not isinstance(model, Ruleset):
+        raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
+    if backend not in BACKENDS:
+        reporter = Reporter()
+        reporter.error("PD701", f"no backend `{backend}`", None, helps=["backends: " + ", ".join(BACKENDS)])
+        raise CompileError(reporter.diagnostics)
+    return Simulator(model, backend, device, threads)

@@ -1,0 +1,220 @@
+"""What a checkpoint holds, checked before torch reads it: a small machine follows its pickle and builds nothing.
+
+torch's reader executes nothing either, but believes sizes: a storage of ten numbers may call itself a storage of a
+thousand million, a tensor may repeat one number without end, and containers may be nested until the stack overflows.
+Here only what `torch.save` writes of tensors, numbers, text, lists, tuples and dicts passes.
+"""
+
+from __future__ import annotations
+
+import io
+import pickletools
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+from powderdsl.system.archives import BadArchive, check_directory
+
+MAX_PICKLE = 1 << 20
+"""Bytes of what is not numbers in tensors."""
+MAX_RECORDS = 1 << 14
+MAX_DEPTH = 32
+
+_SIZES = {
+    "Byte": 1, "Char": 1, "Bool": 1, "Short": 2, "Half": 2, "BFloat16": 2, "Int": 4, "Float": 4, "Long": 8, "Double": 8,
+}  # fmt: skip
+_ORDERED, _TENSOR = "collections OrderedDict", "torch._utils _rebuild_tensor_v2"
+
+
+class NotSaved(Exception):
+    """What is in a file that no training saves."""
+
+
+@dataclass
+class _Node:
+    """A value. `kind`: ``atom``, ``tuple``, ``list``, ``dict``, ``ordered``, ``global``, ``storage`` or ``tensor``."""
+
+    kind: str
+    value: Any = None
+    depth: int = 0
+
+
+_ATOMS = frozenset(
+    [
+        "BINUNICODE",
+        "BININT",
+        "BININT1",
+        "BININT2",
+        "LONG1",
+        "LONG4",
+        "BINFLOAT",
+        "NONE",
+        "NEWTRUE",
+        "NEWFALSE",
+    ]
+)
+_COUNTS = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+_EMPTY = {"EMPTY_DICT": "dict", "EMPTY_LIST": "list", "EMPTY_TUPLE": "tuple"}
+_MARK = _Node("mark")
+
+
+def checked(data: bytes) -> io.BytesIO:
+    """A checkpoint with the same contents and nothing else, for `torch.load`.
+
+    Raises:
+        Exception: whatever is wrong with it: it is not an archive, or holds what no training saves.
+    """
+    file = io.BytesIO(data)
+    check_directory(file, MAX_RECORDS, 1 << 24)
+    clean = io.BytesIO()
+    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(clean, "w") as out:
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise BadArchive("its records are packed")
+        if sum(entry.file_size for entry in entries) > len(data):
+            raise BadArchive("its records overlap")
+        sizes = {entry.filename: entry.file_size for entry in entries}
+        if len(sizes) != len(entries):
+            raise BadArchive("two of its records have one name")
+        found = [name for name in sizes if name.count("/") == 1 and name.endswith("/data.pkl")]
+        if len(found) != 1 or sizes[found[0]] > MAX_PICKLE:
+            raise BadArchive("it has no description, or one that is too long")
+        prefix = found[0].removesuffix("data.pkl")
+        _Machine({name.removeprefix(f"{prefix}data/"): size for name, size in sizes.items()}).run(
+            archive.read(found[0])
+        )
+        for entry in entries:
+            out.writestr(zipfile.ZipInfo(entry.filename), archive.read(entry))
+    clean.seek(0)
+    return clean
+
+
+class _Machine:
+    """Follows the operations of a pickle. `records`: the bytes of each storage, by its name."""
+
+    def __init__(self, records: dict[str, int]):
+        self.records = records
+        self.stack: list[_Node] = []
+        self.memo: dict[int, _Node] = {}
+
+    def run(self, text: bytes) -> None:
+        argument: Any
+        for opcode, argument, _ in pickletools.genops(text):
+            name = opcode.name
+            if name in _ATOMS:
+                self.stack.append(_Node("atom", argument))
+            elif name in _EMPTY:
+                self.stack.append(_Node(_EMPTY[name], []))
+            elif name in _COUNTS:
+                self.push_tuple(self.pop(_COUNTS[name]))
+            elif name in ("BINPUT", "LONG_BINPUT"):
+                self.memo[argument] = self.stack[-1]
+            elif name in ("BINGET", "LONG_BINGET"):
+                self.stack.append(self.shared(argument))
+            elif name == "GLOBAL":
+                self.stack.append(_Node("global", argument))
+            elif name == "MARK":
+                self.stack.append(_MARK)
+            elif name in ("PROTO", "STOP"):
+                continue
+            elif name in _STEPS:
+                _STEPS[name](self)
+            else:
+                raise NotSaved(f"it uses {name}")
+
+    def shared(self, number: int) -> _Node:
+        found = self.memo[number]
+        if found.kind in ("list", "dict", "ordered"):
+            raise NotSaved("two of its values are one")
+        return found
+
+    def pop(self, count: int) -> list[_Node]:
+        found = self.stack[-count:]
+        if len(found) < count or _MARK in found:
+            raise NotSaved("it is cut off")
+        del self.stack[-count:]
+        return found
+
+    def pop_to_mark(self) -> list[_Node]:
+        found: list[_Node] = []
+        while self.stack[-1] is not _MARK:
+            found.append(self.stack.pop())
+        self.stack.pop()
+        return found[::-1]
+
+    def push_tuple(self, items: list[_Node]) -> None:
+        self.stack.append(self.holding(_Node("tuple", items), items))
+
+    def holding(self, node: _Node, items: list[_Node]) -> _Node:
+        """The node, as deep as with these items in it."""
+        node.depth = max([node.depth, *(1 + one.depth for one in items)])
+        if node.depth > MAX_DEPTH:
+            raise NotSaved("it is nested too deep")
+        return node
+
+    def fill(self, kinds: tuple[str, ...], items: list[_Node]) -> None:
+        target = self.stack[-1]
+        if target.kind not in kinds:
+            raise NotSaved("it fills what is no container")
+        if target.kind != "list":
+            keys = items[::2]
+            if len(items) % 2 or any(one.kind != "atom" for one in keys):
+                raise NotSaved("it has keys that are no words")
+            target.value += [one.value for one in keys]
+        self.holding(target, items)
+
+    def storage(self) -> None:
+        (found,) = self.pop(1)
+        what, kind, key, _, count = (one.value for one in found.value)
+        module, _, name = str(kind).partition(" ")
+        size = _SIZES.get(name.removesuffix("Storage"))
+        if what != "storage" or module != "torch" or size is None or type(count) is not int or count < 0:
+            raise NotSaved("it has a storage that is none")
+        if self.records.get(key) != count * size:
+            raise NotSaved(f"the storage {key} does not have the bytes that it says")
+        self.stack.append(_Node("storage", count))
+
+    def reduce(self) -> None:
+        function, arguments = self.pop(2)
+        if function.kind != "global" or arguments.kind != "tuple":
+            raise NotSaved("it calls what is no function")
+        if function.value == _ORDERED and not arguments.value:
+            self.stack.append(_Node("ordered", []))
+        elif function.value == _TENSOR:
+            self.stack.append(_tensor(arguments.value))
+        else:
+            raise NotSaved(f"it calls {function.value}")
+
+    def build(self) -> None:
+        target, state = self.pop(2)
+        # torch keeps the versions of modules so.
+        if target.kind != "ordered" or state.kind != "dict" or state.value != ["_metadata"]:
+            raise NotSaved("it sets attributes")
+        self.stack.append(target)
+
+
+def _tensor(arguments: list[_Node]) -> _Node:
+    """A tensor, if it lies in its storage and repeats nothing."""
+    storage, offset, shape, strides, *_ = arguments
+    numbers = [offset, *shape.value, *strides.value]
+    if storage.kind != "storage" or any(type(one.value) is not int or one.value < 0 for one in numbers):
+        raise NotSaved("it has a tensor that is none")
+    sides, steps = [one.value for one in shape.value], [one.value for one in strides.value]
+    last = offset.value + sum((side - 1) * step for side, step in zip(sides, steps, strict=True))
+    if prod(sides) > storage.value or (prod(sides) and last >= storage.value):
+        raise NotSaved("it has a tensor that is larger than its storage")
+    return _Node("tensor")
+
+
+_STEPS: dict[str, Callable[[_Machine], None]] = {
+    "TUPLE": lambda one: one.push_tuple(one.pop_to_mark()),
+    "APPEND": lambda one: one.fill(("list",), one.pop(1)),
+    "APPENDS": lambda one: one.fill(("list",), one.pop_to_mark()),
+    "SETITEM": lambda one: one.fill(("dict", "ordered"), one.pop(2)),
+    "SETITEMS": lambda one: one.fill(("dict", "ordered"), one.pop_to_mark()),
+    "BINPERSID": _Machine.storage,
+    "REDUCE": _Machine.reduce,
+    "BUILD": _Machine.build,
+}

@@ -1,0 +1,74 @@
+"""Writing files whole or not at all, and errors about files. `powderdsl.system.reading` reads them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from powderdsl.diagnostics import CompileError, Diagnostic, Label
+from powderdsl.system.reading import refuse_irregular
+from powderdsl.system.scratch import scratch_file
+
+
+def failure(
+    code: str, message: str, *, notes: tuple[str, ...] = (), helps: tuple[str, ...] = ()
+) -> CompileError:
+    """A single error without a place in a text: about a file, a picture, a size."""
+    return CompileError([Diagnostic(code, message, Label(None), notes=notes, helps=helps)])
+
+
+@contextmanager
+def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
+    """A temporary path beside `path`, with its suffix, that takes its place when the block ends well.
+
+    When the block fails or is interrupted, nothing is left and an older file stays as it was. When the process is
+    killed, the next one that writes to the folder removes what is left. Raises CompileError (PD613) if the file cannot
+    be written.
+
+    Args:
+        follow: for paths that the user named: a link stays a link, and the file that it leads to is replaced. Otherwise
+            the link itself is replaced, which may come from a stranger's folder.
+    """
+    target = destination(path, follow=follow)
+    with ExitStack() as stack:
+        try:
+            temporary = stack.enter_context(scratch_file(target))
+        except (OSError, ValueError) as error:
+            raise not_writable(path, error) from None
+        yield temporary
+        # Scratch files are private to their owner; an ordinary new file follows the umask.
+        temporary.chmod(0o666 & ~_umask())
+        try:
+            os.replace(temporary, target)
+        except OSError as error:
+            raise not_writable(path, error) from None
+
+
+def destination(path: Path, *, follow: bool) -> Path:
+    """Where a file of this name is written: the path itself, or where a link leads.
+
+    Raises:
+        CompileError: PD613 if a folder, a pipe, a socket or a device is there, or links form a loop.
+    """
+    try:
+        target = path.resolve() if follow and path.is_symlink() else path
+        if target.exists() and (follow or not path.is_symlink()):
+            refuse_irregular(target)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise not_writable(path, error) from None
+    return target
+
+
+def not_writable(path: Path, error: Exception) -> CompileError:
+    """PD613, with what the system said."""
+    reason = getattr(error, "strerror", None) or str(error)
+    return failure("PD613", f"cannot write {path}", notes=(reason,))
+
+
+def _umask() -> int:
+    # There is no way to read it but to set it.
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,1 @@
+"""Bit planes on NumPy's arrays."""

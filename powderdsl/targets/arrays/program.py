@@ -1,0 +1,169 @@
+"""Bit planes on the CPU: generated passes on NumPy's arrays, as many worlds at a time as fit the cache."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from powderdsl.ir.gates import width as planes_of
+from powderdsl.ir.ops import PassGraph, Program
+from powderdsl.targets.arrays.draws import Draws, base_keys
+from powderdsl.targets.arrays.kernels import ArrayKernels
+from powderdsl.targets.arrays.words import Array, pack, unpack
+from powderdsl.targets.dense.source import load_source
+from powderdsl.targets.job import Job
+from powderdsl.targets.laps import Laps, unwatched
+from powderdsl.targets.planes.quiet import quiet_pass, real_inputs
+from powderdsl.targets.planes.source import planes_pass_source
+
+GLANCE = 61
+"""One in so many reals is looked at before all are."""
+
+State = dict[str, Array]
+
+CHUNK = 1 << 17
+"""Cells worked on at a time: a float32 for each fits the second-level cache twice or more."""
+
+
+PassFunction = Callable[[ArrayKernels, State], State]
+
+
+def _function(pass_: PassGraph, number: int) -> PassFunction:
+    """A pass as a function; where its reals are all zero, a shorter one if there is one."""
+    full, quiet = _loaded(pass_, number), quiet_pass(pass_)
+    if quiet is None:
+        return full
+    short, slots = _loaded(quiet, number), real_inputs(pass_)
+
+    def either(kernels: ArrayKernels, state: State) -> State:
+        silent = all(_is_zero(state[slot]) for slot in slots)
+        return short(kernels, state) if silent else full(kernels, state)
+
+    return either
+
+
+def _loaded(pass_: PassGraph, number: int) -> PassFunction:
+    source, name, constants = planes_pass_source(pass_, number)
+    function: PassFunction = load_source(source, name, {k: np.float32(v) for k, v in constants.items()})
+    return function
+
+
+def _is_zero(reals: Array) -> bool:
+    bits = reals.reshape(-1).view(np.int32)
+    return not np.count_nonzero(bits[::GLANCE]) and not np.count_nonzero(bits)
+
+
+class ArrayProgram:
+    """A program on planes for the CPU.
+
+    Args:
+        program: the numeric program, whose slots are the state's.
+        planes: the same program from `ir.bits.lower_bits`.
+    """
+
+    def __init__(self, program: Program, planes: Program):
+        self._types = {slot.name: slot.type for slot in program.slots}
+        self._kinds = dict(program.params)
+        self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
+        self._idents = np.array([ident for _, ident, _ in program.streams], np.uint32)
+        self._resets = [slot for slot in planes.slots if slot.resets]
+        self._kept: tuple[tuple[int, int, int], dict[object, Array]] = ((0, 0, 0), {})
+        """The last shape of worlds, and what hangs on it only."""
+        self._functions = [(pass_.name, _function(pass_, i)) for i, pass_ in enumerate(planes.passes)]
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later in storage dtypes."""
+        return self._run(job, unwatched)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds that each pass takes over `job.steps`."""
+        laps = Laps(torch.device("cpu"))
+        self._run(job, laps)
+        return laps.passes()
+
+    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
+        batch, height, width = job.state["element"].shape
+        result = {name: torch.empty_like(old) for name, old in job.state.items()}
+        chunk = max(CHUNK // (height * width), 1)
+        functions = [(name, f) for name, f in self._functions if job.passes is None or name in job.passes]
+        with np.errstate(all="ignore"):
+            for start in range(0, batch, chunk):
+                some = slice(start, min(start + chunk, batch))
+                kernels = self._kernels(job, some, (height, some.stop - some.start, width))
+                state = self._unpack(job.state, some)
+                first = job.clock[2][some].numpy()
+                for i in range(job.steps):
+                    kernels.begin(first + i)
+                    self._reset(state, kernels)
+                    lap("")
+                    for name, function in functions:
+                        state.update(function(kernels, state))
+                        lap(name)
+                self._pack(state, result, some, kernels)
+        return result
+
+    def _kernels(self, job: Job, some: slice, shape: tuple[int, int, int]) -> ArrayKernels:
+        if self._kept[0] != shape:
+            self._kept = (shape, {"valid": pack(np.ones(shape, bool))})
+        lasting = self._kept[1]
+        valid = lasting["valid"]
+        seed, index, _ = (part[some].numpy() for part in job.clock)
+        given = {name: _rows_first(value[some]) for name, value in job.draws.items()}
+        draws = Draws(shape, valid, self._streams, given, base_keys(seed, index), self._idents, lasting)
+        return ArrayKernels(
+            shape, lambda name: job.params[name][some].numpy(), self._kinds, draws, lasting, valid
+        )
+
+    def _reset(self, state: State, kernels: ArrayKernels) -> None:
+        for slot in self._resets:
+            if slot.type.name == "flag":
+                state[slot.name] = kernels.valid if slot.default else kernels.zero
+            else:
+                state[slot.name] = np.full(kernels.shape, slot.default, np.float32)
+
+    def _unpack(self, stored: Mapping[str, Tensor], some: slice) -> State:
+        """Some worlds' state slots as planes."""
+        planes = {}
+        for name, type in self._types.items():
+            base, _, part = name.rpartition(".")
+            if part in ("row", "column") and base in stored:
+                planes[name] = _rows_first(stored[base][some, ("row", "column").index(part)])
+            elif type.name == "real":
+                planes[name] = _rows_first(stored[name][some])
+            elif type.name == "flag":
+                planes[name] = pack(_rows_first(stored[name][some]))
+            else:
+                value = _rows_first(stored[name][some])
+                for i in range(planes_of(type.lo, type.hi)[0]):
+                    planes[f"{name}:{i}"] = pack(
+                        value & value.dtype.type(1 << i) if i < 7 else value >> i & 1
+                    )
+        return planes
+
+    def _pack(self, state: State, result: Mapping[str, Tensor], some: slice, kernels: ArrayKernels) -> None:
+        """Planes as some worlds' state slots in storage dtypes."""
+        for name, tensor in result.items():
+            out = tensor.numpy()[some]
+            if out.ndim == 4:
+                for i, part in enumerate(("row", "column")):
+                    out[:, i] = state[f"{name}.{part}"].transpose(1, 0, 2)
+            elif self._types[name].name == "real":
+                out[...] = state[name].transpose(1, 0, 2)
+            elif self._types[name].name == "flag":
+                out[...] = unpack(state[name], kernels.width).transpose(1, 0, 2)
+            else:
+                count, signed = planes_of(self._types[name].lo, self._types[name].hi)
+                value = np.zeros(kernels.shape, f"u{out.itemsize}")
+                for i in range(count):
+                    bit = unpack(state[f"{name}:{i}"], kernels.width).astype(value.dtype, copy=False)
+                    weight = -1 << i if signed and i == count - 1 else 1 << i
+                    value += bit * value.dtype.type(weight % (1 << 8 * out.itemsize))
+                out[...] = value.view(out.dtype).transpose(1, 0, 2)
+
+
+def _rows_first(worlds: Tensor) -> Array:
+    """[B, H, W] as [H, B, W], copied."""
+    return np.array(worlds.numpy().transpose(1, 0, 2), order="C")

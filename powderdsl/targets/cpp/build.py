@@ -1,0 +1,239 @@
+"""Compile generated C++ and load what came of it: one shared library for each source, compiler and set of flags."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from powderdsl.system.interrupts import held_back
+from powderdsl.system.scratch import scratch_folder
+from powderdsl.system.user_cache import cache_folder
+from powderdsl.targets import cache
+from powderdsl.targets.cpp import compiler_guard
+from powderdsl.targets.cpp.compilers import Compiler, NoCompiler, find_compiler, flags_for, processor
+
+TIMEOUT = 600
+
+
+@dataclass(frozen=True)
+class Building:
+    """How much the compiler optimises (`-O0` to `-O3`), and the folder for libraries: None is the user's cache."""
+
+    level: str = "-O2"
+    folder: Path | None = None
+
+    def place(self) -> Path:
+        """The folder. Raises NoCompiler if there is none that is private to the user."""
+        try:
+            return self.folder or cache_folder("native")
+        except OSError as error:
+            raise NoCompiler(f"no folder for compiled code: {error}") from None
+
+
+FOR_USERS = Building()
+_building: ContextVar[Building] = ContextVar("building", default=FOR_USERS)
+
+
+@contextmanager
+def building(how: Building) -> Iterator[None]:
+    """Build so inside the block: a test of thousands of rulesets wants neither -O2 nor the user's cache."""
+    token = _building.set(how)
+    try:
+        yield
+    finally:
+        _building.reset(token)
+
+
+def current() -> Building:
+    """What `building` says."""
+    return _building.get()
+
+
+def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
+    """A hash of everything that a library depends on."""
+    program = shutil.which(compiler.command[0]) or ""
+    parts = (source, os.path.realpath(program), *compiler.command, compiler.version, *flags, processor())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+
+def build(source: str, ruleset: str = "") -> Path:
+    """The path of the library for a source, compiled unless it lies in the cache.
+
+    Safe with other processes and threads doing the same: one of them compiles, and the library appears whole or not at
+    all. A library that is damaged is compiled anew.
+
+    Args:
+        ruleset: a name for `powderdsl cache list`.
+
+    Raises:
+        NoCompiler: none was found, or it failed.
+    """
+    compiler, how = find_compiler(), current()
+    flags, folder = flags_for(compiler, how.level), how.place()
+    key = cache_key(source, compiler, flags)
+    found = cache.find(folder, key)
+    if found is not None:
+        return found
+    with cache.turn(folder, key):
+        try:
+            return cache.find(folder, key) or _compile(source, ruleset, compiler, flags, folder, key)
+        except OSError as error:
+            raise NoCompiler(f"no room for compiled code: {error}") from None
+
+
+def _compile(
+    source: str, ruleset: str, compiler: Compiler, flags: tuple[str, ...], folder: Path, key: str
+) -> Path:
+    cache.tidy(folder)
+    began, created = time.perf_counter(), time.time()
+    with scratch_folder(folder) as scratch:
+        unit, built = scratch / "program.cpp", scratch / "built"
+        unit.write_text(source, encoding="utf-8")
+        built.mkdir()
+        command = [*compiler.command, *flags, "-o", str(built / cache.LIBRARY), str(unit)]
+        status, said = run_guarded(command, scratch)
+        if status:
+            raise NoCompiler("\n".join([f"{compiler.command[0]} failed:", *said.splitlines()[:8]]))
+        about = {
+            "ruleset": ruleset,
+            "backend": "native",
+            "compiler": compiler.version,
+            "created": created,
+            "seconds": round(time.perf_counter() - began, 2),
+        }
+        return cache.add(folder, key, built, about)
+
+
+_running: dict[subprocess.Popen[bytes], Path] = {}
+_lock = threading.Lock()
+
+
+def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
+    """Exit code and messages of a command that never outlives this process.
+
+    Args:
+        scratch: a folder for its temporary files, which goes when this process ends in between.
+
+    Raises:
+        NoCompiler: it cannot be started, or takes longer than TIMEOUT.
+    """
+    # In a program frozen into one file, sys.executable is that program: there nothing guards.
+    frozen = getattr(sys, "frozen", False) or not sys.executable
+    guard = [] if frozen else [sys.executable, "-I", "-S", compiler_guard.__file__]
+    # Nothing is ever written: the guard waits until the last process that has our end is gone.
+    theirs, ours = os.pipe()
+    process: subprocess.Popen[bytes] | None = None
+    try:
+        with held_back():
+            try:
+                process = subprocess.Popen(
+                    [*guard, *command],
+                    stdin=theirs,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.PIPE,
+                    env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
+                    start_new_session=True,
+                )
+            except OSError as error:
+                raise NoCompiler(f"{command[0]} could not be run: {error}") from None
+            finally:
+                os.close(theirs)
+            with _lock:
+                _running[process] = scratch
+        said = process.communicate(timeout=TIMEOUT)[1].decode(errors="replace")
+    except subprocess.TimeoutExpired:
+        raise NoCompiler(f"{command[0]} took longer than {TIMEOUT} s") from None
+    finally:
+        if process is not None:
+            _end(process)
+            with _lock:
+                _running.pop(process, None)
+        os.close(ours)
+    return process.returncode, said
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a guard that still runs, and all that it has started; reap it."""
+    if process.poll() is None:
+        with suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@atexit.register
+def _end_all() -> None:
+    with _lock:
+        running = dict(_running)
+    for process, scratch in running.items():
+        _end(process)
+        shutil.rmtree(scratch, ignore_errors=True)  # the thread that waits for it is no longer run
+
+
+def _forget() -> None:
+    """In a fork: what the parent runs is none of our business."""
+    global _lock
+    _lock = threading.Lock()
+    _running.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+def open_library(source: str, ruleset: str = "") -> tuple[Path, ctypes.CDLL]:
+    """The library of a source, built if need be. Raises NoCompiler."""
+    path = build(source, ruleset)
+    try:
+        return path, load_library(path)
+    except OSError:  # another process has just thrown it away; or it cannot be loaded at all
+        path = build(source, ruleset)
+    try:
+        return path, load_library(path)
+    except OSError as error:
+        raise NoCompiler(f"compiled code cannot be loaded: {error}") from None
+
+
+@lru_cache(maxsize=64)
+def load_library(path: Path) -> ctypes.CDLL:
+    """The library, loaded once a process, its functions declared."""
+    library = ctypes.CDLL(str(path))
+    pointer, integer, long = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
+    signatures = {
+        "pd_new": (pointer, [integer, integer, integer]),
+        "pd_free": (None, [pointer]),
+        "pd_copy": (pointer, [pointer]),
+        "pd_load": (None, [pointer, integer, integer, integer, pointer]),
+        "pd_store": (None, [pointer, integer, integer, integer, integer, pointer, long]),
+        "pd_load_real": (None, [pointer, integer, pointer, long]),
+        "pd_put": (None, [pointer, integer, integer, integer, integer, pointer, pointer]),
+        "pd_put_real": (None, [pointer, integer, integer, pointer, pointer]),
+        "pd_fill": (None, [pointer, integer, integer, pointer, pointer]),
+        "pd_fill_real": (None, [pointer, integer, pointer, pointer]),
+        "pd_store_real": (None, [pointer, integer, pointer, long]),
+        "pd_rgb": (None, [pointer, integer, integer, pointer, pointer, long]),
+        "pd_ramp": (None, [pointer, *[integer] * 8, pointer, pointer, pointer, long]),
+        "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
+        "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
+        "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
+        "pd_run": (None, [pointer, long, integer, pointer, pointer, pointer, pointer, pointer]),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    if hasattr(library, "pd_profile"):  # only where it was built with clocks
+        library.pd_profile.restype, library.pd_profile.argtypes = None, [pointer]
+    return library

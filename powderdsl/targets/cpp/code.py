@@ -1,0 +1,96 @@
+"""A program as compiled C++ and what its callers must know: enough to run it again without lowering anything."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from powderdsl.ir.ops import Program, Type
+from powderdsl.targets import cache
+from powderdsl.targets.cpp.build import current, open_library
+from powderdsl.targets.cpp.source import native_source
+from powderdsl.targets.layout import Layout
+
+
+@dataclass(frozen=True)
+class NativeCode:
+    """A library, where its slots and parameters lie, the type of each slot, the kind of each parameter, the passes."""
+
+    library: Path
+    layout: Layout
+    types: Mapping[str, Type]
+    kinds: Mapping[str, str]
+    passes: tuple[str, ...]
+
+
+def compile_program(program: Program, planes: Program, *, clocks: bool = False) -> NativeCode:
+    """Write a program as C++ and compile it.
+
+    Args:
+        program: the numeric program, whose slots are the state's.
+        planes: the same program from `ir.bits.lower_bits`.
+        clocks: count the time of each pass.
+
+    Raises:
+        NoCompiler: there is no C++ compiler, or it failed.
+    """
+    source, layout = native_source(planes)
+    library, _ = open_library(f"#define PROFILE\n{source}" if clocks else source, program.name)
+    types = {slot.name: slot.type for slot in program.slots}
+    return NativeCode(library, layout, types, dict(program.params), tuple(p.name for p in planes.passes))
+
+
+def recall(key: str) -> NativeCode | None:
+    """The code that was remembered under a key, if its library is still there. Raises NoCompiler without a cache."""
+    folder = current().place()
+    kept = cache.read_object(folder / f"{key}.json")
+    try:
+        if kept is None or kept.pop("sha256") != _digest(kept):
+            return None
+        library = cache.find(folder, kept["library"])
+        return None if library is None else _decode(kept, library)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None  # damaged: it will be written anew
+
+
+def remember(key: str, code: NativeCode) -> None:
+    """Keep what a program needs besides its library. A cache that cannot be written only costs time."""
+    try:
+        kept = _encode(code)
+        cache.write_json(current().place() / f"{key}.json", {**kept, "sha256": _digest(kept)})
+    except OSError:
+        return
+
+
+def _digest(kept: dict[str, Any]) -> str:
+    """A hash that tells whether a file is as it was written: where its numbers point, native code reads and writes."""
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def _encode(code: NativeCode) -> dict[str, Any]:
+    """As JSON. Tables are lists of pairs: their keys are tuples."""
+    layout = {f.name: getattr(code.layout, f.name) for f in fields(Layout)}
+    return {
+        "library": code.library.parent.name,
+        "layout": {k: list(v.items()) if isinstance(v, dict) else v for k, v in layout.items()},
+        "types": {name: asdict(type) for name, type in code.types.items()},
+        "kinds": dict(code.kinds),
+        "passes": list(code.passes),
+    }
+
+
+def _decode(kept: dict[str, Any], library: Path) -> NativeCode:
+    tables: dict[str, Any] = {
+        name: {_key(key): number for key, number in value} if isinstance(value, list) else value
+        for name, value in kept["layout"].items()
+    }
+    types = {name: Type(**value) for name, value in kept["types"].items()}
+    return NativeCode(library, Layout(**tables), types, kept["kinds"], tuple(kept["passes"]))
+
+
+def _key(key: Any) -> Any:
+    return tuple(key) if isinstance(key, list) else key

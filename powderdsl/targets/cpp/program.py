@@ -1,0 +1,245 @@
+"""The native backend behind the common signature: worlds stay packed between calls, arrays are made when asked for."""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from powderdsl.ir.gates import width as planes_of
+from powderdsl.targets.cpp.build import load_library
+from powderdsl.targets.cpp.code import NativeCode
+from powderdsl.targets.dense.program import Kernels
+from powderdsl.targets.job import Job
+
+
+class PackedState(Mapping[str, Tensor]):
+    """A batch's state in native memory. Slots are unpacked into tensors one by one, when they are first read."""
+
+    def __init__(
+        self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
+    ):
+        self.program, self.like = program, like
+        self._handle: int | None = handle
+        self._tensors: dict[str, Tensor] = {}
+        self._free = weakref.finalize(self, program.library.pd_free, handle)
+
+    @property
+    def handle(self) -> int:
+        """The batch in native memory. Raises RuntimeError once it has been taken."""
+        if self._handle is None:
+            raise RuntimeError(
+                "these worlds were stepped with `reuse`: only those that came of it can be used"
+            )
+        return self._handle
+
+    def take(self) -> int:
+        """The batch, for another to own; this state must not be used afterwards."""
+        handle, self._handle = self.handle, None
+        self._free.detach()
+        self._tensors.clear()
+        return handle
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._tensors:
+            dtype, shape = self.like[name]
+            self._tensors[name] = self.write(name, torch.empty(shape, dtype=dtype))
+        return self._tensors[name]
+
+    def has(self, name: str) -> bool:
+        """Whether a slot's tensor is there already."""
+        return name in self._tensors
+
+    def write(self, name: str, out: Tensor) -> Tensor:
+        """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
+        program = self.program
+        if out.dtype == torch.float32:
+            for i, part in enumerate(self._parts(name)):
+                first = out[:, i] if out.ndim == 4 else out
+                program.library.pd_store_real(
+                    self.handle, program.layout.reals[part], address(first), out.stride(0)
+                )
+        else:
+            slot, bits, signed = program.planes_of(name)
+            program.library.pd_store(
+                self.handle, slot, bits, signed, out.element_size(), address(out), out.stride(0)
+            )
+        return out
+
+    def _parts(self, name: str) -> tuple[str, ...]:
+        """The reals of a slot: two of a vector."""
+        return (f"{name}.row", f"{name}.column") if len(self.like[name][1]) == 4 else (name,)
+
+    def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
+        """The state with one box of cells in each world filled, without unpacking the rest.
+
+        Args:
+            boxes: int64 [B, 4]: first row, the one after the last, first column, the one after the last, all within
+                the grid; empty where nothing changes.
+            values: by slot: int64 [B], float32 [B] for reals, float32 [B, 2] for vectors.
+            reuse: write to this state itself, and return it.
+        """
+        program = self.program
+        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        boxes = boxes.contiguous()
+        for name, value in values.items():
+            changed._tensors.pop(name, None)
+            if value.is_floating_point():
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 2 else (name,)
+                for part, numbers in zip(parts, value.T if value.ndim == 2 else value[None], strict=True):
+                    numbers = numbers.contiguous()
+                    slot = program.layout.reals[part]
+                    program.library.pd_fill_real(changed.handle, slot, address(boxes), address(numbers))
+            else:
+                value = value.contiguous()
+                slot, bits, _ = program.planes_of(name)
+                program.library.pd_fill(changed.handle, slot, bits, address(boxes), address(value))
+        return changed
+
+    def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
+        """The state with the worlds `places`, int64 [n], replaced by those of another state of n worlds.
+
+        `reuse`: write to this state itself, and return it.
+        """
+        program = self.program
+        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        changed._tensors.clear()
+        places, count = places.contiguous(), len(places)
+        for name, value in state.items():
+            if value.dtype == torch.float32:
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
+                for i, part in enumerate(parts):
+                    plane = (value[:, i] if value.ndim == 4 else value).contiguous()
+                    number = program.layout.reals[part]
+                    program.library.pd_put_real(
+                        changed.handle, number, count, address(places), address(plane)
+                    )
+            else:
+                plane = value.contiguous()
+                slot, bits, _ = program.planes_of(name)
+                item = plane.element_size()
+                program.library.pd_put(
+                    changed.handle, slot, bits, item, count, address(places), address(plane)
+                )
+        return changed
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.like)
+
+    def __len__(self) -> int:
+        return len(self.like)
+
+
+class NativeProgram:
+    """A program as compiled C++.
+
+    Args:
+        with_clocks: the same code that counts the time of each pass, made when `profile` asks for it.
+    """
+
+    def __init__(self, code: NativeCode, threads: int, with_clocks: Callable[[], NativeCode]):
+        self.library = load_library(code.library)
+        self.layout, self.threads = code.layout, threads
+        self._types, self._kinds, self._passes = code.types, code.kinds, code.passes
+        self._clocks = with_clocks
+        self._with_clocks: NativeProgram | None = None
+        self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later. Given draws and chosen passes are for other backends."""
+        assert not job.draws
+        assert job.passes is None
+        seed, index, start = (part.contiguous() for part in job.clock)
+        batch = len(seed)
+        if isinstance(job.state, PackedState) and job.state.program is self:
+            handle = job.state.take() if job.reuse else self.library.pd_copy(job.state.handle)
+            like = job.state.like
+        else:
+            handle, like = self._pack(job.state)
+        planes, reals = self._parameters(job.params, batch)
+        packed = PackedState(self, handle, like)
+        self.library.pd_run(
+            handle,
+            job.steps,
+            self.threads,
+            address(seed),
+            address(index),
+            address(start),
+            address(planes),
+            address(reals),
+        )
+        return packed
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds of processor time by pass over `job.steps`, on one thread.
+
+        The first call compiles the program once more, with clocks in it. Raises NoCompiler if that fails.
+        """
+        if self._with_clocks is None:
+            self._with_clocks = NativeProgram(self._clocks(), 1, self._clocks)
+        seconds = (ctypes.c_double * len(self._passes))()
+        library = self._with_clocks.library
+        library.pd_profile(seconds)  # what earlier runs have left
+        self._with_clocks.run(job)
+        library.pd_profile(seconds)
+        return dict(zip(self._passes, seconds, strict=True))
+
+    def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
+        """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
+        key = tuple(params.values())
+        last = self._last  # another thread may write it
+        if (
+            last is not None
+            and len(key) == len(last[0])
+            and all(a is b for a, b in zip(key, last[0], strict=True))
+        ):
+            return last[1]
+        planes = torch.zeros(max(1, len(self.layout.param_planes)), batch, dtype=torch.uint8)
+        views: dict[tuple[str, str], Tensor] = {}
+        for (name, how, bit), number in self.layout.param_planes.items():
+            kind = self._kinds[name] if how == "value" else how
+            if (name, kind) not in views:
+                views[name, kind] = Kernels.param_view(params[name], kind).to(torch.int64)
+            planes[number] = (views[name, kind] >> bit) & 1
+        reals = torch.zeros(max(1, len(self.layout.param_reals)), batch, dtype=torch.float32)
+        for name, number in self.layout.param_reals.items():
+            reals[number] = params[name].to(torch.float32)
+        self._last = (key, (planes, reals))
+        return planes, reals
+
+    def _pack(
+        self, state: Mapping[str, Tensor]
+    ) -> tuple[int, dict[str, tuple[torch.dtype, tuple[int, ...]]]]:
+        batch, height, width = state["element"].shape
+        handle = self.library.pd_new(batch, height, width)
+        like = {}
+        for name, value in state.items():
+            value = value.contiguous()
+            like[name] = (value.dtype, tuple(value.shape))
+            if value.dtype == torch.float32:
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
+                for i, part in enumerate(parts):
+                    first = value[:, i] if value.ndim == 4 else value
+                    self.library.pd_load_real(
+                        handle, self.layout.reals[part], address(first), value.stride(0)
+                    )
+            else:
+                slot, bits, _ = self.planes_of(name)
+                self.library.pd_load(handle, slot, bits, value.element_size(), address(value))
+        return handle, like
+
+    def planes_of(self, name: str) -> tuple[int, int, bool]:
+        """First plane of a slot, number of planes, and whether the last is a sign."""
+        type = self._types[name]
+        if type.name == "flag":
+            return self.layout.planes[name], 1, False
+        bits, signed = planes_of(type.lo, type.hi)
+        return self.layout.planes[f"{name}:0"], bits, signed
+
+
+def address(tensor: Tensor) -> ctypes.c_void_p:
+    """Where a tensor's data begin, for C."""
+    return ctypes.c_void_p(tensor.data_ptr())

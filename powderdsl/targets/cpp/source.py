@@ -1,0 +1,81 @@
+"""IR on planes -> C++ for a whole program: moments guarded by their masks, planes in loops, reals in row sweeps."""
+
+from __future__ import annotations
+
+from functools import reduce
+from importlib.resources import files
+from operator import or_
+
+from powderdsl.ir.ops import Program
+from powderdsl.targets.cpp.passes import PassWriter
+from powderdsl.targets.cpp.presence import look
+from powderdsl.targets.layout import Layout, layout_of, literal
+
+GENERATOR_VERSION = 5
+"""Part of every cache key: raise it when generated code changes meaning."""
+
+LIBRARY = ("vectors", "runtime", "planes", "fields")
+"""What stands before the generated passes, in this order: *.hpp."""
+DRIVER = ("driver", "views")
+"""What stands behind them."""
+
+SNAP = 2.0**-20
+
+
+def native_source(program: Program) -> tuple[str, Layout]:
+    """The whole translation unit, and its layout."""
+    layout = layout_of(program)
+    writers = [PassWriter(p, i, layout) for i, p in enumerate(program.passes)]
+    passes = [writer.source() for writer in writers]
+    asked = reduce(or_, (writer.asked for writer in writers), 0)
+    calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
+    resets = [
+        (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
+        for slot in program.slots
+        if slot.resets
+    ]
+    reset_planes = [f"{{{plane}, {int(slot.default)}}}" for slot, plane, _ in resets if plane is not None]
+    reset_reals = [
+        f"{{{real}, {literal(float(slot.default))}}}" for slot, _, real in resets if real is not None
+    ]
+    step_table = [f"{{{a}, {b}}}" for a, b in layout.step_planes]
+    fixed = [f"{{{k}, {a}, {b}}}" for k, a, b in layout.fixed]
+    idents = [f"{ident}u" for _, ident, _ in program.streams]
+    head = "\n".join([
+        f"// {len(program.passes)} passes, generated; version {GENERATOR_VERSION}",
+        f"#define STREAMS {len(layout.streams)}",
+        f"#define STEP_PLANES {len(layout.step_planes)}",
+        f"#define PARAM_PLANES {len(layout.param_planes)}",
+        f"#define PARAM_REALS {len(layout.param_reals)}",
+        f"#define SLOTS {len(layout.planes)}",
+        f"#define REALS {len(layout.reals)}",
+        f"#define MOVING {layout.moving}",
+        f"#define ACTIVE {layout.active}",
+        f"#define REACH {layout.reach}",
+        f"#define REAL_ROWS {layout.rows}",
+        f"#define HALO {layout.halo}",
+        f"#define AROUND_ROWS {layout.around}",
+        f"#define BEYOND_ROWS {layout.beyond}",
+        f"#define SNAP {literal(SNAP)}",
+        f"#define PASSES {len(program.passes)}",
+    ])  # fmt: skip
+    tables = "\n".join([
+        "struct ResetPlane { int slot; bool value; };",
+        "struct ResetReal { int slot; float value; };",
+        "struct FixedPlane { int kind, a, b; };",
+        "struct StepPlane { u64 a; int b; };",
+        f"static const std::vector<ResetPlane> RESET_PLANES = {{{', '.join(reset_planes)}}};",
+        f"static const std::vector<ResetReal> RESET_REALS = {{{', '.join(reset_reals)}}};",
+        f"static const std::vector<FixedPlane> FIXED = {{{', '.join(fixed)}}};",
+        f"static const std::vector<StepPlane> STEP_TABLE = {{{', '.join(step_table)}}};",
+        f"static const std::vector<u32> STREAM_IDENT = {{{', '.join(idents)}}};",
+    ])  # fmt: skip
+    folder = files("powderdsl.targets.cpp")
+    before, after = (
+        "\n".join((folder / f"{part}.hpp").read_text(encoding="utf-8") for part in parts)
+        for parts in (LIBRARY, DRIVER)
+    )
+    body = "\n\n".join(passes)
+    known = "  if (c.present == ~0ull) look(c);\n" if asked else ""
+    step = f"{look(layout, asked)}\nstatic void run_passes(Context& c) {{\n  START;\n{known}{calls}\n}}"
+    return "\n".join([head, before, tables, body, step, after]), layout

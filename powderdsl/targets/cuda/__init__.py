@@ -1,0 +1,1 @@
+"""Bit planes as CUDA C++, compiled on the user's machine."""

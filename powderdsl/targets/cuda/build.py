@@ -1,0 +1,189 @@
+"""NVRTC and the CUDA driver through ctypes: kernels compiled on the user's machine, kept in the cache, launched on a stream.
+
+NVRTC is the one that torch brings along, so no toolkit has to be installed. torch itself is not imported here: it has
+made its context current before anything of this is called.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import hashlib
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from powderdsl.system.scratch import scratch_folder
+from powderdsl.system.user_cache import cache_folder
+from powderdsl.targets import cache as native_cache
+from powderdsl.targets.cuda.source import KernelSource
+
+OPTIONS = ("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true", "--ftz=false", "-w")
+"""No contraction and no flushing: every operation is rounded by itself, so that all backends agree bit for bit."""
+
+ENTRY = b"powderdsl_steps"
+_SHARED_LIMIT, _MAJOR, _MINOR = 97, 75, 76
+_DYNAMIC_SHARED = 8
+"""Numbers of attributes in the driver's interface."""
+
+
+class NoCuda(Exception):
+    """No CUDA device, driver or NVRTC that works was found; the message says what."""
+
+
+class Worlds(ctypes.Structure):
+    """The kernel's argument, as `driver.cuh` has it."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("planes", "reals", "scratch", "seed", "index", "step", "flags", "numbers")),
+        ("worlds", ctypes.c_int),
+        ("steps", ctypes.c_int),
+    )  # fmt: skip
+
+
+@cache
+def driver() -> ctypes.CDLL:
+    """The CUDA driver. Raises NoCuda."""
+    name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+    try:
+        return ctypes.CDLL(name)
+    except OSError as error:
+        raise NoCuda(f"no CUDA driver: {error}") from None
+
+
+@cache
+def nvrtc(version: str) -> ctypes.CDLL:
+    """NVRTC of a CUDA version such as ``13.0``: one that is loaded, on the library path or in a package. Raises NoCuda."""
+    major = version.split(".")[0]
+    if sys.platform == "win32":
+        names, pattern = [f"nvrtc64_{major}0_0.dll"], f"nvrtc64_{major}*.dll"
+    else:
+        names, pattern = [f"libnvrtc.so.{major}"], f"libnvrtc.so.{major}*"
+    for folder in sys.path:
+        for place in ("nvidia/*/lib", "nvidia/*/bin", "nvidia/*/bin/*", "torch/lib"):
+            names += sorted(glob.glob(str(Path(folder or ".") / place / pattern)))
+    for name in names:
+        try:
+            for beside in glob.glob(str(Path(name).parent / "libnvrtc-builtins.so.*")) if "/" in name else ():
+                ctypes.CDLL(beside)  # NVRTC opens it by name, and does not look beside itself
+            return ctypes.CDLL(name)
+        except OSError:
+            continue
+    raise NoCuda(f"no NVRTC of CUDA {version}: `pip install nvidia-cuda-nvrtc`, or reinstall torch")
+
+
+def check(code: int, what: str) -> None:
+    """Raises NoCuda unless a call of the driver went well."""
+    if code:
+        text = ctypes.c_char_p()
+        driver().cuGetErrorString(code, ctypes.byref(text))
+        raise NoCuda(f"{what}: {(text.value or b'unknown error').decode()} ({code})")
+
+
+def device_attribute(device: int, number: int) -> int:
+    """A property of a device, by its number in the driver's interface. Raises NoCuda."""
+    value, handle = ctypes.c_int(), ctypes.c_int()
+    check(driver().cuInit(0), "the CUDA driver does not start")
+    check(driver().cuDeviceGet(ctypes.byref(handle), device), f"no CUDA device {device}")
+    check(driver().cuDeviceGetAttribute(ctypes.byref(value), number, handle), "a question to the device")
+    return value.value
+
+
+def shared_limit(device: int) -> int:
+    """Bytes of shared memory that a block may have on a device. Raises NoCuda."""
+    return device_attribute(device, _SHARED_LIMIT)
+
+
+def architecture(device: int) -> str:
+    """``sm_90`` and the like. Raises NoCuda."""
+    return f"sm_{device_attribute(device, _MAJOR)}{device_attribute(device, _MINOR)}"
+
+
+def machine_code(source: KernelSource, architecture: str, version: str) -> bytes:
+    """A kernel's machine code, from the cache or compiled now.
+
+    Safe with other processes doing the same: a file appears under its name whole, or not at all.
+
+    Raises:
+        NoCuda: NVRTC is missing or failed, or there is no folder for the cache.
+    """
+    compiler = nvrtc(version)
+    major, minor = ctypes.c_int(), ctypes.c_int()
+    compiler.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
+    options = (f"--gpu-architecture={architecture}", *OPTIONS)
+    key = "\0".join([source.text, f"{major.value}.{minor.value}", *options])
+    try:
+        folder = cache_folder("native")
+    except OSError as error:
+        raise NoCuda(f"no cache folder: {error}") from None
+    name = hashlib.sha256(key.encode()).hexdigest()[:32]
+    found = native_cache.find(folder, name)
+    if found is not None:
+        return found.read_bytes()
+    began = time.perf_counter()
+    code = compile_text(compiler, source.text, options)
+    with suppress(OSError), scratch_folder(folder) as scratch:
+        built = scratch / "built"
+        built.mkdir()
+        (built / native_cache.LIBRARY).write_bytes(code)
+        about = {
+            "ruleset": source.name,
+            "backend": "cuda",
+            "compiler": f"NVRTC {major.value}.{minor.value} for {architecture}",
+            "created": time.time(),
+            "seconds": round(time.perf_counter() - began, 2),
+        }
+        native_cache.add(folder, name, built, about)
+    return code
+
+
+def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> bytes:
+    """Machine code of a source by NVRTC. Raises NoCuda with the first lines of what it says."""
+    program, size = ctypes.c_void_p(), ctypes.c_size_t()
+    created = compiler.nvrtcCreateProgram(
+        ctypes.byref(program), text.encode(), b"powderdsl.cu", 0, None, None
+    )
+    if created:
+        raise NoCuda(f"NVRTC does not start ({created})")
+    try:
+        given = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
+        if compiler.nvrtcCompileProgram(program, len(options), given):
+            compiler.nvrtcGetProgramLogSize(program, ctypes.byref(size))
+            log = ctypes.create_string_buffer(size.value)
+            compiler.nvrtcGetProgramLog(program, log)
+            raise NoCuda("NVRTC failed:\n" + "\n".join(log.value.decode(errors="replace").splitlines()[:8]))
+        if compiler.nvrtcGetCUBINSize(program, ctypes.byref(size)):
+            raise NoCuda("NVRTC made no machine code")
+        code = ctypes.create_string_buffer(size.value)
+        compiler.nvrtcGetCUBIN(program, code)
+        return code.raw
+    finally:
+        compiler.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+Start = Callable[[Worlds, int, int], None]
+"""Puts a kernel on a stream: its argument, blocks, and the stream's address."""
+
+
+def load_kernel(code: bytes, source: KernelSource) -> Start:
+    """A kernel from machine code, in the context that is current. It stays loaded. Raises NoCuda."""
+    cuda = driver()
+    module, function = ctypes.c_void_p(), ctypes.c_void_p()
+    check(cuda.cuModuleLoadData(ctypes.byref(module), code), "a kernel could not be loaded")
+    check(cuda.cuModuleGetFunction(ctypes.byref(function), module, ENTRY), "a kernel has no entry")
+    check(
+        cuda.cuFuncSetAttribute(function, _DYNAMIC_SHARED, source.shared),
+        f"{source.shared} bytes of shared memory",
+    )
+
+    def start(worlds: Worlds, blocks: int, stream: int) -> None:
+        arguments = (ctypes.c_void_p * 1)(ctypes.cast(ctypes.byref(worlds), ctypes.c_void_p))
+        code = cuda.cuLaunchKernel(
+            function, blocks, 1, 1, source.threads, 1, 1, source.shared, ctypes.c_void_p(stream), arguments, None
+        )  # fmt: skip
+        check(code, "a kernel could not be started")
+
+    return start

@@ -1,0 +1,261 @@
+"""The cuda backend behind the common signature: packed worlds on the device, one launch for all steps of a call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.ir.gates import width as planes_of
+from powderdsl.ir.ops import Program, SlotType
+from powderdsl.targets import words as torch_words
+from powderdsl.targets.cuda import build
+from powderdsl.targets.cuda.source import KernelSource, cuda_source
+from powderdsl.targets.dense.mixed import Part, packed_program
+from powderdsl.targets.dense.program import Kernels
+from powderdsl.targets.job import Job
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What a kernel is launched with; tensors are contiguous and on its device."""
+
+    planes: Tensor
+    """int32 [B, slots, H, ⌈W/32⌉], changed in place."""
+    reals: Tensor
+    """float32 [B, reals, H, W], changed in place."""
+    scratch: Tensor
+    clock: tuple[Tensor, Tensor, Tensor]
+    flags: Tensor
+    """uint8 [n, B]: planes of parameters."""
+    numbers: Tensor
+    """float32 [m, B]: parameters as they are."""
+    steps: int
+    blocks: int
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All tensors in the kernel's order."""
+        return self.planes, self.reals, self.scratch, *self.clock, self.flags, self.numbers
+
+
+Launch = Callable[[Arguments], None]
+"""Runs a kernel on the current stream."""
+
+Compile = Callable[[KernelSource], Launch]
+"""Makes a kernel of its source, for one device."""
+
+
+def compiler_for(device: torch.device) -> Compile:
+    """Makes kernels for a CUDA device. What it returns raises CompileError (PD701) if that fails."""
+
+    def compile(source: KernelSource) -> Launch:
+        version = torch.version.cuda or ""
+        try:
+            with torch.cuda.device(device):
+                torch.empty(1, device=device)  # the context is there from now on
+                architecture = build.architecture(torch.cuda.current_device())
+                code = build.machine_code(source, architecture, version)
+                start = build.load_kernel(code, source)
+        except build.NoCuda as error:
+            raise refusal(str(error)) from None
+
+        def launch(arguments: Arguments) -> None:
+            with torch.cuda.device(device):
+                stream = torch.cuda.current_stream(device).cuda_stream
+                start(worlds_of(arguments), arguments.blocks, stream)
+
+        return launch
+
+    return compile
+
+
+def worlds_of(arguments: Arguments) -> build.Worlds:
+    """The arguments as the kernel takes them."""
+    addresses = (tensor.data_ptr() for tensor in arguments.tensors)
+    return build.Worlds(*addresses, len(arguments.clock[0]), arguments.steps)
+
+
+def cuda_program(program: Program, device: torch.device) -> Part:
+    """A program for a CUDA device; passes that planes cannot carry run on cells.
+
+    Raises:
+        CompileError: PD701 if there is no such device, driver or NVRTC.
+    """
+    problem = "its kernels run on a CUDA device" if device.type != "cuda" else ""
+    try:
+        if not problem:
+            with torch.cuda.device(device):
+                torch.empty(1, device=device)
+                limit = build.shared_limit(torch.cuda.current_device())
+            build.nvrtc(torch.version.cuda or "")
+            compile = compiler_for(device)
+            return packed_program(
+                program, device, lambda cells, planes: CudaProgram(cells, planes, compile, limit)
+            )
+    except build.NoCuda as error:
+        problem = str(error)
+    raise refusal(problem)
+
+
+def refusal(problem: str) -> CompileError:
+    """What a user reads where the backend cannot be had."""
+    reporter = Reporter()
+    helps = ["run on the device `cuda`, or on the backend `native` or `torch`"]
+    reporter.error(
+        "PD701", "the cuda backend is not available", None, notes=problem.splitlines(), helps=helps
+    )
+    return CompileError(reporter.diagnostics)
+
+
+class DeviceState(Mapping[str, Tensor]):
+    """A batch's state in packed tensors. Slots are unpacked one by one, when they are first read."""
+
+    def __init__(
+        self,
+        program: CudaProgram,
+        planes: Tensor,
+        reals: Tensor,
+        like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]],
+    ):
+        self.program, self.planes, self.reals, self.like = program, planes, reals, like
+        self._tensors: dict[str, Tensor] = {}
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._tensors:
+            self._tensors[name] = self.program.unpack(self, name)
+        return self._tensors[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.like)
+
+    def __len__(self) -> int:
+        return len(self.like)
+
+
+class CudaProgram:
+    """A program as kernels, one a size of grid.
+
+    Args:
+        program: the numeric program, whose slots are the state's.
+        planes: the same program from `ir.bits.lower_bits`.
+        compile: makes kernels for the device.
+        shared_limit: bytes of shared memory that a block may have there.
+    """
+
+    def __init__(self, program: Program, planes: Program, compile: Compile, shared_limit: int):
+        self._planes, self._compile, self._limit = planes, compile, shared_limit
+        self._slots: dict[str, SlotType] = {slot.name: slot for slot in program.slots}
+        self._kinds = dict(program.params)
+        self._kernels: dict[tuple[int, int], tuple[KernelSource, Launch]] = {}
+
+    def kernel(self, height: int, width: int) -> tuple[KernelSource, Launch]:
+        """The kernel for a size of grid, compiled on first use."""
+        if (height, width) not in self._kernels:
+            source = cuda_source(self._planes, height, width, self._limit)
+            self._kernels[height, width] = source, self._compile(source)
+        return self._kernels[height, width]
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later. Given draws and chosen passes are for other backends."""
+        assert not job.draws
+        assert job.passes is None
+        with torch.no_grad():
+            return self._run(job)
+
+    def _run(self, job: Job) -> DeviceState:
+        state = job.state
+        shape = state.like["element"][1] if isinstance(state, DeviceState) else state["element"].shape
+        batch, height, width = shape
+        source, launch = self.kernel(height, width)
+        after = (
+            self._copy(state)
+            if isinstance(state, DeviceState) and state.program is self
+            else self._pack(state, source)
+        )
+        device = after.planes.device
+        flags, numbers = self._parameters(job.params, batch, source, device)
+        blocks = -(-batch // source.group)
+        scratch = torch.empty(max(1, blocks * source.scratch // 4), dtype=torch.int32, device=device)
+        seed, index, start = (part.contiguous() for part in job.clock)
+        launch(
+            Arguments(
+                after.planes, after.reals, scratch, (seed, index, start), flags, numbers, job.steps, blocks
+            )
+        )
+        return after
+
+    def _copy(self, state: DeviceState) -> DeviceState:
+        return DeviceState(self, state.planes.clone(), state.reals.clone(), state.like)
+
+    def _parameters(
+        self, params: Mapping[str, Tensor], batch: int, source: KernelSource, device: torch.device
+    ) -> tuple[Tensor, Tensor]:
+        """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
+        layout = source.layout
+        flags = torch.zeros(max(1, len(layout.param_planes)), batch, dtype=torch.uint8, device=device)
+        views: dict[tuple[str, str], Tensor] = {}
+        for (name, how, bit), number in layout.param_planes.items():
+            kind = self._kinds[name] if how == "value" else how
+            if (name, kind) not in views:
+                views[name, kind] = Kernels.param_view(params[name], kind).to(torch.int64)
+            flags[number] = (views[name, kind] >> bit) & 1
+        numbers = torch.zeros(max(1, len(layout.param_reals)), batch, dtype=torch.float32, device=device)
+        for name, number in layout.param_reals.items():
+            numbers[number] = params[name].to(torch.float32)
+        return flags, numbers
+
+    def _pack(self, state: Mapping[str, Tensor], source: KernelSource) -> DeviceState:
+        """State slots as packed planes and reals."""
+        batch, height, width = state["element"].shape
+        device, layout = state["element"].device, source.layout
+        row_words = -(-width // 32)
+        planes = torch.zeros(
+            batch, max(1, len(layout.planes)), height, row_words, dtype=torch.int32, device=device
+        )
+        reals = torch.zeros(
+            batch, max(1, len(layout.reals)), height, width, dtype=torch.float32, device=device
+        )
+        like = {}
+        for name, value in state.items():
+            like[name] = (value.dtype, tuple(value.shape))
+            if value.dtype == torch.float32:
+                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
+                for i, part in enumerate(parts):
+                    reals[:, layout.reals[part]] = value[:, i] if value.ndim == 4 else value
+            else:
+                first, bits, _ = self._planes_of(name, source)
+                for i in range(bits):
+                    words = torch_words.pack((value >> i) & 1 != 0)
+                    planes[:, first + i] = words.view(torch.int32)[..., :row_words]
+        return DeviceState(self, planes, reals, like)
+
+    def unpack(self, state: DeviceState, name: str) -> Tensor:
+        """One slot of a state in its storage dtype."""
+        dtype, shape = state.like[name]
+        height, width = shape[-2:]
+        source, _ = self.kernel(height, width)
+        if dtype == torch.float32:
+            parts = (f"{name}.row", f"{name}.column") if len(shape) == 4 else (name,)
+            found = [state.reals[:, source.layout.reals[part]] for part in parts]
+            return torch.stack(found, 1) if len(shape) == 4 else found[0].clone()
+        first, bits, signed = self._planes_of(name, source)
+        words = state.planes[:, first : first + bits]
+        octets = words.contiguous().view(torch.uint8)
+        flags = (octets[..., None] >> torch.arange(8, dtype=torch.uint8, device=words.device)) & 1
+        cells = flags.flatten(-2)[..., :width].to(torch.int32)
+        value = torch.zeros(cells.shape[0], *cells.shape[2:], dtype=torch.int32, device=words.device)
+        for i in range(bits):
+            value += cells[:, i] * (-(1 << i) if signed and i == bits - 1 else 1 << i)
+        return value.to(dtype)
+
+    def _planes_of(self, name: str, source: KernelSource) -> tuple[int, int, bool]:
+        """First plane of a slot, number of planes, and whether the last is a sign."""
+        type = self._slots[name].type
+        if type.name == "flag":
+            return source.layout.planes[name], 1, False
+        bits, signed = planes_of(type.lo, type.hi)
+        return source.layout.planes[f"{name}:0"], bits, signed

@@ -1,0 +1,160 @@
+"""IR on planes -> CUDA C++ for a whole program and one size of grid: one kernel that runs many steps on the chip."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+
+from powderdsl.ir.ops import Program
+from powderdsl.targets.cuda.emit import Emitter, Pending
+from powderdsl.targets.cuda.passes import PassSchedule
+from powderdsl.targets.cuda.schedule import Pool, make_plan
+from powderdsl.targets.layout import Layout, layout_of, literal
+
+GENERATOR_VERSION = 1
+"""Part of every cache key: raise it when generated code changes meaning."""
+
+SNAP = 2.0**-20
+WARP = 32
+MAX_THREADS = 1024
+SMALL = 64
+"""Words of a block up to which worlds share one: fewer would leave most of its threads idle."""
+
+HELD = 4
+"""Rounds of a loop over words up to which a thread holds back what it writes in registers."""
+
+
+RESERVED = 1024
+"""Bytes of shared memory that the system takes of each block."""
+
+REGISTERS, ENOUGH = 65_536, 128
+"""Registers of a multiprocessor, and how many a thread should have."""
+
+
+@dataclass(frozen=True)
+class KernelSource:
+    """A translation unit, and what launching it takes."""
+
+    name: str
+    """Of the rules."""
+    text: str
+    layout: Layout
+    group: int
+    """Worlds a block."""
+    threads: int
+    shared: int
+    """Bytes of shared memory a block."""
+    scratch: int
+    """Bytes of global memory a block: what did not fit."""
+
+
+def cuda_source(program: Program, height: int, width: int, shared_limit: int) -> KernelSource:
+    """The kernel of a program on planes for one size of grid.
+
+    Args:
+        shared_limit: bytes of shared memory that a block may have. Fields leave it first, then planes.
+    """
+    layout = layout_of(program)
+    row_words = -(-width // WARP)
+    words = height * row_words
+    group = max(1, SMALL // words)
+    wanted = -(-group * words // WARP) * WARP * (2 if layout.reals else 1)
+    threads = min(MAX_THREADS, wanted)
+    pool = Pool(
+        {"p": len(layout.planes), "f": len(layout.reals)}, {"p": len(layout.planes), "f": len(layout.reals)}
+    )
+    pending = Pending()
+    passes = []
+    for number, pass_ in enumerate(program.passes):
+        schedule = PassSchedule(pass_, layout)
+        rounds = -(-group * words // threads)
+        plan = make_plan(
+            schedule.statements,
+            schedule.homes,
+            schedule.changed,
+            schedule.open_homes,
+            schedule.prefers,
+            pool,
+            rounds <= HELD,
+        )
+        emitter = Emitter(plan, pending)
+        body = emitter.text(schedule.statements)
+        pending = emitter.pending
+        passes.append(f"DEVICE void pass_{number}(const Block& c) {{\n(void)c;\n{body}\n}}")
+    uniform = (
+        4
+        * group
+        * (
+            2
+            + 2 * len(layout.streams)
+            + len(layout.step_planes)
+            + len(layout.param_planes)
+            + len(layout.param_reals)
+        )
+    )
+    planes = 4 * group * words * pool.size["p"]
+    fields = 4 * group * (height * width + words) * pool.size["f"]
+    planes_fit = uniform + planes <= shared_limit
+    fields_fit = planes_fit and uniform + planes + fields <= shared_limit
+    shared = uniform + (planes if planes_fit else 0) + (fields if fields_fit else 0)
+    # As many blocks as the chip's memory holds, but not so many that registers run out.
+    blocks = max(1, min(shared_limit // (shared + RESERVED), REGISTERS // (threads * ENOUGH)))
+    head = {
+        "HEIGHT": height, "WIDTH": width, "ROW_WORDS": row_words, "GROUP": group,
+        "PLANES_ON_CHIP": int(planes_fit), "FIELDS_ON_CHIP": int(fields_fit),
+        "PLANES": pool.size["p"], "FIELDS": pool.size["f"], "SLOTS": len(layout.planes), "REALS": len(layout.reals),
+        "STREAMS": len(layout.streams), "STEP_PLANES": len(layout.step_planes),
+        "PARAM_PLANES": len(layout.param_planes), "PARAM_REALS": len(layout.param_reals), "SNAP": literal(SNAP),
+    }  # fmt: skip
+    folder = files("powderdsl.targets.cuda")
+    text = "\n".join([
+        f"// {len(program.passes)} passes for grids of {height} x {width}, generated; version {GENERATOR_VERSION}",
+        *(f"#define {name} {value}" for name, value in head.items()),
+        f"#if !defined(EMULATED)\n#define THREADS {threads}\n#define BLOCKS {blocks}\n#endif",
+        (folder / "runtime.cuh").read_text(encoding="utf-8"),
+        *_tables(program, layout, width, row_words),
+        "\n\n".join(passes),
+        _resets(program, layout),
+        "DEVICE void run_passes(const Block& c) {",
+        *(f"pass_{number}(c);" for number in range(len(passes))),
+        "}",
+        (folder / "driver.cuh").read_text(encoding="utf-8"),
+    ])  # fmt: skip
+    scratch = (0 if planes_fit else planes) + (0 if fields_fit else fields)
+    return KernelSource(program.name, text, layout, group, threads, shared, scratch)
+
+
+def _tables(program: Program, layout: Layout, width: int, row_words: int) -> list[str]:
+    """Constants by stream, step and column."""
+    idents = ", ".join(f"{ident}u" for _, ident, _ in program.streams) or "0"
+    moduli = ", ".join(f"{modulus}ull" for modulus, _ in layout.step_planes) or "1"
+    bits = ", ".join(str(bit) for _, bit in layout.step_planes) or "0"
+    lines = [
+        f"TABLE u32 STREAM_IDENT[] = {{{idents}}};",
+        f"TABLE u64 STEP_MODULUS[] = {{{moduli}}};",
+        f"TABLE int STEP_BIT[] = {{{bits}}};",
+    ]
+    for (kind, modulus, bit), number in layout.fixed.items():
+        if kind == 1:
+            words = [0] * row_words
+            for x in range(width):
+                words[x // WARP] |= (x % modulus >> bit & 1) << x % WARP
+            lines.append(f"TABLE u32 COLUMNS_{number}[] = {{{', '.join(f'{word:#x}u' for word in words)}}};")
+    return lines
+
+
+def _resets(program: Program, layout: Layout) -> str:
+    """What slots that reset each step hold at its start."""
+    planes, reals = [], []
+    for slot in program.slots:
+        if slot.resets and slot.name in layout.planes:
+            planes.append(f"P({layout.planes[slot.name]})[i] = {'valid' if slot.default else '0'};")
+        elif slot.resets:
+            number, value = layout.reals[slot.name], float(slot.default)
+            need = f"N({number})[i] != 0" if value == 0 else "true"
+            reals.append(
+                f"FOR_BUSY_WORDS(i, [&](int i) {{ return {need}; }}) {{ PLACE(i); LANES {{ CELL; "
+                f"if (inside) F({number})[cell] = {literal(value)}; }} ONCE N({number})[i] = {'0' if value == 0 else 'valid'}; }}"
+            )
+    loop = f"FOR_WORDS(k, i) {{ PLACE(i); {' '.join(planes)} }}" if planes else ""
+    return "\n".join(["DEVICE void reset_slots(const Block& c) {", "(void)c;", loop, *reals, "}"])

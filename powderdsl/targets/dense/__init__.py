@@ -1,0 +1,1 @@
+"""One element a cell, on torch tensors: the target to read."""

@@ -1,0 +1,71 @@
+"""Programs in several forms, one after the other within each step: packed where planes can carry a pass, else dense."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from powderdsl.ir.ops import Program
+from powderdsl.ir.segments import Segment, segments
+from powderdsl.targets.dense.program import DenseProgram
+from powderdsl.targets.job import Job
+from powderdsl.targets.laps import profile_of
+
+
+class Part(Protocol):
+    """Some passes of a ruleset made executable."""
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        ...
+
+
+MakePacked = Callable[[Program, Program], Part]
+"""Makes a part of a program on numbers and the same on planes."""
+
+
+class MixedProgram:
+    """Parts that take turns. The state goes from one to the next whole, unpacked and packed again on the way."""
+
+    def __init__(self, parts: Sequence[Part]):
+        self.parts = tuple(parts)
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        seed, index, start = job.clock
+        state = job.state
+        for i in range(job.steps):
+            for part in self.parts:
+                state = part.run(replace(job, state=state, clock=(seed, index, start + i), steps=1))
+        return state
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds by pass over `job.steps`; what packing and unpacking between the parts costs is left out."""
+        seed, index, start = job.clock
+        state = job.state
+        seconds: dict[str, float] = {}
+        for i in range(job.steps):
+            for part in self.parts:
+                turn = replace(job, state=state, clock=(seed, index, start + i), steps=1)
+                for name, spent in profile_of(part, turn).items():
+                    seconds[name] = seconds.get(name, 0.0) + spent
+                state = part.run(turn)
+        return seconds
+
+
+def packed_program(program: Program, device: torch.device, make: MakePacked) -> Part:
+    """A program on planes by `make`, except for the passes that planes cannot carry."""
+    return mixed_program(segments(program), device, make)
+
+
+def mixed_program(found: Sequence[Segment], device: torch.device, make: MakePacked) -> Part:
+    """The program of some segments; that of a single one as it is."""
+    parts = [
+        DenseProgram(one.program, device) if one.planes is None else make(one.program, one.planes)
+        for one in found
+    ]
+    return parts[0] if len(parts) == 1 else MixedProgram(parts)

@@ -1,0 +1,266 @@
+"""The readable torch backend: one tensor element a cell; masks, rolls and shifted sums. Handles every IR operation.
+
+Each pass becomes a generated, straight-line Python function; names in it come from node numbers only, never from
+rule files. Flags are bool, whole numbers int32, reals float32, all [B, H, W] or broadcastable to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.ir.ops import Program
+from powderdsl.targets import random
+from powderdsl.targets.dense.source import load_source, pass_source
+from powderdsl.targets.job import Job
+from powderdsl.targets.laps import Laps, unwatched
+
+SNAP = 2.0**-20
+
+PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
+
+_DTYPES = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
+
+
+@dataclass
+class Kernels:
+    """What generated code calls, for one grid size and batch: neighbours, draws, coordinates, parameters."""
+
+    shape: tuple[int, int, int]
+    device: torch.device
+    params: Mapping[str, Tensor]
+    streams: Mapping[str, tuple[int, int]]
+    """Position in `keys`, and bits."""
+    given: Mapping[str, Tensor]
+    base: Tensor
+    idents: Tensor
+    step: Tensor
+    flags: frozenset[str] = frozenset()
+    """Parameters that are flags."""
+    keys: Tensor = field(init=False)
+    _draws: dict[tuple[str, int], Tensor] = field(default_factory=dict)
+    _masks: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+
+    def begin(self, step: Tensor) -> None:
+        """Start a step: new keys, no draws yet."""
+        self.step = step
+        self.keys = random.step_keys(self.base, step, self.idents)
+        self._draws.clear()
+
+    def full(self, x: Tensor) -> Tensor:
+        return x if x.shape == self.shape else x.expand(self.shape)
+
+    def roll(self, x: Tensor, dy: int, dx: int) -> Tensor:
+        """The value at the neighbour (dy, dx); the grid wraps."""
+        return torch.roll(self.full(x), (-dy, -dx), (-2, -1))
+
+    def reach(self, x: Tensor, dy: int, dx: int) -> Tensor:
+        """The value at the neighbour (dy, dx), zero outside the grid."""
+        rolled = self.roll(x, dy, dx)
+        return torch.where(self.inside(dy, dx), rolled, torch.zeros((), dtype=x.dtype, device=self.device))
+
+    def inside(self, dy: int, dx: int) -> Tensor:
+        """bool [H, W]: whether the neighbour lies inside the grid."""
+        if (dy, dx) not in self._masks:
+            _, height, width = self.shape
+            y = torch.arange(height, device=self.device)[:, None] + dy
+            x = torch.arange(width, device=self.device)[None] + dx
+            self._masks[dy, dx] = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        return self._masks[dy, dx]
+
+    def count(self, x: Tensor, weights: tuple[tuple[int, int, int], ...], wraps: bool) -> Tensor:
+        """Weighted number of neighbours that hold: row sums first, each pattern of weights once."""
+        look = self.roll if wraps else self.reach
+        cells = self.full(x).to(torch.int32)
+        patterns: dict[int, list[tuple[int, int]]] = {}
+        for dy, dx, weight in weights:
+            patterns.setdefault(dy, []).append((dx, weight))
+        sums: dict[tuple[tuple[int, int], ...], Tensor] = {}
+        total = None
+        for dy, pattern in patterns.items():
+            key = tuple(pattern)
+            if key not in sums:
+                row = None
+                for dx, weight in pattern:
+                    term = look(cells, 0, dx) if dx else cells
+                    term = term if weight == 1 else term * weight
+                    row = term if row is None else row + term
+                assert row is not None
+                sums[key] = row
+            part = look(sums[key], dy, 0) if dy else sums[key]
+            total = part if total is None else total + part
+        return torch.zeros_like(cells) if total is None else total
+
+    def draw(self, stream: str, bits: int) -> Tensor:
+        """The first `bits` bits of a stream's draws, int64 [B, H, W]."""
+        key = (stream, bits)
+        if key not in self._draws:
+            position, resolution = self.streams[stream]
+            if stream in self.given:
+                self._draws[key] = self.given[stream] >> (resolution - bits)
+            else:
+                self._draws[key] = random.draws(self.keys[position], bits, *self.shape[1:])
+        return self._draws[key]
+
+    def draw_real(self, stream: str) -> Tensor:
+        """A stream's draws in (0, 1), float32."""
+        bits = self.streams[stream][1]
+        return ((self.draw(stream, bits).double() + 0.5) / float(1 << bits)).float()
+
+    def coordinate(self, axis: str, modulus: int) -> Tensor:
+        _, height, width = self.shape
+        if axis == "step":
+            value = self.step[:, None, None]
+        elif axis == "row":
+            value = torch.arange(height, device=self.device)[:, None]
+        else:
+            value = torch.arange(width, device=self.device)[None]
+        return (value % modulus).to(torch.int32)
+
+    def param(self, name: str, view: str) -> Tensor:
+        """A parameter [B, 1, 1]: its value, or as a chance the number of draws below (`lt16`) or up to it (`le16`)."""
+        return self.param_view(self.params[name], view)[:, None, None]
+
+    @staticmethod
+    def param_view(value: Tensor, view: str) -> Tensor:
+        """Parameter values (float64 [B]) as generated code wants them."""
+        match view:
+            case "flag":
+                return value != 0
+            case "int":
+                return value.to(torch.int32)
+            case "real" | "chance":
+                return value.to(torch.float32)
+        count = 1 << int(view[2:])
+        scaled = value * count - 0.5
+        limit = scaled.ceil() if view[:2] == "lt" else scaled.floor() + 1
+        return limit.clamp(0, count).to(torch.int64)
+
+    @staticmethod
+    def swap(
+        content: Tensor, movers: Tensor, targets: Tensor, there: Tensor, back: Tensor, rest: Tensor
+    ) -> Tensor:
+        return torch.where(movers, there, torch.where(targets, back, rest))
+
+    @staticmethod
+    def divide(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(b == 0, torch.zeros((), dtype=a.dtype, device=a.device), a / b)
+
+    @staticmethod
+    def quotient(a: Any, b: Any) -> Tensor:
+        """Whole division, rounded down; 0 where b is 0. One of them may be a constant."""
+        if isinstance(b, int):
+            return torch.div(a, b, rounding_mode="floor")  # no rule divides by the constant 0
+        numerator = torch.full_like(b, a) if isinstance(a, int) else a
+        found = torch.div(numerator, torch.where(b == 0, torch.ones_like(b), b), rounding_mode="floor")
+        return torch.where(b == 0, torch.zeros_like(found), found)
+
+    @staticmethod
+    def settle(x: Tensor, low: float, high: float) -> Tensor:
+        """No NaN, within bounds, nothing smaller than SNAP."""
+        zero = torch.zeros((), dtype=x.dtype, device=x.device)
+        x = torch.where(x == x, x, zero).clamp(low, high)
+        return torch.where(x.abs() < SNAP, zero, x)
+
+
+def kernel_source(program: Program, only: str | None = None) -> str:
+    """The generated source of all passes (or one), as `--emit kernels` prints it."""
+    return "\n\n".join(
+        pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
+    )
+
+
+class DenseProgram:
+    """A program whose passes are generated torch functions."""
+
+    def __init__(self, program: Program, device: torch.device):
+        self.program = program
+        self.device = device
+        self._slots = {slot.name: slot for slot in program.slots}
+        self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
+        self._idents = torch.tensor(
+            [ident for _, ident, _ in program.streams], dtype=torch.int64, device=device
+        )
+        self._functions: list[tuple[str, PassFunction]] = [
+            (p.name, compiled(*pass_source(p, i), device)) for i, p in enumerate(program.passes)
+        ]
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later in storage dtypes; no host sync."""
+        return self._run(job, unwatched)
+
+    def profile(self, job: Job) -> Mapping[str, float]:
+        """Seconds that each pass takes over `job.steps`."""
+        laps = Laps(self.device)
+        self._run(job, laps)
+        return laps.passes()
+
+    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
+        seed, index, start = job.clock
+        batch, height, width = job.state["element"].shape
+        kernels = Kernels(
+            (batch, height, width), self.device, job.params, self._streams, job.draws,
+            random.base_keys(seed, index), self._idents, start,
+        )  # fmt: skip
+        planes = self._unpack(job.state)
+        with torch.no_grad():
+            for i in range(job.steps):
+                kernels.begin(start + i)
+                for name, slot in self._slots.items():
+                    if slot.resets:
+                        planes[name] = torch.full(
+                            kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
+                        )
+                lap("")
+                for name, function in self._functions:
+                    if job.passes is None or name in job.passes:
+                        planes.update(function(kernels, planes))
+                        lap(name)
+        return self._pack(planes, job.state, kernels)
+
+    def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """State slots as planes in working dtypes: vectors split, whole numbers widened."""
+        planes = {}
+        for name, slot in self._slots.items():
+            base, _, part = name.rpartition(".")
+            if part in ("row", "column") and base in state:
+                planes[name] = state[base][:, ("row", "column").index(part)]
+            else:
+                planes[name] = state[name].to(_DTYPES[slot.type.name])
+        return planes
+
+    def _pack(
+        self, planes: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: Kernels
+    ) -> dict[str, Tensor]:
+        """Planes as state slots in storage dtypes."""
+        packed = {}
+        for name, old in like.items():
+            if old.ndim == 4:
+                packed[name] = torch.stack(
+                    [kernels.full(planes[f"{name}.{part}"]) for part in ("row", "column")], 1
+                )
+            else:
+                new = kernels.full(planes[name]).to(old.dtype)
+                packed[name] = new.clone() if new is old else new.contiguous()
+        return packed
+
+
+def compiled(source: str, name: str, constants: Mapping[str, object], device: torch.device) -> PassFunction:
+    """The function of a pass's source on this device."""
+    namespace: dict[str, object] = {"torch": torch}
+    for key, value in constants.items():
+        dtype = (
+            torch.bool
+            if isinstance(value, bool)
+            else torch.float32
+            if isinstance(value, float)
+            else torch.int32
+        )
+        if dtype == torch.int32 and max(value if isinstance(value, tuple) else (value,)) >= 1 << 31:
+            dtype = torch.int64  # thresholds of draws of 32 bits
+        namespace[key] = torch.tensor(value, dtype=dtype, device=device)
+    return load_source(source, name, namespace)

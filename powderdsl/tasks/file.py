@@ -1,0 +1,401 @@
+"""A task file -> a checked `Task`. Everything that is wrong is reported at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from powderdsl.compiler import load_with_diagnostics, names_in_file, read
+from powderdsl.diagnostics import CompileError, Reporter, Source, Span, suggest
+from powderdsl.model.builtins import FUNCTIONS as RULE_FUNCTIONS
+from powderdsl.model.check import resolve_names
+from powderdsl.model.composition.palette import Palette
+from powderdsl.model.expressions.typer import Typer
+from powderdsl.model.schema import Reader, first_line
+from powderdsl.model.types import Ruleset
+from powderdsl.model.world_sides import fits, size_problem
+from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.parse import parse_scalar
+from powderdsl.syntax.parse import reserved_words as rule_words
+from powderdsl.tasks.agents import read_agent
+from powderdsl.tasks.drawings import Drawer, Plan, element_ids
+from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
+from powderdsl.tasks.keys import TASK_KEYS
+from powderdsl.tasks.stamps import read_stamp
+from powderdsl.tasks.statement_lists import BROKEN, read_items, read_lets, text_span
+from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Scalar, Split, Stamp, Task
+from powderdsl.worlds.raster import Size
+from powderdsl.worlds.scene.amounts import filled_in
+from powderdsl.worlds.scene.statements import Statement, Word, read_amount, read_statement, reserved_words
+
+Entries = dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]]
+
+MAX_VARIANTS = 256
+"""Worlds that the stands of one split may have."""
+
+
+def read_task(
+    source: Source,
+    reporter: Reporter,
+    *,
+    knobs: Mapping[str, int] | None = None,
+    params: Mapping[str, Any] | None = None,
+    packs: Sequence[str] = (),
+    palette: Palette | None = None,
+) -> Task:
+    """The checked task of a file's text; warnings stay with the reporter.
+
+    `packs` are added to its rules; `palette` has ids that were recorded.
+
+    Raises:
+        CompileError: with everything that is wrong in the file, and in its rules.
+    """
+    tree = yaml_tree.parse_yaml(source, reporter)
+    if tree is None and not reporter.has_errors:
+        helps = ["a task starts with `task: NAME`"]
+        reporter.error("PD107", f"{source.name} is empty", None, helps=helps)
+    reporter.raise_if_errors()
+    assert tree is not None
+    reader = Reader(reporter, TASK_KEYS)
+    entries = reader.mapping(tree, "task", "a task")
+    rules = _read_rules(reader, entries, source, params, packs, palette)
+    if rules is None:
+        reporter.raise_if_errors()
+        raise AssertionError("a task without rules was not reported")
+    return _TaskReader(reader, entries, *rules, knobs or {}).task()
+
+
+def _read_rules(
+    reader: Reader,
+    entries: Entries,
+    source: Source,
+    params: Mapping[str, Any] | None,
+    packs: Sequence[str],
+    palette: Palette | None,
+) -> tuple[Ruleset, Typer, tuple[str, ...]] | None:
+    """The ruleset, what checks expressions against it, and what was loaded.
+
+    What is wrong with the rules is reported here.
+    """
+    word = reader.scalar(entries, "rules")
+    if word is None or not word.text:
+        return None
+    written: dict[str, Any] = {}
+    node = entries["params"][1] if "params" in entries else None
+    for key, value in node.entries if isinstance(node, yaml_tree.Mapping) else ():
+        if isinstance(value, yaml_tree.Scalar):
+            written[key.text] = value.text
+        else:
+            reader.shape(value, "a single value")
+    names = names_in_file(word.text, word.span, reader.reporter)
+    if names is None:
+        return None
+    rules = (*names, *packs)
+    try:
+        ruleset, _ = load_with_diagnostics(*rules, params={**written, **(params or {})}, palette=palette)
+    except CompileError as error:
+        for one in error.diagnostics:
+            place = one.primary.span or word.span
+            reader.reporter.error(
+                one.code, one.message, place, one.primary.text, notes=one.notes, helps=one.helps
+            )
+        return None
+    loaded, decl = read(rules, Reporter())
+    typer, _ = resolve_names(loaded, decl, Reporter(), palette)
+    typer.reporter = typer.unknown.reporter = reader.reporter
+    return ruleset, typer, rules
+
+
+class _TaskReader:
+    """Reads one task, section by section."""
+
+    def __init__(
+        self,
+        reader: Reader,
+        entries: Entries,
+        ruleset: Ruleset,
+        typer: Typer,
+        rules: tuple[str, ...],
+        given: Mapping[str, int],
+    ):
+        self.reader, self.reporter, self.entries = reader, reader.reporter, entries
+        self.ruleset, self.typer, self.given = ruleset, typer, given
+        self.rules = rules
+        own, _ = read(rules[:1], Reporter())
+        self.own = {pack.name.text for pack in own}
+        """The packs of the task's own rules: it knows no names of those that are added."""
+        self.taken: dict[str, Span] = {}
+        self.broken: set[str] = set()
+
+    def task(self) -> Task:
+        name = self.reader.scalar(self.entries, "task")
+        if name is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,59}", name.text):
+            label = "letters, digits, `-` and `_`, up to 60"
+            self.reporter.error("PD111", "a task's name is a word", name.span, label)
+        size = self.size()
+        fill = self.fill()
+        knobs = self.knobs()
+        values = {knob.name: knob.value for knob in knobs}
+        plan = Plan(
+            "train",
+            fill,
+            values,
+            self.names(read_lets(self.node("let"), self.reader)),
+            self.regions(),
+            self.stamps(),
+            self.lists("parts", "a part"),
+            self.lists("targets", "a target"),
+            read_items(self.node("generate"), self.reader),
+            frozenset(self.broken),
+        )
+        splits, used = self.splits(plan, size)
+        agent = read_agent(self.reader, self.entries.get("agent"), self.ruleset, size)
+        goal = self.goal(plan)
+        self.unused(plan, used)
+        self.typer.unknown.report()
+        self.reporter.raise_if_errors()
+        assert name is not None
+        assert agent is not None
+        about = self.reader.text(self.entries, "about")
+        return Task(name.text, about, self.ruleset, size, knobs, agent, goal, splits, self.rules)
+
+    def node(self, key: str) -> yaml_tree.Node | None:
+        return self.entries[key][1] if key in self.entries else None
+
+    # What worlds are made of
+
+    def size(self) -> Size:
+        node = self.node("size")
+        items = node.items if isinstance(node, yaml_tree.Sequence) else ()
+        words = [item.text for item in items if isinstance(item, yaml_tree.Scalar)]
+        numbers = [int(word) for word in words if re.fullmatch(r"[0-9]{1,5}", word)]
+        if node is None:
+            return 64, 64
+        if len(items) != 2 or len(numbers) != 2 or not all(1 <= one <= MAX_SIDE for one in numbers):
+            label = f"two whole numbers from 1 to {MAX_SIDE}"
+            helps = ["size: [64, 64]"]
+            self.reporter.error("PD607", "a size is [rows, columns]", first_line(node), label, helps=helps)
+            return 64, 64
+        if not fits(self.ruleset, (numbers[0], numbers[1])):
+            problem = size_problem(self.ruleset, (numbers[0], numbers[1]))
+            self.reporter.error("PD607", problem, first_line(node), "does not fit")
+        return numbers[0], numbers[1]
+
+    def fill(self) -> int:
+        scalar = self.reader.scalar(self.entries, "fill")
+        if scalar is None:
+            return 0
+        ids = element_ids(Word(scalar.text, scalar.span), self.ruleset, self.reporter)
+        return ids[0] if ids else 0
+
+    def take(self, word: yaml_tree.Scalar | Word) -> None:
+        """Report a new name that already means something, or that statements and expressions need."""
+        if word.text in reserved_words() | rule_words() | {*ACTION_WORDS, *FUNCTIONS, *RULE_FUNCTIONS}:
+            self.reporter.error("PD311", f"`{word.text}` is a word of the language", word.span, "taken")
+        elif word.text in self.taken:
+            self.reporter.error(
+                "PD308", f"`{word.text}` already means something", word.span, "second meaning"
+            )
+        elif self._is_name(word.text):
+            label = "the rules use this word"
+            self.reporter.error("PD308", f"`{word.text}` hides another `{word.text}`", word.span, label)
+        self.taken[word.text] = word.span
+
+    def _is_name(self, word: str) -> bool:
+        """Whether a word means something in the task's own rules."""
+        symbols = self.typer.symbols
+        owner = symbols.composition.names.owners.get(word)
+        return (owner is None or owner[0] in self.own) and bool(
+            self.ruleset.element(word) or symbols.constants.get(word)
+        )
+
+    def names(self, lets: list[tuple[Word, Any]]) -> list[tuple[Word, Any]]:
+        for word, _ in lets:
+            self.take(word)
+        return lets
+
+    def knobs(self) -> tuple[Knob, ...]:
+        found: dict[str, Knob] = {}
+        for key, node in self.reader.named(self.node("knobs"), "a knob"):
+            self.take(key)
+            self.broken.add(key.text)
+            entries = self.reader.mapping(node, "knob", "a knob")
+            bounds = self.amount(self.reader.scalar(entries, "range"))
+            default = self.amount(self.reader.scalar(entries, "default"))
+            if bounds is None or default is None:
+                continue
+            ends = [arg.value for arg in bounds.args if arg.is_number]
+            if bounds.op != "draw" or len(ends) != 2:
+                self.reporter.error(
+                    "PD803", "a knob's range has two whole numbers", bounds.span, "such as `0..64`"
+                )
+                continue
+            low, high = int(ends[0] or 0), int(ends[1] or 0)
+            above = {name: knob.value for name, knob in found.items()}
+            try:
+                value = filled_in(default, above)
+            except ZeroDivisionError:
+                value = default
+            if not value.is_number:
+                label = "a whole number, or knobs that stand above this one"
+                helps = suggest(default.span.text if default.span else "", found, "knobs above it")
+                self.reporter.error("PD803", f"the default of `{key.text}`", default.span, label, helps=helps)
+                continue
+            about = self.reader.text(entries, "about")
+            usual = int(value.value or 0)
+            chosen = int(self.given.get(key.text, usual))
+            for one, span in (
+                (usual, default.span),
+                (chosen, None if key.text in self.given else default.span),
+            ):
+                if not low <= one <= high:
+                    message = f"the knob `{key.text}` must lie in {low}..{high}"
+                    self.reporter.error("PD803", message, span, f"{one} lies outside", notes=[f"it is {one}"])
+            self.broken.discard(key.text)
+            found[key.text] = Knob(key.text, usual, low, high, chosen, about, key.span)
+        for name in self.given:
+            if name not in self.taken:
+                helps = suggest(name, found, "knobs") or ("the task has no knobs",)
+                self.reporter.error("PD803", f"no knob `{name}`", None, helps=helps)
+        return tuple(found.values())
+
+    def amount(self, scalar: yaml_tree.Scalar | None) -> Any:
+        span = text_span(scalar, self.reporter) if scalar is not None else None
+        return read_amount(span, self.reporter) if span is not None else None
+
+    def regions(self) -> dict[str, tuple[Statement, ...]]:
+        found = {}
+        for key, node in self.reader.named(self.node("regions"), "a region"):
+            self.take(key)
+            shapes = []
+            for item in node.items if isinstance(node, yaml_tree.Sequence) else (node,):
+                span = text_span(item, self.reporter)
+                if not isinstance(item, yaml_tree.Scalar):
+                    self.reader.shape(item, "a shape, such as `box rows 1:5 columns 2:8`")
+                elif span is not None:
+                    shapes.append(read_statement(span, self.reporter, shape=True))
+            found[key.text] = tuple(one for one in shapes if one is not None)
+        return found
+
+    def stamps(self) -> dict[str, Stamp]:
+        found = {}
+        for key, node in self.reader.named(self.node("stamps"), "a stamp"):
+            stamp = read_stamp(key, node, self.reader, self.ruleset)
+            found[key.text] = stamp or Stamp(key.text, ((255,),))
+        return found
+
+    def lists(self, section: str, what: str) -> dict[str, Any]:
+        return {
+            key.text: read_items(node, self.reader)
+            for key, node in self.reader.named(self.node(section), what)
+        }
+
+    # Splits
+
+    def splits(self, plan: Plan, size: Size) -> tuple[tuple[Split, ...], set[str]]:
+        """All splits, and the parts that any of them uses."""
+        about = self.reader.text(self.entries, "about")
+        plans: list[tuple[str, str, list[Plan]]] = [("train", about, [plan])]
+        for key, node in self.reader.named(self.node("splits"), "a split"):
+            entries = self.reader.mapping(node, "split", "a split")
+            base = self.varied(plan, entries, key.text)
+            stands = entries.get("stands")
+            variants = [base] if stands is None else self.stands(base, stands[1])
+            told = self.reader.text(entries, "about")
+            if key.text == "train":
+                self.reporter.error(
+                    "PD302", "the split `train` is there already", key.span, "it is what the task itself says",
+                    helps=["choose another name, or change `generate`, `let` and `parts` of the task"],
+                )  # fmt: skip
+            plans.append((key.text, told, variants))
+        splits, used = [], set()
+        for name, told, variants in plans:
+            generators = []
+            for variant in variants:
+                drawer = Drawer(variant, self.ruleset, size, self.reporter)
+                generators.append(drawer.generator())
+                used |= drawer.used_parts
+            splits.append(Split(name, told, tuple(generators)))
+        return tuple(splits), used
+
+    def stands(self, base: Plan, node: yaml_tree.Node) -> list[Plan]:
+        if not isinstance(node, yaml_tree.Sequence) or not node.items:
+            self.reader.shape(node, "a list of stands", "each starts with `- stand: NAME`")
+            return [base]
+        if len(node.items) > MAX_VARIANTS:
+            message = f"{len(node.items)} stands"
+            self.reporter.error("PD508", message, first_line(node), f"the limit is {MAX_VARIANTS}")
+            return [base]
+        found = []
+        for item in node.items:
+            entries = self.reader.mapping(item, "stand", "a stand")
+            name = self.reader.scalar(entries, "stand")
+            found.append(self.varied(base, entries, name.text if name else "?"))
+        return found
+
+    def varied(self, plan: Plan, entries: Entries, name: str) -> Plan:
+        """The plan with what a split or stand changes."""
+        changes: dict[str, Any] = {"name": name}
+        if "knobs" in entries:
+            values = dict(plan.knobs)
+            for word, amount in read_lets(entries["knobs"][1], self.reader):
+                self.known(word, plan.knobs, "knob")
+                if amount is BROKEN:
+                    continue
+                filled = filled_in(amount, plan.knobs)
+                if filled.is_number:
+                    values[word.text] = int(filled.value or 0)
+                else:
+                    self.reporter.error("PD803", "a knob is one number", amount.span, "no draws here")
+            changes["knobs"] = values
+        if "let" in entries:
+            given = read_lets(entries["let"][1], self.reader)
+            here = dict.fromkeys(word.text for word, _ in plan.lets)
+            for word, _ in given:
+                self.known(word, here, "number")
+            other = {word.text: amount for word, amount in given}
+            changes["lets"] = [(word, other.get(word.text, amount)) for word, amount in plan.lets]
+        if "parts" in entries:
+            parts = dict(plan.parts)
+            for key, node in self.reader.named(entries["parts"][1], "a part"):
+                self.known(Word(key.text, key.span), plan.parts, "part")
+                parts[key.text] = read_items(node, self.reader)
+            changes["parts"] = parts
+        if "generate" in entries:
+            changes["items"] = read_items(entries["generate"][1], self.reader)
+        return replace(plan, **changes)
+
+    def known(self, word: Word, known: Mapping[str, object], what: str) -> None:
+        if word.text not in known:
+            helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
+            self.reporter.error(
+                "PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps
+            )
+
+    def unused(self, plan: Plan, used: set[str]) -> None:
+        """Warn of parts that nothing uses."""
+        node = self.node("parts")
+        for key, _ in node.entries if isinstance(node, yaml_tree.Mapping) else ():
+            if key.text in plan.parts and key.text not in used:
+                message = f"the part `{key.text}` is never used"
+                self.reporter.report("PD507", message, key.span, "no list has it", helps=["remove it"])
+
+    # What counts
+
+    def goal(self, plan: Plan) -> Goal:
+        checker = GoalChecker(self.typer, frozenset(plan.regions), frozenset(plan.targets), plan.knobs)
+        found: dict[str, Scalar | None] = {}
+        for section in ("reward", "end"):
+            node = self.node(section)
+            entries = self.reader.mapping(node, section, f"`{section}`") if node is not None else {}
+            if isinstance(node, yaml_tree.Mapping) and not node.entries:
+                helps = [", ".join(f"`{key}`: {row.about}" for key, row in TASK_KEYS[section].items())]
+                self.reporter.error("PD109", f"`{section}` says nothing", node.span, "empty", helps=helps)
+            for key in TASK_KEYS[section]:
+                scalar = self.reader.scalar(entries, key)
+                syntax = parse_scalar(scalar, "expression", self.reporter) if scalar else None
+                if syntax is not None:
+                    found[key] = checker.number(syntax) if section == "reward" else checker.condition(syntax)
+        return Goal(found.get("each"), found.get("final"), found.get("success"), found.get("failure"))

@@ -1,0 +1,1 @@
+"""Tasks on tensors: generators, shapes, actions, measures."""

@@ -1,0 +1,412 @@
+"""Generators on tensors: seeds in, worlds out, no loop over worlds.
+
+Every number that a world draws is a hash of its seed, the statement, the repetition and which number of the statement
+it is. So a world is the same alone and in any batch, on any device.
+
+Painting happens on bits: an id is a few planes, a word is 64 rows of a column.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from powderdsl.targets.random import MASK, base_keys, mix
+from powderdsl.tasks.task import Drawing, Generator, Group, Region
+from powderdsl.tasks.tensors.shapes import covered_rows, pack, unpack, words_of_rows
+from powderdsl.worlds.raster import Size, mask
+from powderdsl.worlds.scene.amounts import Amount, calculate
+from powderdsl.worlds.scene.fixed import shape_of
+
+NOTHING = 255
+"""In targets and stamps: no element."""
+
+CHUNK_CELLS = 1 << 20
+"""Cells of the worlds that are made together on the CPU: their words fit its cache."""
+
+CHANCE_BITS = 16
+"""Scattered cells are drawn with that many bits: chances are multiples of 2⁻¹⁶."""
+
+_NUMBERS, _STATEMENT, _COUNTER, _INDEX = 128, 0x9E3779B1, 0x85EBCA6B, 0x7A51
+"""Draws of one statement and repetition; odd factors that spread counters; the worlds' index of `base_keys`, which
+keeps draws of generators apart from those of rules."""
+
+
+_LIMITED = ("scatter", "stamp")
+"""Statements whose cells are found only when they are painted."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """Generated worlds: ids uint8 [B, H, W]; regions bool [B, H, W] or [1, H, W]; targets uint8 [B, H, W]."""
+
+    ids: Tensor
+    regions: Mapping[str, Tensor]
+    targets: Mapping[str, Tensor]
+
+
+class DrawTable:
+    """Which numbers a generator draws, so that all of them are hashed at once: few operations, each on many numbers.
+
+    A statement has a block of `repeats` times `wanted` draws. Statements of one number share their draws.
+    """
+
+    def __init__(self, blocks: Iterable[tuple[int, int, int]], device: torch.device):
+        """`blocks`: number, repeats and wanted of each statement."""
+        most: dict[int, tuple[int, int]] = {}
+        for statement, repeats, wanted in blocks:
+            old = most.get(statement, (0, 0))
+            most[statement] = max(repeats, old[0]), max(wanted, old[1])
+        self.blocks: dict[int, tuple[int, int, int]] = {}
+        """By statement: the place of its first draw, repeats, wanted."""
+        keys: list[int] = []
+        counters: list[int] = []
+        for statement, (repeats, wanted) in most.items():
+            self.blocks[statement] = (len(keys), repeats, wanted)
+            keys += [statement * _STATEMENT & MASK] * (repeats * wanted)
+            counters += [r * _NUMBERS + n for r in range(repeats) for n in range(wanted)]
+        self.size = len(keys)
+        self.keys = torch.tensor(keys, dtype=torch.int64, device=device)
+        self.spread = torch.tensor(counters, dtype=torch.int64, device=device) * _COUNTER & MASK
+
+
+class Hashes:
+    """The random numbers of a batch of seeds, int64 [B]: those of a table, and others of single statements."""
+
+    def __init__(self, seeds: Tensor, table: DrawTable):
+        self.keys = base_keys(seeds, torch.full_like(seeds, _INDEX))
+        self.table = table
+        self.drawn = self._hash(table.keys, table.spread) if table.size else None
+
+    def draw(self, statement: int, counters: Tensor) -> Tensor:
+        """32-bit numbers of one statement: int64 [B, n] for counters int64 [n]."""
+        key = torch.tensor([statement * _STATEMENT & MASK], device=counters.device)
+        return self._hash(key, (counters * _COUNTER) & MASK)
+
+    def _hash(self, keys: Tensor, spread: Tensor) -> Tensor:
+        keys = mix((self.keys[0][:, None] + keys) & MASK)
+        return mix((mix((keys + spread) & MASK) + self.keys[1][:, None]) & MASK)
+
+    def block(self, statement: int, repeats: int) -> Tensor:
+        """The draws of a statement of the table in its first repetitions: int64 [B, repeats, wanted]."""
+        assert self.drawn is not None
+        start, most, wanted = self.table.blocks[statement]
+        return self.drawn[:, start : start + most * wanted].view(-1, most, wanted)[:, :repeats]
+
+
+def name_number(name: str) -> int:
+    """The number of a name of `let`, by which it draws the same in every split: FNV-1a, 32 bits."""
+    found = 0x811C9DC5
+    for byte in name.encode():
+        found = (found ^ byte) * 0x01000193 & MASK
+    return found
+
+
+class _Draws:
+    """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter."""
+
+    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Tensor]):
+        self.hashes, self.names, self.device = hashes, names, hashes.keys.device
+        self.statement, self.repeats = statement, repeats
+        self.drawn: tuple[Tensor, ...] | None = None
+        self.used = 0
+
+    def uniform(self, low: Tensor | int, high: Tensor | int) -> Tensor:
+        """Whole numbers from `low` to `high`, both included; where there are none, `low`."""
+        if self.drawn is None:
+            self.drawn = self.hashes.block(self.statement, self.repeats).unbind(-1)
+        drawn = self.drawn[self.used]
+        self.used += 1
+        return low + ((drawn * (high - low + 1)) >> 32)
+
+    def value(self, amount: Amount) -> Tensor | int:
+        if amount.op == "number":
+            return int(amount.value or 0)
+        if amount.op == "name":
+            return self.names[str(amount.value)]
+        parts = [self.value(arg) for arg in amount.args]
+        if amount.op == "draw":
+            return self.uniform(parts[0], parts[1])
+        if amount.op == "neg":
+            return -parts[0]
+        if amount.op in ("div", "mod") and any(isinstance(part, Tensor) for part in parts):
+            a, b = (torch.as_tensor(part, device=self.device) for part in parts)
+            return torch.div(a, b, rounding_mode="floor") if amount.op == "div" else torch.remainder(a, b)
+        return calculate(amount.op, parts[0], parts[1])  # type: ignore[arg-type]
+
+    def tensor(self, amount: Amount | None) -> Tensor | None:
+        """int64 that broadcasts to [B, R]."""
+        if amount is None:
+            return None
+        return torch.as_tensor(self.value(amount), device=self.device)
+
+
+def _draws_in(*amounts: Amount | None) -> int:
+    return sum(part.op == "draw" for one in amounts if one is not None for part in one.walk())
+
+
+def _draw_blocks(generator: Generator) -> Iterator[tuple[int, int, int]]:
+    """What a generator draws, as `DrawTable` takes it."""
+    for name, amount in generator.lets:
+        yield name_number(name), 1, _draws_in(amount)
+    for region in generator.regions:
+        for number, shape in enumerate(region.shapes):
+            yield _shape_number(region, number), 1, _draws_in(*shape.amounts)
+    for group in (*generator.groups, *(group for target in generator.targets for group in target.groups)):
+        yield group.number, 1, _draws_in(group.count)
+        for name, amount in group.lets:
+            yield name_number(name), group.most, _draws_in(amount)
+        for one in group.drawings:
+            yield one.number, group.most, _draws_in(*one.amounts) + (len(one.ids) > 1)
+
+
+def _shape_number(region: Region, place: int) -> int:
+    """A region's own draws hang on its name and the shape's place."""
+    return name_number(f"{region.name} {place}")
+
+
+class WorldMaker:
+    """A generator made executable for one size and device."""
+
+    def __init__(self, generator: Generator, size: Size, device: torch.device):
+        self.generator, self.size, self.device = generator, size, device
+        self.words = -(-size[0] // 64)
+        self.stamps = {stamp.name: _bordered(stamp.rows, device) for stamp in generator.stamps}
+        groups = [*generator.groups, *(group for target in generator.targets for group in target.groups)]
+        painted = [i for group in groups for one in group.drawings for i in one.ids]
+        held = [int(i) for stamp in self.stamps.values() for i in stamp.unique() if i != NOTHING]
+        self.planes = max(1, max([generator.fill, *painted, *held]).bit_length())
+        self.table = DrawTable(_draw_blocks(generator), device)
+        self.fixed: dict[Drawing, Tensor] = {}
+        """Words of shapes that are the same in every world."""
+        self._bits: dict[tuple[int, int], Tensor] = {}
+        self.fixed_regions = {
+            region.name: self._union([self.fixed_words(one) for one in region.shapes])[None]
+            for region in generator.regions
+            if not region.drawn
+        }
+        self.fixed_cells = {
+            name: unpack([words], size[0]).bool() for name, words in self.fixed_regions.items()
+        }
+
+    def make(self, seeds: Tensor) -> Made:
+        """The worlds of some seeds, int64 [B]."""
+        chunk = max(1, len(seeds))
+        if self.device.type == "cpu":
+            chunk = max(1, CHUNK_CELLS // max(self.size[0] * self.size[1], self.table.size))
+        made = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
+        if len(made) == 1:
+            return made[0]
+        regions = dict(made[0].regions)
+        for name in (name for name in regions if name not in self.fixed_cells):
+            regions[name] = torch.cat([one.regions[name] for one in made])
+        targets = {name: torch.cat([one.targets[name] for one in made]) for name in made[0].targets}
+        return Made(torch.cat([one.ids for one in made]), regions, targets)
+
+    def _chunk(self, seeds: Tensor) -> Made:
+        hashes = Hashes(seeds, self.table)
+        names = self._lets(self.generator.lets, hashes, 1, {})
+        regions = dict(self.fixed_regions)
+        for region in self.generator.regions:
+            if region.drawn:
+                regions[region.name] = self._region(region, hashes, names)
+        cells = {
+            name: self.fixed_cells[name] if name in self.fixed_cells else unpack([words], self.size[0]).bool()
+            for name, words in regions.items()
+        }
+        planes = self._canvas(len(seeds), self.generator.fill)
+        self._paint(planes, self.generator.groups, hashes, names, regions)
+        targets = {}
+        for target in self.generator.targets:
+            canvas = self._canvas(len(seeds), 0, more=1)
+            self._paint(canvas, target.groups, hashes, names, regions)
+            painted = unpack(canvas[-1:], self.size[0]).bool()
+            targets[target.name] = torch.where(painted, unpack(canvas[:-1], self.size[0]), NOTHING)
+        return Made(unpack(planes, self.size[0]), cells, targets)
+
+    def _canvas(self, batch: int, fill: int, more: int = 0) -> Tensor:
+        """Planes of an element everywhere, int64 [P, B, W, K]; with one more plane for what has been painted."""
+        bits = [-(fill >> plane & 1) for plane in range(self.planes + more)]
+        plane = torch.tensor(bits, dtype=torch.int64, device=self.device)[:, None, None, None]
+        return plane.repeat(1, batch, self.size[1], self.words)
+
+    def _lets(
+        self, lets: tuple[tuple[str, Amount], ...], hashes: Hashes, repeats: int, names: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """`names` and more of them: int64 that broadcasts to [B, R]."""
+        found = dict(names)
+        for name, amount in lets:
+            value = _Draws(hashes, name_number(name), repeats, found).tensor(amount)
+            assert value is not None
+            found[name] = value
+        return found
+
+    def _region(self, region: Region, hashes: Hashes, names: Mapping[str, Tensor]) -> Tensor:
+        """Words [B, W, K] of a region."""
+        found = []
+        for number, shape in enumerate(region.shapes):
+            draws = _Draws(hashes, _shape_number(region, number), 1, names)
+            words = self.drawn_words(shape, [draws.tensor(one) for one in shape.amounts])
+            full = (len(hashes.keys[0]), 1, self.size[1], self.words)
+            found.append(words.expand(full)[:, 0])
+        return self._union(found)
+
+    @staticmethod
+    def _union(words: list[Tensor]) -> Tensor:
+        found = words[0]
+        for one in words[1:]:
+            found = found | one
+        return found
+
+    def drawn_words(self, drawing: Drawing, numbers: list[Tensor | None]) -> Tensor:
+        """The words of a shape whose numbers broadcast to [B, R]: broadcasts to [B, R, W, K]."""
+        if drawing.kind in ("frame", "fill"):
+            return self.fixed_words(drawing)
+        return words_of_rows(covered_rows(drawing.kind, numbers, self.size), self.size)
+
+    def fixed_words(self, drawing: Drawing) -> Tensor:
+        """The words [W, K] of a shape of plain numbers."""
+        if drawing not in self.fixed:
+            numbers = [None if one is None else int(one.value or 0) for one in drawing.amounts]
+            cells = torch.as_tensor(mask(shape_of(drawing.kind, numbers), self.size), device=self.device)
+            self.fixed[drawing] = pack(cells)
+        return self.fixed[drawing]
+
+    def fixed_bits(self, number: int, planes: int) -> Tensor:
+        """The bits of an id, as `_plane_bits` has them."""
+        if (number, planes) not in self._bits:
+            self._bits[number, planes] = _plane_bits(
+                torch.tensor(number, device=self.device), planes, self.planes
+            )
+        return self._bits[number, planes]
+
+    def _paint(
+        self,
+        planes: Tensor,
+        groups: tuple[Group, ...],
+        hashes: Hashes,
+        names: Mapping[str, Tensor],
+        regions: Mapping[str, Tensor],
+    ) -> None:
+        """Paint all groups on planes, in place."""
+        batch = planes.shape[1]
+        for group in groups:
+            count = _Draws(hashes, group.number, 1, names).tensor(group.count)
+            assert count is not None
+            repeats = group.most
+            if planes.device.type == "cpu" and repeats > 1:
+                repeats = int(count.max())  # what no world of the batch repeats is not drawn
+            if repeats == 0:
+                continue
+            active = torch.arange(repeats, device=self.device) < count
+            once = -active.expand(batch, repeats).long()[..., None, None]
+            local = self._lets(group.lets, hashes, repeats, names)
+            painters = []
+            for one in group.drawings:
+                draws = _Draws(hashes, one.number, repeats, local)
+                painters.append(_Painter(self, one, draws, once, len(planes)))
+            for repeat in range(repeats):
+                for painter in painters:
+                    painter.paint(planes, repeat, regions)
+
+
+class _Painter:
+    """One statement in all its repetitions: what it needs is computed for all of them at once."""
+
+    def __init__(self, maker: WorldMaker, drawing: Drawing, draws: _Draws, once: Tensor, planes: int):
+        """`once`: int64 [B, R, 1, 1], all bits where a world has a repetition."""
+        self.maker, self.drawing, self.draws = maker, drawing, draws
+        repeats = once.shape[1]
+        if len(drawing.ids) > 1:
+            ids = torch.tensor(drawing.ids, device=maker.device)[draws.uniform(0, len(drawing.ids) - 1)]
+            bits = _plane_bits(ids, planes, maker.planes)
+        else:  # those of stamps stand in their pictures
+            bits = maker.fixed_bits(drawing.ids[0] if drawing.ids else 0, planes)
+        self.bits = bits.unbind(2) if bits.shape[2] > 1 else bits.unbind(2) * repeats
+        self.numbers: list[Tensor | None] = []
+        if all(one is None or one.is_number for one in drawing.amounts) and drawing.kind not in _LIMITED:
+            words = maker.fixed_words(drawing) & once
+        else:
+            numbers = [draws.tensor(one) for one in drawing.amounts]
+            self.numbers = [None if one is None else one.expand(once.shape[:2]) for one in numbers]
+            words = once
+            if drawing.kind not in _LIMITED:
+                words = maker.drawn_words(drawing, self.numbers) & once
+        self.words = words.unbind(1)
+
+    def paint(self, planes: Tensor, repeat: int, regions: Mapping[str, Tensor]) -> None:
+        """Paint one repetition on planes, in place."""
+        drawing = self.drawing
+        words, bits = self.words[repeat], self.bits[repeat]
+        if drawing.kind == "stamp":
+            picture = self._stamp(repeat)
+            words = words & pack(picture != NOTHING)
+            layers = [pack((picture >> place & 1).bool()) for place in range(self.maker.planes)]
+            layers += [torch.full_like(words, -1)] * (len(planes) - len(layers))
+            bits = torch.stack(layers)
+        elif drawing.kind == "scatter":
+            words = words & self._scattered(repeat)
+        if drawing.where is not None:
+            words = words & regions[drawing.where]
+        if drawing.over is not None:
+            words = words & self._holding(planes, drawing.over)
+        planes ^= (planes ^ bits) & words
+
+    def _holding(self, planes: Tensor, ids: frozenset[int]) -> Tensor:
+        """The words of cells that hold one of some elements."""
+        found = torch.zeros_like(planes[0])
+        for one in sorted(ids):
+            same = torch.full_like(planes[0], -1 if one >> self.maker.planes == 0 else 0)
+            for place in range(self.maker.planes):
+                same = same & (planes[place] if one >> place & 1 else ~planes[place])
+            found = found | same
+        return found
+
+    def _stamp(self, repeat: int) -> Tensor:
+        """The stamp where it stands in each world: uint8 [B, H, W], NOTHING around it."""
+        picture = self.maker.stamps[str(self.drawing.stamp)]
+        index = []
+        for axis, side in enumerate(self.maker.size):
+            start = self.numbers[axis]
+            assert start is not None
+            place = torch.arange(side, device=picture.device) - start[:, repeat, None] + 1
+            index.append(place.clamp(0, picture.shape[axis] - 1))
+        return picture[index[0][:, :, None], index[1][:, None, :]]
+
+    def _scattered(self, repeat: int) -> Tensor:
+        """Words [B, W, K] in which each bit is set with the chance of `chance` in a hundred.
+
+        A draw of CHANCE_BITS bits is compared with the threshold from the last bit to the first, 64 cells at once.
+        """
+        percent = self.numbers[0]
+        assert percent is not None
+        limit = (percent[:, repeat, None] << CHANCE_BITS) // 100
+        width, words = self.maker.size[1], self.maker.words
+        halves = torch.arange(2 * width * words, device=limit.device)
+        below = torch.zeros_like(halves)[None]
+        for place in range(CHANCE_BITS):
+            counters = (
+                ((halves + 1) * CHANCE_BITS + place) * (_NUMBERS * 256) + repeat * _NUMBERS + _NUMBERS - 1
+            )
+            drawn = self.draws.hashes.draw(self.drawing.number, counters)
+            bit = -(limit >> place & 1)
+            below = (bit & ~drawn) | (~(bit ^ drawn) & below)
+        below = torch.where(limit >> CHANCE_BITS > 0, -1, below) & MASK
+        low, high = below.view(-1, width, words, 2).unbind(-1)
+        return low | high << 32
+
+
+def _plane_bits(ids: Tensor, planes: int, own: int) -> Tensor:
+    """The bits of ids [B, R] (or fewer) in each plane, as whole words: [P, B, R, 1, 1], planes beyond `own` set."""
+    ids = ids[(None,) * (2 - ids.ndim)]
+    place = torch.arange(planes, device=ids.device)[:, None, None]
+    return torch.where(place < own, -(ids >> place & 1), -1)[..., None, None]
+
+
+def _bordered(rows: tuple[tuple[int, ...], ...], device: torch.device) -> Tensor:
+    """A stamp's ids with a border of NOTHING, uint8 [h + 2, w + 2]: what lies outside is read there."""
+    picture = torch.tensor(rows, dtype=torch.uint8, device=device)
+    return torch.nn.functional.pad(picture, (1, 1, 1, 1), value=NOTHING)

@@ -1,0 +1,255 @@
+"""Measures on tensors: cell expressions lowered to one generated function, and sums of what it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from powderdsl.ir.build import Builder
+from powderdsl.ir.lower.expressions import Planes, lower_expression
+from powderdsl.ir.lower.rules import plane_names, plane_type
+from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType
+from powderdsl.ir.stages import run_passes
+from powderdsl.model.state import slots
+from powderdsl.model.types import Expr, Ruleset
+from powderdsl.targets.dense.program import Kernels, PassFunction, compiled
+from powderdsl.targets.dense.source import pass_source
+from powderdsl.tasks.goals import REGION_LET, parts_of
+from powderdsl.tasks.task import Goal, Measure, Scalar
+from powderdsl.tasks.tensors.generator import NOTHING
+from powderdsl.worlds.raster import Size
+
+Window = tuple[int, int, int, int]
+"""First row, the one after the last, first column, the one after the last."""
+
+_LOOKING = ("look", "count", "sum", "inside", "coordinate")
+"""Operations that see more than the cell itself: a window on the world would change them."""
+
+
+def scalars_of(goal: Goal) -> list[Scalar]:
+    """Every part of a goal's expressions."""
+    scalars = [one for one in (goal.each, goal.final, goal.success, goal.failure) if one is not None]
+    return [part for one in scalars for part in parts_of(one)]
+
+
+def measures_of(goal: Goal) -> tuple[Measure, ...]:
+    """Every measure of a goal once."""
+    return tuple(dict.fromkeys(part.value for part in scalars_of(goal) if part.op == "measure"))
+
+
+@dataclass(frozen=True)
+class Given:
+    """What measures are taken of: a state and the masks of its episodes."""
+
+    state: Mapping[str, Tensor]
+    step: Tensor
+    params: Mapping[str, Tensor]
+    regions: Mapping[str, Tensor]
+    targets: Mapping[str, Tensor]
+
+
+class Meter:
+    """Measures made executable for one ruleset and size.
+
+    Args:
+        fixed: the regions that are the same in all worlds, bool [1, H, W]: only their window is looked at.
+    """
+
+    def __init__(
+        self,
+        ruleset: Ruleset,
+        measures: tuple[Measure, ...],
+        size: Size,
+        fixed: Mapping[str, Tensor],
+        device: torch.device,
+    ):
+        self.measures, self.size, self.device = measures, size, device
+        groups: dict[Window, list[int]] = {}
+        for number, measure in enumerate(measures):
+            if measure.value is not None:
+                groups.setdefault(_window(measure, size, fixed), []).append(number)
+        self._parts = [
+            _Part(ruleset, [(i, measures[i]) for i in numbers], window, device)
+            for window, numbers in groups.items()
+        ]
+
+    def take(self, given: Given) -> Tensor:
+        """The numbers of all measures: float64 [B, n]."""
+        batch = len(given.step)
+        found: list[Tensor] = [torch.zeros(0)] * len(self.measures)
+        for part in self._parts:
+            for number, cells in part.cells(given).items():
+                found[number] = self._reduced(self.measures[number], cells, part.window, given)
+        for number, measure in enumerate(self.measures):
+            if measure.target is not None:
+                target = given.targets[measure.target]
+                wanted = (target != NOTHING).sum((1, 2)).double()
+                same = (given.state["element"] == target).sum((1, 2)).double()
+                found[number] = same / wanted.clamp(min=1)
+        if not found:
+            return torch.zeros(batch, 0, dtype=torch.float64, device=self.device)
+        return torch.stack([one.expand(batch) for one in found], 1)
+
+    def _reduced(self, measure: Measure, cells: Tensor, window: Window, given: Given) -> Tensor:
+        """One number a world, float64 [B], of cells [B, h, w] in a window."""
+        mask = None
+        if measure.region is not None:
+            mask = _cut(given.regions[measure.region], window)
+            cells = cells & mask if cells.dtype == torch.bool else cells * mask
+        exact = torch.int32 if cells.dtype == torch.bool else torch.int64  # counts: half the time
+        total = cells.sum((1, 2), dtype=torch.float64 if cells.dtype.is_floating_point else exact).double()
+        match measure.how:
+            case "share" | "mean":
+                count = self.size[0] * self.size[1] if mask is None else mask.sum((1, 2))
+                return total / torch.as_tensor(count, device=self.device).clamp(min=1)
+            case "highest":
+                height = self.size[0] - torch.arange(window[0], window[1], device=self.device)
+                return (cells.any(2) * height).amax(1).double()
+        return total
+
+
+def _window(measure: Measure, size: Size, fixed: Mapping[str, Tensor]) -> Window:
+    """The part of the world that a measure looks at: the whole, unless its region is small and fixed."""
+    value = measure.value
+    assert value is not None
+    whole = (0, size[0], 0, size[1])
+    if measure.region not in fixed or any(part.op in _LOOKING for part in value.walk()):
+        return whole
+    rows, columns = (fixed[str(measure.region)][0].any(axis).nonzero()[:, 0] for axis in (1, 0))
+    if not len(rows):
+        return whole
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
+def _cut(plane: Tensor, window: Window) -> Tensor:
+    top, bottom, left, right = window
+    return plane[..., top:bottom, left:right]
+
+
+class _Part:
+    """The cell expressions of one window as one generated function."""
+
+    def __init__(
+        self, ruleset: Ruleset, measures: list[tuple[int, Measure]], window: Window, device: torch.device
+    ):
+        self.window, self.device = window, device
+        self.numbers = [number for number, _ in measures]
+        build = Builder()
+        table = {slot.name: slot for slot in slots(ruleset)}
+        types = {
+            name: plane_type(slot.kind, ruleset.slots)
+            for slot in table.values()
+            for name in plane_names(slot)
+        }
+        exprs = [measure.value for _, measure in measures if measure.value is not None]
+        regions = sorted({name for expr in exprs for name in _regions_of(expr)})
+        state = {name: build.input(name, type) for name, type in types.items()}
+        lets: dict[str, Node | tuple[Node, Node]] = {name: build.input(name, FLAG) for name in regions}
+        outputs = []
+        for number, expr in zip(self.numbers, exprs, strict=True):
+            node = lower_expression(expr, Planes(ruleset, build, state, lets, table))
+            assert isinstance(node, Node)
+            outputs.append((f"measure {number}", node))
+        rows = [SlotType(name, type, 0, False) for name, type in types.items()]
+        rows += [SlotType(name, FLAG, 0, False) for name in regions]
+        rows += [SlotType(name, node.type, 0, False) for name, node in outputs]
+        params = tuple((p.name, p.kind.name) for p in ruleset.params)
+        streams = tuple((s.name, s.ident, s.bits) for s in ruleset.streams)
+        graph = PassGraph("measures", ruleset.name, (), tuple(outputs))
+        program = run_passes(Program(ruleset.name, tuple(rows), params, streams, (graph,)))
+        source, name, constants = pass_source(program.passes[0], 0)
+        self.slots = [one for one in types if f"state[{one!r}]" in source]
+        self.types, self.regions = types, regions
+        self.run: PassFunction = compiled(source, name, constants, device)
+
+    def cells(self, given: Given) -> dict[int, Tensor]:
+        """The value of each cell of the window, [B, h, w], by the measure's number."""
+        batch = len(given.step)
+        top, bottom, left, right = self.window
+        none = torch.zeros(0, dtype=torch.int64, device=self.device)
+        shape = (batch, bottom - top, right - left)
+        kernels = Kernels(shape, self.device, given.params, {}, {}, none, none, given.step)
+        planes: dict[str, Tensor] = {}
+        for name in self.slots:
+            base, _, part = name.rpartition(".")
+            vector = part in ("row", "column") and base in given.state
+            plane = given.state[base][:, ("row", "column").index(part)] if vector else given.state[name]
+            planes[name] = _cut(plane, self.window).to(_WORKING[self.types[name].name])
+        for name in self.regions:
+            planes[name] = _cut(given.regions[name.removeprefix(REGION_LET)], self.window)
+        found = self.run(kernels, planes)
+        return {number: found[f"measure {number}"] for number in self.numbers}
+
+
+_WORKING = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
+
+
+def _regions_of(expr: Expr) -> set[str]:
+    return {str(part.value) for part in expr.walk() if part.op == "let"}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a scalar is calculated from: measures now, at the start and before the action, float64 [B, n]; and the action."""
+
+    measures: Mapping[Measure, int]
+    now: Tensor
+    start: Tensor
+    before: Tensor
+    action: Mapping[str, Tensor]
+
+
+def scalar_value(scalar: Scalar, facts: Facts) -> Tensor:
+    """float64 [B]; conditions are 0 or 1."""
+    match scalar.op:
+        case "const":
+            return torch.full_like(facts.now[:, :1].sum(1), float(scalar.value))
+        case "measure":
+            return facts.now[:, facts.measures[scalar.value]]
+        case "action":
+            return facts.action[scalar.value].double()
+        case "start" | "before":
+            then = facts.start if scalar.op == "start" else facts.before
+            past = Facts(facts.measures, then, facts.start, facts.before, facts.action)
+            return scalar_value(scalar.args[0], past)
+    a, *rest = (scalar_value(arg, facts) for arg in scalar.args)
+    b = rest[0] if rest else a
+    match scalar.op:
+        case "add":
+            return a + b
+        case "sub":
+            return a - b
+        case "mul":
+            return a * b
+        case "div":
+            return torch.where(b == 0, torch.zeros_like(a), a / b)
+        case "quotient":
+            return torch.where(b == 0, torch.zeros_like(a), torch.floor(a / b))
+        case "mod":
+            return torch.where(b == 0, torch.zeros_like(a), torch.remainder(a, b))
+        case "neg":
+            return -a
+        case "abs":
+            return a.abs()
+        case "min":
+            return torch.minimum(a, b)
+        case "max":
+            return torch.maximum(a, b)
+        case "lt":
+            return (a < b).double()
+        case "le":
+            return (a <= b).double()
+        case "eq":
+            return (a == b).double()
+        case "and":
+            return a * b
+        case "or":
+            return torch.maximum(a, b)
+        case "not":
+            return 1 - a
+        case "choose":
+            return torch.where(a != 0, b, rest[1])
+    raise AssertionError(scalar.op)

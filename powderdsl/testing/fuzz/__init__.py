@@ -1,0 +1,1 @@
+"""Fuzzing: targets compared on random rules, damaged rule files, failing cases made small."""

@@ -1,0 +1,171 @@
+"""Fuzzing at length: many seeds in several processes, what fails made small and saved, and where to go on."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter, deque
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from tempfile import gettempdir
+
+import torch
+
+from powderdsl.system.crew import Done, Lost, Tell, work_through
+from powderdsl.system.reading import parse_json, read_bytes
+from powderdsl.system.scratch import scratch_folder
+from powderdsl.system.writing import failure, replacing
+from powderdsl.testing.fuzz.case_files import write_case
+from powderdsl.testing.fuzz.differential import Finding, Outcome, Plan, run_seed, seeded_starts, still_fails
+from powderdsl.testing.fuzz.reducer import reduce_case
+from powderdsl.testing.generators.cases import Case, load_text
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
+
+SEED_LIMIT = 600.0
+"""Seconds that a seed may take before it counts as one that hangs."""
+
+REDUCE_SECONDS = 120.0
+MOST_FINDINGS = 20
+"""So many are enough: they have one cause, more often than not."""
+
+STATE_FILE = "state.json"
+
+
+@dataclass
+class Tally:
+    """What has been done. `next`: all seeds from the first one to before this are done."""
+
+    plan: str
+    first: int
+    next: int
+    rulesets: int = 0
+    refused: int = 0
+    worlds: int = 0
+    used: Counter[tuple[str, str]] = field(default_factory=Counter)
+    files: list[str] = field(default_factory=list)
+    """Names of the files with what failed."""
+    _ahead: set[int] = field(default_factory=set)
+
+    def count(self, outcome: Outcome) -> None:
+        """Add the outcome of a seed."""
+        self.refused += outcome.refused
+        self.rulesets += not outcome.refused
+        self.worlds += outcome.worlds
+        self.used.update(outcome.used)
+        self.pass_over(outcome.seed)
+
+    def pass_over(self, seed: int) -> None:
+        """Note that a seed is done."""
+        self._ahead.add(seed)
+        while self.next in self._ahead:
+            self._ahead.remove(self.next)
+            self.next += 1
+
+
+def describe(plan: Plan) -> str:
+    """The plan in a line; a campaign goes on only under the same one."""
+    return f"{','.join(plan.backends)} worlds {plan.worlds} steps {plan.steps} {plan.building.level}"
+
+
+def save_tally(tally: Tally, folder: Path) -> None:
+    """Write the state file, whole or not at all. Raises CompileError (PD613) if it cannot be written."""
+    rows = {key: value for key, value in vars(tally).items() if not key.startswith("_")}
+    rows["used"] = [[group, name, count] for (group, name), count in sorted(tally.used.items())]
+    with replacing(folder / STATE_FILE) as temporary:
+        temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+def load_tally(folder: Path, plan: Plan) -> Tally:
+    """The state file of a folder. Raises CompileError: PD101 there is none, PD602 it is of another plan, or none."""
+    path = folder / STATE_FILE
+    try:
+        rows = parse_json(read_bytes(path, 1 << 22))
+        used = Counter({(str(group), str(name)): int(count) for group, name, count in rows.pop("used")})
+        tally = Tally(**rows, used=used)
+    except OSError as error:
+        raise failure("PD101", f"cannot read {path}", notes=(str(error.strerror),)) from None
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise failure("PD602", f"{path} is no state of `powderdsl fuzz`", notes=(str(error),)) from None
+    if tally.plan != describe(plan):
+        notes = (f"there: {tally.plan}", f"here: {describe(plan)}")
+        helps = ("give the options that it began with, or another folder",)
+        raise failure("PD602", f"{path} belongs to another plan", notes=notes, helps=helps)
+    return tally
+
+
+def run_campaign(
+    plan: Plan, tally: Tally, seeds: Iterator[int], jobs: int, folder: Path, until: float
+) -> Generator[Outcome | Path, None, None]:
+    """Compare on seeds until they or the time are over; each outcome of a seed, and each file with a finding.
+
+    The state file is kept up to date, also when the caller stops early. Findings are saved as they are found, and
+    again when they have been made smaller.
+
+    Args:
+        seeds: the seeds that are left.
+        until: the end, on `time.monotonic`'s clock.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    tasks: deque[int | Finding] = deque(islice(seeds, 2 * jobs))
+    saved = time.monotonic()
+    with scratch_folder(Path(gettempdir())) as scratch:
+        work = partial(perform, plan, scratch)
+        try:
+            for heard in work_through(tasks, work, jobs, SEED_LIMIT):
+                findings: tuple[Finding, ...] = ()
+                if isinstance(heard, Lost):
+                    findings = () if isinstance(heard.task, Finding) else (_lost(plan, heard),)
+                    if not isinstance(heard.task, Finding):
+                        tally.pass_over(heard.task)
+                elif isinstance(heard.result, Outcome):
+                    tally.count(heard.result)
+                    findings = heard.result.findings
+                    yield heard.result
+                else:
+                    write_case(folder / file_name(heard.result), heard.result.case, heard.result.problem)
+                for finding in findings:
+                    path = folder / file_name(finding)
+                    write_case(path, finding.case, finding.problem)
+                    tally.files.append(path.name)
+                    if isinstance(heard, Done):
+                        tasks.appendleft(finding)
+                    yield path
+                if time.monotonic() < until and len(tally.files) < MOST_FINDINGS:
+                    tasks.extend(islice(seeds, max(0, 2 * jobs - len(tasks))))
+                else:
+                    for task in [task for task in tasks if not isinstance(task, Finding)]:
+                        tasks.remove(task)
+                if time.monotonic() > saved + 10:
+                    saved = time.monotonic()
+                    save_tally(tally, folder)
+        finally:
+            save_tally(tally, folder)
+
+
+def file_name(finding: Finding) -> str:
+    return f"seed{finding.seed}-{finding.case.backend}.yaml"
+
+
+def perform(plan: Plan, scratch: Path, task: int | Finding, tell: Tell) -> Outcome | Finding:
+    """What a process does with a task: runs a seed, or makes a finding small."""
+    torch.set_num_threads(1)
+    folder = scratch / str(os.getpid())  # each its own, so that none removes what another has just built
+    folder.mkdir(exist_ok=True)
+    how = replace(plan.building, folder=folder)
+    if isinstance(task, int):
+        return run_seed(task, replace(plan, building=how), tell)
+    end = time.monotonic() + REDUCE_SECONDS
+    fails = still_fails(task, how)
+    return replace(task, case=reduce_case(task.case, lambda case: time.monotonic() < end and fails(case)))
+
+
+def _lost(plan: Plan, lost: Lost) -> Finding:
+    """What a process was at when it died or was ended, as a finding: not made small, since it would die again."""
+    text = random_ruleset_text(lost.task)
+    backend, number = lost.told or (plan.backends[0], 0)
+    starts = list(seeded_starts(load_text(text), lost.task, plan.worlds))
+    return Finding(lost.task, Case(text, starts[number], plan.steps, backend), "lost", lost.reason)

@@ -1,0 +1,1 @@
+"""Random rulesets and start worlds, from a seed or from Hypothesis."""

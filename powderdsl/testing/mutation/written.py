@@ -1,0 +1,205 @@
+"""A world on which a mutant differs, as a test that can be pasted into the pack, and put there with all else kept."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.model.declarations import PackDecl
+from powderdsl.model.types import Element, Ruleset
+from powderdsl.simulation.draw import to_numpy
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.syntax.yaml_tree import Mapping, parse_yaml
+from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
+from powderdsl.testing.mutation.distinguishing import Distinction
+from powderdsl.testing.mutation.mutants import Mutant
+from powderdsl.testing.mutation.original import GENERATED
+from powderdsl.testing.pack_tests.fields import field_rows
+from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS
+from powderdsl.testing.properties.running import run_sample
+
+LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
+
+
+@dataclass(frozen=True)
+class GeneratedTest:
+    """A test of a pack. `text` is an item of `tests:` without indentation."""
+
+    pack: str
+    name: str
+    text: str
+
+
+def written_test(
+    mutant: Mutant, found: Distinction, sim: Simulator, packs: Sequence[PackDecl]
+) -> GeneratedTest:
+    """The test that the original passes and the mutant fails. `sim` runs the original.
+
+    A test names no seed if the original does the same with all that a test runs with by itself.
+    """
+    ruleset = sim.ruleset
+    seed: int | None = int(found.sample.seeds[0])
+    others = replace(found.sample.repeated(len(SEEDS)), seeds=np.array(SEEDS, np.int64))
+    after = run_sample(sim, others, found.steps)[0][-1][found.slot]
+    if seed in SEEDS and (after == found.first[found.slot]).all():
+        seed = None
+    before, wanted = found.sample.ids[0], found.first["element"][0]
+    there = [e for e in ruleset.elements if e.id in np.unique([*before.ravel(), *wanted.ravel()])]
+    glyphs, legend = _legend(there, ruleset, packs, mutant.pack)
+    name = f"{GENERATED}{_digest(mutant.key)} against {mutant.operator} in {_where(mutant)}"
+    lines = [f"- {name}:"]
+    if legend:
+        said = ", ".join(f"{_quoted(glyph)}: {element}" for glyph, element in legend)
+        lines.append(f"    legend: {{{said}}}")
+    lines += ["    given: |", *_drawn(before, glyphs)]
+    needed = _closure(packs, mutant.pack)
+    start = run_sample(sim, found.sample, 0)[1]
+    usual = sim.world(found.sample.ids)
+    for field in found.sample.fields:
+        words = _words(field, start, ~_unequal(start, usual, field), ".")
+        if words:
+            lines += ["    fields:"] if "    fields:" not in lines else []
+            lines += [f"      {_known(field, ruleset, needed)}: |", *words]
+    lines.append(f"    after: {found.steps} step{'' if found.steps == 1 else 's'}")
+    if found.slot == "element":
+        lines += ["    expect: |", *_drawn(wanted, glyphs)]
+    else:
+        end = run_sample(sim, found.sample, found.steps)[1]
+        unequal = (found.first[found.slot] != found.second[found.slot])[0]
+        same = ~(unequal.any(0) if unequal.ndim == 3 else unequal)
+        name_ = _known(found.slot, ruleset, needed)
+        lines += ["    expect_fields:", f"      {name_}: |", *_words(found.slot, end, same, ANYTHING)]
+    if seed is not None:
+        lines.append(f"    seed: {seed}")
+    return GeneratedTest(mutant.pack, name, "\n".join(lines) + "\n")
+
+
+def _unequal(first: World, second: World, field: str) -> np.ndarray:
+    """bool [H, W]: cells in which a field of two worlds differs."""
+    unequal = to_numpy(first.state[field][0]) != to_numpy(second.state[field][0])
+    return np.asarray(unequal.any(0) if unequal.ndim == 3 else unequal)
+
+
+def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]:
+    """A drawing of a field, with a filler for cells that need not be told; none if that is all of them."""
+    if same.all():
+        return []
+    rows = [row.split() for row in field_rows(field, world, 0)]
+    told = [[filler if same[y, x] else word for x, word in enumerate(words)] for y, words in enumerate(rows)]
+    return ["        " + " ".join(words) for words in told]
+
+
+def _known(field: str, ruleset: Ruleset, needed: frozenset[str]) -> str:
+    """A field's name, with `?` if its pack may be absent."""
+    owners = {one.name: one.pack for one in ruleset.fields} | {
+        one.name: one.pack for one in ruleset.properties
+    }
+    owner = owners[field]
+    return field if owner in needed else f"{field}?"
+
+
+def _drawn(ids: np.ndarray, glyphs: dict[int, str]) -> list[str]:
+    return ["      " + " ".join(glyphs[number] for number in row) for row in ids.tolist()]
+
+
+def _digest(key: str) -> str:
+    return hashlib.sha256(re.sub(r":\d+", "", key).encode()).hexdigest()[:6]
+
+
+def _where(mutant: Mutant) -> str:
+    """The words that were changed, as far as a name of a test can hold them."""
+    edit = mutant.edits[0]
+    old = " ".join(mutant.source.text[edit.start : edit.end].split())
+    words = re.sub(r"[^A-Za-z0-9_ .<>=+*/()%-]", " ", old or mutant.pack)
+    return " ".join(words.split())[:40].strip(" -") or mutant.pack
+
+
+def _quoted(glyph: str) -> str:
+    return glyph if glyph.isalpha() else f'"{glyph}"'
+
+
+def _legend(
+    there: Sequence[Element], ruleset: Ruleset, packs: Sequence[PackDecl], pack: str
+) -> tuple[dict[int, str], list[tuple[str, str]]]:
+    """A character for each element, and those that a legend must explain.
+
+    Characters that packs choose themselves are known wherever these are loaded; all others depend on what else is
+    loaded. Elements of packs that this one does not need may be absent: the test then waits.
+    """
+    needed = _closure(packs, pack)
+    chosen = {f"{one.name.text}.{decl.name.text}": decl.glyph for one in packs for decl in one.elements}
+    glyphs: dict[int, str] = {}
+    legend = []
+    for element in there:
+        if chosen.get(element.qualified) and element.pack in needed and element.glyph not in glyphs.values():
+            glyphs[element.id] = element.glyph
+    for element in there:
+        if element.id in glyphs:
+            continue
+        taken = {
+            *glyphs.values(),
+            "?",
+            *(e.glyph for e in ruleset.elements if e.pack in needed and chosen.get(e.qualified)),
+        }
+        wanted = [element.glyph, *element.name, *element.name.upper(), *LETTERS]
+        glyph = next(one for one in wanted if one not in taken and one not in "\"'\\#")
+        glyphs[element.id] = glyph
+        legend.append((glyph, element.name if element.pack in needed else f"{element.name}?"))
+    return glyphs, legend
+
+
+def _closure(packs: Sequence[PackDecl], pack: str) -> frozenset[str]:
+    """A pack and all that it needs, directly or not."""
+    needs = {one.name.text: [need.text for need in one.needs] for one in packs}
+    found: set[str] = set()
+    waiting = [pack]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting.extend(needs.get(name, ()))
+    return frozenset(found)
+
+
+def with_tests(source: Source, tests: Sequence[GeneratedTest]) -> str:
+    """A pack's text with more tests at the end of its `tests:`; comments and all else stay as they are.
+
+    Raises:
+        ValueError: `tests:` is written in a way that nothing can be added to, as in `tests: [...]`.
+    """
+    root = parse_yaml(source, Reporter())
+    text = source.text if source.text.endswith("\n") or not source.text else source.text + "\n"
+    node = root.get("tests") if isinstance(root, Mapping) else None
+    if node is None:
+        return text + "tests:\n" + "".join(_indented(test.text, 2) for test in tests)
+    if not isinstance(node, YamlSequence) or source.text[node.span.start] == "[":
+        raise ValueError(f"{source.name}: `tests:` is not a list with a line for each test")
+    first = source.text.rfind("\n", 0, node.span.start) + 1
+    indent = len(source.text[first : node.span.start]) - len(source.text[first : node.span.start].lstrip(" "))
+    # The list ends before the next key of the file, or at its end; blank lines and comments between stay below it.
+    following = [key.span.start for key, _ in root.entries if key.span.start > node.span.start]  # type: ignore[union-attr]
+    end = min(following, default=len(text))
+    lines = text[:end].splitlines(keepends=True)
+    while lines and (not lines[-1].strip() or lines[-1].startswith("#")):
+        end -= len(lines.pop())
+    return text[:end] + "".join(_indented(test.text, indent) for test in tests) + text[end:]
+
+
+def _indented(text: str, indent: int) -> str:
+    return "".join(f"{' ' * indent}{line}\n" for line in text.splitlines())
+
+
+def add_tests(path: Path, tests: Sequence[GeneratedTest]) -> None:
+    """Write more tests into a pack's file, whole or not at all."""
+    from powderdsl.system.writing import replacing
+
+    path = path.resolve()
+    whole = with_tests(Source(str(path), path.read_text(encoding="utf-8")), tests)
+    with replacing(path) as temporary:
+        temporary.write_text(whole, encoding="utf-8")

@@ -1,0 +1,139 @@
+"""Chances that tests of packs claim, held against counts: many copies of a world, each with luck of its own.
+
+A count is judged by Chernoff's bound, which needs no table and holds for any number of trials: that n trials of a
+chance p come out at a share q or farther away has a probability of at most exp(−n·D(q‖p)) on each side, where D is the
+divergence of the two. A correct rule fails with a probability below `ERROR_RATE`; the seeds are fixed, so that a test
+which passes once passes always.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import ceil, log
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.model import reference
+from powderdsl.model.state import slots
+from powderdsl.model.types import Often
+from powderdsl.simulation.draw import to_numpy
+
+if TYPE_CHECKING:
+    from powderdsl.simulation.simulator import World
+
+ERROR_RATE = 1e-6
+"""How likely a correct chance fails a test, at most; and how likely one passes that is off by `OFF`."""
+
+OFF = 0.25
+"""How far a chance may be off, as a part of itself or of what it lacks to 100 %, before it is sure to be noticed."""
+
+MOST = 1 << 25
+"""Cells times steps that a test may cost. A chance that would need more is tested less sharply."""
+
+CHUNK = 1 << 19
+"""Cells that run at once."""
+
+
+def divergence(share: float, chance: float) -> float:
+    """How unlike two chances are, D(share‖chance), in nats for each trial."""
+    total = 0.0
+    for a, b in ((share, chance), (1 - share, 1 - chance)):
+        if a > 0:
+            if b <= 0:
+                return float("inf")
+            total += a * log(a / b)
+    return max(total, 0.0)
+
+
+def is_unlikely(hits: int, trials: int, chance: float) -> bool:
+    """Whether chance alone gives a count like this, or one farther off, less than once in 1 / ERROR_RATE times."""
+    return trials * divergence(hits / trials, chance) > log(2 / ERROR_RATE)
+
+
+def trials_for(chance: float) -> int:
+    """How many trials tell a chance from one that is off by OFF, in either direction, with ERROR_RATE both ways."""
+    small = min(chance, 1 - chance)
+    if small <= 0:
+        return 1 << 16
+    return max(_trials_between(chance, chance + side * OFF * small) for side in (1, -1))
+
+
+def _trials_between(first: float, second: float) -> int:
+    """The trials after which some share is too unlikely for the first chance or for the second, whatever it is."""
+    low, high = sorted((first, second))
+    a, b = low, high
+    for _ in range(60):  # the share that is equally unlike both
+        middle = (a + b) / 2
+        if divergence(middle, low) < divergence(middle, high):
+            a = middle
+        else:
+            b = middle
+    return ceil(log(2 / ERROR_RATE) / divergence((a + b) / 2, low))
+
+
+def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int) -> str:
+    """A sentence about the first claim that counts contradict, or nothing.
+
+    Args:
+        start: one world.
+        seed: of all copies; each has an index of its own.
+    """
+    chosen = [(claim, _cells(claim, start)) for claim in claims]
+    for claim, cells in chosen:
+        if not cells.any():
+            return f"no cell of the start world is as `{_words(claim)}` says"
+    most = max(1, MOST // (start.ids.numel() * max(steps, 1)))
+    copies = min(most, max(ceil(trials_for(float(c.chance)) / int(cells.sum())) for c, cells in chosen))
+    hits = [0] * len(chosen)
+    chunk = max(1, CHUNK // start.ids.numel())
+    for first in range(0, copies, chunk):
+        world = _copies(start, first, min(chunk, copies - first), seed)
+        world = world.sim.step(world, steps=steps)
+        at = world_context(world)
+        for number, (claim, cells) in enumerate(chosen):
+            hits[number] += int(reference.evaluate(claim.after, at)[:, cells].sum())
+    for (claim, cells), found in zip(chosen, hits, strict=True):
+        trials = copies * int(cells.sum())
+        if is_unlikely(found, trials, float(claim.chance)):
+            return (
+                f"`{_words(claim)}` came true {found:,} times in {trials:,}, {100 * found / trials:.3g} %,"
+                f" not {100 * float(claim.chance):g} %: luck does that less than once in a million times"
+            )
+    return ""
+
+
+def _words(claim: Often) -> str:
+    return " ".join(claim.span.text.split())
+
+
+def _cells(claim: Often, start: World) -> NDArray[np.bool_]:
+    """The cells [H, W] of the start world that the claim is about."""
+    holds: NDArray[np.bool_] = reference.evaluate(claim.before, world_context(start))[0]
+    return holds
+
+
+def _copies(start: World, first: int, count: int, seed: int) -> World:
+    """The world many times over, each with another index and so with luck of its own."""
+    many = start.select([0] * count)
+    index = many.index.new_tensor(range(first, first + count))
+    return replace(many, index=index, seed=many.seed.new_full((count,), seed))
+
+
+def world_context(world: World) -> reference.Context:
+    """What a condition reads of a world: its state as the oracle holds it, parameters, the clock."""
+    ruleset = world.sim.ruleset
+    wide: dict[str, type] = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
+    state: reference.State = {
+        slot.name: to_numpy(world.state[slot.name]).astype(wide.get(slot.kind.name, np.int64))
+        for slot in slots(ruleset)
+    }
+    dtypes: dict[str, type] = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
+    params: dict[str, reference.Array] = {
+        param.name: np.full(len(world), float(param.default), dtypes[param.kind.name])
+        for param in ruleset.params
+    }
+    clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
+    return reference.Context(ruleset, state, params, {}, clock)

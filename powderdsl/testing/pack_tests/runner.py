@@ -1,0 +1,252 @@
+"""Runs the tests that stand in packs: small worlds, and what must become of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.diagnostics import Span
+from powderdsl.model import reference
+from powderdsl.model.restrict import restricted, without
+from powderdsl.model.text import one_line
+from powderdsl.model.types import Example, Ruleset
+from powderdsl.simulation.draw import to_numpy
+from powderdsl.simulation.simulator import compile
+from powderdsl.testing.pack_tests.chances import chance_problem, world_context
+from powderdsl.testing.pack_tests.fields import described, field_rows, unlike, with_fields
+
+if TYPE_CHECKING:
+    from powderdsl.simulation.simulator import Simulator, World
+
+SEEDS = (0, 1, 2, 3, 4)
+"""What a test runs with if it names no seed: a rule that needs luck should not pass by luck."""
+
+MOST = 8
+"""Added packs that are left out in turn, to see which of them change what a test shows."""
+
+ANYTHING = "?"
+"""The character of `expect` that matches every element."""
+
+
+@dataclass(frozen=True)
+class ExampleResult:
+    """What came of one test.
+
+    `problem` is empty if it passed with every seed, otherwise a sentence about the first seed it failed with:
+    `seed`, after how many steps, and the world then, in the test's characters. `field` is the field that is not as
+    expected, if one is, and `field_after` its rows, a word a cell.
+    `added` are loaded packs that the test does not speak of, without which it passes: then it has not failed, it comes
+    out differently.
+    """
+
+    example: Example
+    seeds: tuple[int, ...]
+    problem: str = ""
+    seed: int = 0
+    step: int = 0
+    after: tuple[str, ...] = ()
+    field: str = ""
+    field_after: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+
+    @property
+    def passed(self) -> bool:
+        """Whether it came out as it says, with all seeds."""
+        return not self.problem
+
+    @property
+    def failed(self) -> bool:
+        """Whether it did not, and no added pack is the reason."""
+        return bool(self.problem) and not self.added
+
+
+def run_examples(
+    ruleset: Ruleset,
+    backend: str = "planes",
+    device: str = "cpu",
+    *,
+    sim: Simulator | None = None,
+    seen: Callable[[World], None] | None = None,
+) -> list[ExampleResult]:
+    """Run every test of a ruleset's packs, in the order of the files.
+
+    A test runs with its own seed, or with each of SEEDS. It passes if the last world looks as `expect` says, its
+    fields hold what `expect_fields` says, every condition under `always` holds in every cell after every step, and
+    what `often` says happens about as often. Tests of one size run as one batch. One that does not pass runs again with
+    the packs of its scope alone, if more are loaded.
+
+    Args:
+        sim: what runs them, instead of a new simulator of this ruleset.
+        seen: called with the worlds of each batch at its end.
+    """
+    sim = sim or compile(ruleset, backend=backend, device=device)
+    sizes: dict[tuple[int, int], list[int]] = {}
+    for number, example in enumerate(ruleset.tests):
+        sizes.setdefault((len(example.given), len(example.given[0])), []).append(number)
+    results: dict[int, ExampleResult] = {}
+    for numbers in sizes.values():
+        batch = [_Running.of(ruleset.tests[number], sim) for number in numbers]
+        found = _run(batch, sim, seen)
+        results |= dict(zip(numbers, found, strict=True))
+    return _judged([results[number] for number in range(len(ruleset.tests))], ruleset, sim)
+
+
+def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> list[ExampleResult]:
+    """The results; those that are wrong only with packs that the tests do not speak of name these packs."""
+    scopes: dict[tuple[str, ...], list[ExampleResult]] = {}
+    for result in results:
+        scope = result.example.scope
+        if not result.passed and scope and ruleset.added_to(scope):
+            scopes.setdefault(scope, []).append(result)
+    added: dict[Span, tuple[str, ...]] = {}
+    for scope, wrong in scopes.items():
+        places = {result.example.span for result in wrong}
+        others = ruleset.added_to(scope)
+        right = _passing(restricted(ruleset, scope), places, sim)
+        fewer = others[:MOST] if len(others) > 1 and right else ()
+        without_one = {pack: _passing(without(ruleset, pack), right, sim) for pack in fewer}
+        for place in right:
+            added[place] = tuple(pack for pack in fewer if place in without_one[pack]) or others
+    return [replace(one, added=added.get(one.example.span, ())) for one in results]
+
+
+def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: Simulator) -> tuple[Span, ...]:
+    """Which of some tests pass with other rules, by where they stand."""
+    tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
+    if ruleset is None or not tests:
+        return ()
+    results = run_examples(replace(ruleset, tests=tests), sim.backend, str(sim.device))
+    return tuple(dict.fromkeys(result.example.span for result in results if result.passed))
+
+
+def start_of(example: Example, sim: Simulator, seed: int) -> World:
+    """The start world of a test, one of a seed."""
+    ids = {char: _id(sim.ruleset, name) for char, name in example.legend}
+    grid = np.array([[[ids[char] for char in row] for row in example.given]], dtype=np.uint8)
+    return with_fields(sim.world(grid, seed=[seed]), [example])
+
+
+@dataclass(frozen=True)
+class _Running:
+    """A test with what its characters mean, and the seeds it runs with."""
+
+    example: Example
+    ids: Mapping[str, int]
+    seeds: tuple[int, ...]
+
+    @classmethod
+    def of(cls, example: Example, sim: Simulator) -> _Running:
+        ids = {char: _id(sim.ruleset, name) for char, name in dict(example.legend).items()}
+        return cls(example, ids, SEEDS if example.seed is None else (example.seed,))
+
+    def stops(self) -> set[int]:
+        """The steps after which it is looked at: conditions that hold always want every one."""
+        steps = self.example.steps
+        return set(range(1, steps + 1)) if self.example.always else {steps} if steps else set()
+
+    def look(self, world: World, step: int) -> ExampleResult | None:
+        """What is wrong after a step; `world` holds this test's worlds alone."""
+        example, sim = self.example, world.sim
+        for condition in example.always if step else ():
+            holds = reference.evaluate(condition, world_context(world))
+            if not holds.all():
+                index, row, column = (int(part[0]) for part in np.nonzero(~holds))
+                words = one_line(condition.span) if condition.span else "a condition"
+                problem = f"`{words}` does not hold at row {row}, column {column}"
+                return _failure(example, self.seeds, index, step, world, self.ids, problem)
+        if step < example.steps:
+            return None
+        wanted = _wanted(example, self.ids)
+        differs = None if wanted is None else (to_numpy(world.ids) != wanted) & (wanted >= 0)
+        if wanted is not None and differs is not None and differs.any():
+            index, row, column = (int(part[0]) for part in np.nonzero(differs))
+            found = _name(sim.ruleset, int(world.ids[index, row, column]))
+            asked = _name(sim.ruleset, int(wanted[row, column]))
+            problem = f"row {row}, column {column} is `{found}`, not `{asked}`"
+            return _failure(example, self.seeds, index, step, world, self.ids, problem)
+        for grid in example.expect_fields:
+            place = unlike(grid, world)
+            if place is not None:
+                index, row, column = place
+                problem = f"`{grid.name}` in {described(grid, world, place)}"
+                failure = _failure(example, self.seeds, index, step, world, self.ids, problem)
+                return replace(failure, field=grid.name, field_after=field_rows(grid.name, world, index))
+        return None
+
+
+def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | None) -> list[ExampleResult]:
+    """Tests of one size, all at once: each has a slice of the batch."""
+    grids = [
+        np.array([[one.ids[char] for char in row] for row in one.example.given], dtype=np.uint8)
+        for one in batch
+    ]
+    copies = [np.repeat(ids[None], len(one.seeds), axis=0) for ids, one in zip(grids, batch, strict=True)]
+    world = sim.world(np.concatenate(copies), seed=[seed for one in batch for seed in one.seeds])
+    world = with_fields(world, [one.example for one in batch for _ in one.seeds])
+    ends = np.cumsum([len(one.seeds) for one in batch])
+    results: dict[int, ExampleResult] = {}
+    now = 0
+    for stop in sorted({0}.union(*(one.stops() for one in batch))):
+        world = sim.step(world, steps=stop - now)
+        now = stop
+        for number, one in enumerate(batch):
+            if number in results or not (stop in one.stops() or one.example.steps == stop):
+                continue
+            own = world.select(slice(int(ends[number]) - len(one.seeds), int(ends[number])))
+            problem = one.look(own, stop)
+            if problem is not None:
+                results[number] = problem
+    if seen is not None:
+        seen(world)
+    for number, one in enumerate(batch):
+        if one.example.often and number not in results:
+            seed = one.seeds[0]
+            start = with_fields(sim.world(grids[number][None], seed=seed), [one.example])
+            problem_of = chance_problem(start, one.example.steps, one.example.often, seed)
+            if problem_of:
+                results[number] = ExampleResult(one.example, one.seeds, problem_of, seed, one.example.steps)
+    return [results.get(number, ExampleResult(one.example, one.seeds)) for number, one in enumerate(batch)]
+
+
+def _failure(
+    example: Example,
+    seeds: tuple[int, ...],
+    index: int,
+    step: int,
+    world: World,
+    ids: Mapping[str, int],
+    problem: str,
+) -> ExampleResult:
+    after = _rows(to_numpy(world.ids)[index], ids, example)
+    return ExampleResult(example, seeds, problem, seeds[index], step, after)
+
+
+def _wanted(example: Example, ids: Mapping[str, int]) -> NDArray[np.int16] | None:
+    """The ids that `expect` asks for, int16 [H, W]; −1 where anything will do."""
+    if example.expect is None:
+        return None
+    rows = [[-1 if char == ANYTHING else ids[char] for char in row] for row in example.expect]
+    return np.array(rows, dtype=np.int16)
+
+
+def _rows(world: NDArray[np.uint8], ids: Mapping[str, int], example: Example) -> tuple[str, ...]:
+    """A world in characters, those that the test itself uses first: two may mean the same element."""
+    used = "".join([*example.given, *(example.expect or ())])
+    characters: dict[int, str] = {}
+    for char in sorted(ids, key=lambda char: char not in used):
+        characters.setdefault(ids[char], char)
+    return tuple("".join(characters[number] for number in row) for row in world.tolist())
+
+
+def _id(ruleset: Ruleset, name: str) -> int:
+    element = ruleset.element(name)
+    assert element is not None, f"the checked model has a test with the unknown element {name}"
+    return element.id
+
+
+def _name(ruleset: Ruleset, number: int) -> str:
+    return next(element.name for element in ruleset.elements if element.id == number)

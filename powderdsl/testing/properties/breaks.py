@@ -1,0 +1,279 @@
+"""Whether worlds break a claim: after which step, and in which cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+
+from powderdsl.model import reference
+from powderdsl.model.state import slots
+from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
+from powderdsl.testing.properties.running import context, reference_states
+from powderdsl.testing.properties.samples import Array, Sample, State, fresh
+from powderdsl.testing.properties.turns import turned_cells, turned_sample, turned_state
+
+
+@dataclass(frozen=True)
+class KnownIds:
+    """Cells and fields only ever name elements that the ruleset has."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The backend gives what the reference gives."""
+
+
+@dataclass(frozen=True)
+class Alike:
+    """A turned world turns into the same things, as often. Each world runs `copies` times, with other seeds."""
+
+    turn: str
+    copies: int
+
+
+Tested = Claim | KnownIds | Agreement | Alike
+
+SIGMAS = 6.0
+"""How far two frequencies may lie apart: chance alone does that once in five hundred million times."""
+
+
+class Runs(Protocol):
+    """What runs worlds: `running.Runner`, or the oracle alone."""
+
+    @property
+    def ruleset(self) -> Ruleset: ...
+
+    def states(
+        self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None
+    ) -> list[State]: ...
+
+
+@dataclass(frozen=True)
+class Breaks:
+    """`first` [B]: the step after which a world breaks the claim, 0 if it does not; `cell` [B, 2]: where.
+
+    `counts` [B]: whether the world was a test at all: one that starts as the claim forbids is none.
+    """
+
+    first: Array
+    cell: Array
+    counts: Array
+
+
+def steps_for(claim: Tested, usual: int) -> int:
+    """How many steps a test of the claim runs."""
+    match claim:
+        case Never():
+            return usual if claim.steps == 1 else claim.steps
+        case Local() | Symmetric() | Alike():
+            return 1
+    return usual
+
+
+def breaks(claim: Tested, runs: Runs, sample: Sample, steps: int) -> Breaks:
+    """Run the worlds and look."""
+    match claim:
+        case Local():
+            return _breaks_of(_local(claim, runs, sample)[None])
+        case Symmetric():
+            return _breaks_of(_symmetric(claim, runs, sample)[None])
+        case Alike():
+            return _breaks_of(_alike(claim, runs, sample)[None])
+        case Agreement():
+            return _agreement(runs, sample, steps)
+    return look(claim, runs.ruleset, sample, runs.states(sample, steps))
+
+
+def is_paired(claim: Tested) -> bool:
+    """Whether a test of the claim needs more than one run of the worlds."""
+    return isinstance(claim, Local | Symmetric | Alike | Agreement)
+
+
+def look(claim: Tested, ruleset: Ruleset, sample: Sample, states: list[State]) -> Breaks:
+    """Whether worlds, of which these are the states, break a claim that needs one run only."""
+    ids = [state["element"] for state in states]
+    match claim:
+        case Unchanging():
+            held = [np.isin(one, sorted(claim.ids)) for one in ids[:-1]]
+            return _breaks_of(
+                np.stack([mask & (a != b) for mask, a, b in zip(held, ids, ids[1:], strict=False)])
+            )
+        case Total():
+            return _total(claim, ruleset, sample, states)
+        case Never():
+            held = [
+                reference.evaluate(claim.condition, context(ruleset, state, sample, step))
+                for step, state in enumerate(states)
+            ]
+            return _never(claim.steps, held)
+        case Bounded():
+            outside = [
+                _outside(_field(ruleset, claim.field, state, sample, step), claim)
+                for step, state in enumerate(states)
+            ]
+            return _never(1, outside)
+        case KnownIds():
+            return _breaks_of(np.stack([_unknown(ruleset, state) for state in states[1:]]))
+    raise TypeError(f"{type(claim).__name__} needs more than one run")
+
+
+def _breaks_of(masks: Array, counts: Array | None = None) -> Breaks:
+    """From bool [steps, B, H, W]: what is broken after each step."""
+    batch, _, width = masks.shape[1:]
+    broken = masks.reshape(len(masks), batch, -1).any(2)
+    if counts is not None:
+        broken &= counts
+    first = np.where(broken.any(0), broken.argmax(0) + 1, 0)
+    at_first = masks[np.maximum(first - 1, 0), np.arange(batch)].reshape(batch, -1)
+    flat = at_first.argmax(1)
+    cell = np.stack([flat // width, flat % width], 1)
+    return Breaks(first, cell, np.ones(batch, bool) if counts is None else counts)
+
+
+def _total(claim: Total, ruleset: Ruleset, sample: Sample, states: list[State]) -> Breaks:
+    values = [
+        reference.evaluate(claim.value, context(ruleset, state, sample, step)).astype(np.int64)
+        for step, state in enumerate(states)
+    ]
+    masks = []
+    for before, after in pairwise(values):
+        change = (after - before).sum((1, 2))
+        wrong = {"constant": change != 0, "never rises": change > 0, "never falls": change < 0}[claim.trend]
+        cells = (after > before) if claim.trend == "never rises" else (after < before)
+        cells = (after != before) if claim.trend == "constant" else cells
+        masks.append(wrong[:, None, None] & cells)
+    return _breaks_of(np.stack(masks))
+
+
+def _never(steps: int, held: list[Array]) -> Breaks:
+    """A condition by step, from the start on: it must not hold for so many steps in a row."""
+    if steps == 1:
+        return _breaks_of(np.stack(held[1:]), np.asarray(~held[0].any((1, 2))))
+    run = np.zeros(held[0].shape, np.int64)
+    masks = []
+    for one in held[1:]:
+        run = np.where(one, run + 1, 0)
+        masks.append(run >= steps)
+    return _breaks_of(np.stack(masks))
+
+
+def _field(ruleset: Ruleset, name: str, state: State, sample: Sample, step: int) -> Array:
+    if name in state:
+        return state[name]
+    prop = ruleset.property(name)
+    assert prop is not None
+    table = np.zeros(256)
+    params = {param.name: float(param.default) for param in ruleset.params}
+    table[: len(prop.values)] = [params[v] if isinstance(v, str) else float(v) for v in prop.values]  # type: ignore[arg-type]
+    return table[state["element"]]
+
+
+def _outside(values: Array, claim: Bounded) -> Array:
+    mask = np.asarray((values < claim.lo) | (values > claim.hi))
+    return np.asarray(mask.any(1)) if mask.ndim == 4 else mask
+
+
+def _unknown(ruleset: Ruleset, state: State) -> Array:
+    known = [element.id for element in ruleset.elements]
+    named = [slot.name for slot in slots(ruleset) if slot.kind.name == "element"]
+    wrong: Array = ~np.isin(state["element"], known)
+    for name in named:
+        wrong = wrong | ~np.isin(state[name], known)
+    return wrong
+
+
+# Claims about two runs
+
+
+def touched(ruleset: Ruleset, sample: Sample) -> tuple[Sample, Array]:
+    """The same worlds with another fresh element in one cell each, by their seeds; and which cells: bool [B, H, W]."""
+    height, width = sample.shape
+    known = np.array([element.id for element in ruleset.elements])
+    worlds = np.arange(len(sample))
+    row, column = sample.seeds % height, sample.seeds // 7 % width
+    mask = np.zeros(sample.ids.shape, bool)
+    mask[worlds, row, column] = True
+    old = np.searchsorted(known, sample.ids[worlds, row, column])
+    other = known[(old + 1 + sample.seeds // 3 % max(len(known) - 1, 1)) % len(known)]
+    ids = sample.ids.copy()
+    ids[worlds, row, column] = other
+    table = {slot.name: slot for slot in slots(ruleset)}
+    fields = {}
+    for name, values in sample.fields.items():
+        usual = fresh(ruleset, table[name], ids)
+        fields[name] = np.where(mask[:, None] if values.ndim == 4 else mask, usual, values)
+    return replace(sample, ids=ids, fields=fields), mask
+
+
+def differences(first: State, second: State) -> Array:
+    """bool [B, H, W]: cells in which two states differ."""
+    wrong = np.zeros(first["element"].shape, bool)
+    for name, values in first.items():
+        unequal = values != second[name]
+        wrong |= unequal.any(1) if unequal.ndim == 4 else unequal
+    return wrong
+
+
+def near(mask: Array, radius: int) -> Array:
+    """Cells within so many rows and columns of a mask [B, H, W], around the edges too."""
+    for axis in (1, 2):
+        reach = min(radius, mask.shape[axis] // 2)
+        mask = np.logical_or.reduce([np.roll(mask, shift, axis) for shift in range(-reach, reach + 1)])
+    return mask
+
+
+def _local(claim: Local, runs: Runs, sample: Sample) -> Array:
+    other, mask = touched(runs.ruleset, sample)
+    first, second = (runs.states(one, 1)[-1] for one in (sample, other))
+    return differences(first, second) & ~near(mask, claim.radius)
+
+
+def draws_for(ruleset: Ruleset, sample: Sample) -> dict[str, Array]:
+    """Draws for all streams, by the worlds' seeds: float64 [B, H, W]."""
+    height, width = sample.shape
+    found = {}
+    for number, stream in enumerate(ruleset.streams):
+        rows = [np.random.default_rng([int(seed), number]).random((height, width)) for seed in sample.seeds]
+        found[stream.name] = np.stack(rows)
+    return found
+
+
+def _symmetric(claim: Symmetric, runs: Runs, sample: Sample) -> Array:
+    draws = draws_for(runs.ruleset, sample)
+    turned_draws = {name: turned_cells(values, claim.turn) for name, values in draws.items()}
+    first = runs.states(sample, 1, draws)[-1]
+    second = runs.states(turned_sample(runs.ruleset, sample, claim.turn), 1, turned_draws)[-1]
+    wrong = differences(turned_state(runs.ruleset, first, claim.turn), second)
+    for _ in range(1 if claim.turn == "mirrored" else 3):  # back to where the first worlds are
+        wrong = turned_cells(wrong, claim.turn)
+    return wrong
+
+
+def _alike(claim: Alike, runs: Runs, sample: Sample) -> Array:
+    masks = []
+    for world in range(len(sample)):
+        one = sample.one(world).repeated(claim.copies)
+        seeds = int(sample.seeds[world]) + np.arange(claim.copies)
+        first = runs.states(replace(one, seeds=seeds), 1)[-1]["element"]
+        turned = turned_sample(runs.ruleset, replace(one, seeds=seeds + claim.copies), claim.turn)
+        second = runs.states(turned, 1)[-1]["element"]
+        mask = np.zeros(second.shape[1:], bool)
+        for element in runs.ruleset.elements:
+            a = turned_cells(first == element.id, claim.turn).mean(0)
+            b = (second == element.id).mean(0)
+            mean = (a + b) / 2
+            mask |= np.abs(a - b) > SIGMAS * np.sqrt(2 * mean * (1 - mean) / claim.copies) + 1e-9
+        for _ in range(1 if claim.turn == "mirrored" else 3):
+            mask = turned_cells(mask, claim.turn)
+        masks.append(mask)
+    return np.stack(masks)
+
+
+def _agreement(runs: Runs, sample: Sample, steps: int) -> Breaks:
+    found = runs.states(sample, steps)
+    wanted = reference_states(runs.ruleset, sample, steps)
+    return _breaks_of(np.stack([differences(a, b) for a, b in zip(found[1:], wanted[1:], strict=True)]))

@@ -1,0 +1,211 @@
+"""What came of testing a property, as text for people and as plain data for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from powderdsl.diagnostics import Span
+from powderdsl.model.fields.words import direction_word
+from powderdsl.model.restrict import Difference
+from powderdsl.model.state import slots
+from powderdsl.model.text import one_line, place_of
+from powderdsl.model.types import Kind, Ruleset
+from powderdsl.simulation.draw import palette, ramps, rgb, scale, to_numpy
+from powderdsl.testing.properties.breaks import Tested
+from powderdsl.testing.properties.samples import Array, Sample, fresh
+
+STATUSES = ("proven", "tested", "untested", "differs", "broken")
+"""``differs``: a world breaks it because packs are loaded that it does not speak of."""
+
+MAX_DRAWN = 40
+"""Rows and columns that are drawn in full."""
+
+MAX_TEXT = 200
+"""Characters of a field that are shown."""
+
+
+@dataclass(frozen=True)
+class Property:
+    """A claim with the words it is known by. `owner` is the pack that says it, or ``automatic``; then it has no place."""
+
+    claim: Tested
+    text: str
+    owner: str
+    span: Span | None
+    without: frozenset[int] = frozenset()
+    """Elements that a world starts without."""
+    scope: tuple[str, ...] = ()
+    """The packs that it speaks of."""
+
+    @property
+    def place(self) -> str:
+        """`file:line`, or nothing."""
+        return place_of(self.span) if self.span else ""
+
+
+@dataclass(frozen=True)
+class Counterexample:
+    """A small world that breaks a property after some steps.
+
+    `before` and `after` are ids [H, W] at the start and after the last step, `cell` is where it is broken.
+    `culprits` are the lines of rules without which the last step would not have broken it. `shown` are the fields
+    [H, W] that colors follow, by name, before and after.
+    """
+
+    sample: Sample
+    steps: int
+    before: Array
+    after: Array
+    cell: tuple[int, int]
+    culprits: tuple[Span, ...]
+    shown: tuple[Mapping[str, Array], Mapping[str, Array]]
+
+
+@dataclass(frozen=True)
+class Result:
+    """One of STATUSES, on how many worlds, and why. `reason` is a proof, or what stands in the way of one."""
+
+    prop: Property
+    status: str
+    worlds: int
+    reason: str
+    counterexample: Counterexample | None = None
+    difference: Difference | None = None
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing was found against what it speaks of."""
+        return self.status != "broken"
+
+
+def result_line(result: Result) -> str:
+    """`proven    core: … (…)`."""
+    how = {
+        "proven": result.reason,
+        "tested": f"{result.worlds:,} worlds{', ' + result.reason if result.reason else ''}",
+        "untested": result.reason,
+        "differs": difference_words(result.difference) if result.difference else "",
+        "broken": result.prop.place or "of every ruleset",
+    }[result.status]
+    status = result.status.upper() if result.status == "broken" else result.status
+    return f"{status:<9} {result.prop.owner}: {result.prop.text} ({how})"
+
+
+def difference_words(found: Difference) -> str:
+    """``with `steam`: steam.yaml:17``: the packs, and where in their files the reason stands."""
+    places = dict.fromkeys(place_of(cause.span) for cause in found.causes)
+    return f"{found.with_packs}{': ' if places else ''}{', '.join(places)}"
+
+
+def difference_lines(found: Difference) -> Iterator[str]:
+    """What in the added packs makes the difference."""
+    for cause in found.causes:
+        yield f"{place_of(cause.span)}: {cause.does}"
+
+
+def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[str]:
+    """The rule that broke it, the world before and after, and what else the world holds."""
+    steps = "1 step" if found.steps == 1 else f"{found.steps} steps"
+    yield f"broken at row {found.cell[0]}, column {found.cell[1]}, after {steps} with seed {int(found.sample.seeds[0])}"
+    for span in found.culprits:
+        yield f"by {place_of(span)}: {one_line(span)}"
+    glyphs = {element.id: element.glyph for element in ruleset.elements}
+    columns = [
+        [title, *(" ".join(glyphs.get(number, "?") for number in row) for row in ids[:MAX_DRAWN, :MAX_DRAWN].tolist())]
+        for title, ids in (("before", found.before), ("after", found.after))
+    ]  # fmt: skip
+    width = max(len(line) for lines in columns for line in lines) + 3
+    for lines in zip(*columns, strict=True):
+        yield "".join(line.ljust(width) for line in lines).rstrip()
+    names = {element.id: element.name for element in ruleset.elements}
+    there = np.unique([*found.before.ravel(), *found.after.ravel()]).tolist()
+    yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
+    yield from _field_lines(found, ruleset, names)
+    for name, values in found.sample.params.items():
+        yield f"{name} = {float(values[0]):g}"
+    if found.sample.clock.any():
+        yield f"the clock says {int(found.sample.clock[0])}"
+
+
+def _field_lines(found: Counterexample, ruleset: Ruleset, names: Mapping[int, str]) -> Iterator[str]:
+    """The fields that are not as in fresh cells, row by row, each value as a word."""
+    for slot in slots(ruleset):
+        values = found.sample.fields.get(slot.name)
+        if values is None or np.array_equal(values, fresh(ruleset, slot, found.sample.ids)):
+            continue
+        cells = values[0] if slot.planes == 1 else np.moveaxis(values[0], 0, -1)
+        rows = (" ".join(_word(value, slot.kind, names) for value in row) for row in cells)
+        text = " / ".join(rows)
+        yield f"{slot.name}: {text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} …'}"
+
+
+def _word(value: Any, kind: Kind, names: Mapping[int, str]) -> str:
+    """A value of a field as tests write it."""
+    match kind.name:
+        case "flag":
+            return "yes" if value else "no"
+        case "element":
+            return names.get(int(value), "?")
+        case "direction":
+            return direction_word(int(value))
+        case "vec2":
+            return ",".join(f"{float(part):g}" for part in value)
+    return f"{float(value):g}"
+
+
+def picture(found: Counterexample, ruleset: Ruleset) -> Array:
+    """Before and after side by side, uint8 [H', W', 3]."""
+    from powderdsl.simulation.draw import contact_sheet
+
+    colors, ramped = palette(ruleset.elements), ramps(ruleset.elements)
+    factor = max(1, min(32, 512 // max(found.before.shape)))
+    images = [
+        to_numpy(scale(rgb(ids, colors, ramps=ramped, fields=fields), factor))
+        for ids, fields in zip((found.before, found.after), found.shown, strict=True)
+    ]
+    return contact_sheet(images, columns=2, gap=8)
+
+
+def result_data(result: Result) -> dict[str, Any]:
+    """Plain data for JSON."""
+    data: dict[str, Any] = {
+        "property": result.prop.text,
+        "pack": result.prop.owner,
+        "place": result.prop.place,
+        "status": result.status,
+        "worlds": result.worlds,
+        "reason": result.reason,
+    }
+    if result.difference is not None:
+        data["difference"] = difference_data(result.difference)
+    found = result.counterexample
+    if found is not None:
+        data["counterexample"] = {
+            "before": found.before.tolist(),
+            "after": found.after.tolist(),
+            "steps": found.steps,
+            "row": found.cell[0],
+            "column": found.cell[1],
+            "seed": int(found.sample.seeds[0]),
+            "clock": int(found.sample.clock[0]),
+            "fields": _plain(found.sample.fields),
+            "params": _plain(found.sample.params),
+            "rules": [{"place": place_of(span), "text": one_line(span)} for span in found.culprits],
+        }
+    return data
+
+
+def difference_data(found: Difference) -> dict[str, Any]:
+    """Plain data for JSON."""
+    causes = [
+        {"pack": cause.pack, "place": place_of(cause.span), "text": cause.does} for cause in found.causes
+    ]
+    return {"packs": list(found.packs), "causes": causes}
+
+
+def _plain(arrays: Mapping[str, Array]) -> dict[str, Any]:
+    return {name: values[0].tolist() for name, values in arrays.items()}

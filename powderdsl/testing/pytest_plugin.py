@@ -1,0 +1,171 @@
+"""Plugin for pytest: packs are collected like test files. Every test and every invariant of a pack is an item.
+
+`pytest rules/` runs them. A pack is tried in the ruleset beside it that lists it, so that packs which work together are
+tested together; otherwise with the packs that it needs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from powderdsl.model.types import Example, Invariant, Ruleset
+    from powderdsl.testing.properties.search import Search
+
+HEAD = re.compile(r"^pack:[ \t]*[A-Za-z_]\w*[ \t]*$|^ruleset:[ \t]*[A-Za-z_]\w*[ \t]*$", re.MULTILINE)
+LISTED = re.compile(r"^packs:[ \t]*\[?(.*)$", re.MULTILINE)
+NEEDED = re.compile(r"^needs:[ \t]*\[?([^\]\n]*)", re.MULTILINE)
+
+WORLDS = 300
+"""Random worlds that each invariant is tried on; `powderdsl test` tries more."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--powderdsl-worlds",
+        type=int,
+        default=WORLDS,
+        help="random worlds that each invariant of a pack is tried on",
+    )
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> PackFile | None:
+    """YAML files that start as packs and rulesets do. Others are nobody's business."""
+    if file_path.suffix not in (".yaml", ".yml"):
+        return None
+    try:
+        text = _text(file_path)
+    except (OSError, UnicodeDecodeError):
+        return None
+    return PackFile.from_parent(parent, path=file_path) if HEAD.search(text) else None
+
+
+def _text(path: Path) -> str:
+    """The text of a rule file. Raises OSError, UnicodeDecodeError."""
+    from powderdsl.syntax.sources import MAX_BYTES
+    from powderdsl.system.reading import read_bytes
+
+    return read_bytes(path, MAX_BYTES).decode("utf-8")
+
+
+def home_of(path: Path) -> str:
+    """The rules that a pack is tried in, as `powderdsl.load` takes them."""
+    from powderdsl.compiler import shipped_rules
+
+    text = _text(path)
+    if re.search(r"^ruleset:", text, re.MULTILINE):
+        return str(path)
+    for other in sorted(path.parent.glob("*.yaml")):
+        try:
+            head = _text(other)
+        except (OSError, UnicodeDecodeError):
+            continue
+        listed = LISTED.search(head) if re.search(r"^ruleset:", head, re.MULTILINE) else None
+        if listed and path.stem in re.findall(r"\w+", listed[1]):
+            return str(other)
+    needed = NEEDED.search(text)
+    names = re.findall(r"\w+", needed[1]) if needed else []
+    beside = {name: path.parent / f"{name}.yaml" for name in names}
+    found = [
+        str(beside[n]) if beside[n].is_file() else n
+        for n in names
+        if beside[n].is_file() or n in shipped_rules()
+    ]
+    return "+".join([*found, str(path)])
+
+
+@cache
+def loaded(rules: str, stamp: float) -> Ruleset:
+    """A ruleset, once for all of its packs; `stamp` tells versions of the files apart."""
+    from powderdsl.compiler import load
+
+    return load(rules)
+
+
+_SEARCHES: dict[int, tuple[Ruleset, Search]] = {}
+
+
+def search_of(ruleset: Ruleset, worlds: int) -> Search:
+    """What proves and tries a ruleset's invariants, made once: the ledger takes a second."""
+    from powderdsl.testing.properties.running import Runner
+    from powderdsl.testing.properties.search import Plan, Search
+
+    if id(ruleset) not in _SEARCHES:
+        _SEARCHES[id(ruleset)] = ruleset, Search.of(Runner(ruleset), Plan(worlds))
+    return _SEARCHES[id(ruleset)][1]
+
+
+class PackFile(pytest.File):
+    """A pack or ruleset."""
+
+    def collect(self) -> Iterator[pytest.Item]:
+        rules = home_of(self.path)
+        from powderdsl.diagnostics.printable import printable
+
+        ruleset = loaded(rules, self.path.stat().st_mtime)
+        names: dict[str, int] = {}
+        subjects: list[Example | Invariant] = [*ruleset.tests, *ruleset.invariants]
+        for one in subjects:
+            if not same_file(one.span.source.name, self.path):
+                continue
+            name = printable(getattr(one, "name", "") or " ".join(one.span.text.split()))
+            names[name] = names.get(name, 0) + 1
+            unique = name if names[name] == 1 else f"{name} ({names[name]})"
+            yield PackItem.from_parent(self, name=unique, ruleset=ruleset, subject=one)
+
+
+def same_file(name: str, path: Path) -> bool:
+    return Path(name).resolve() == path.resolve()
+
+
+class Failed(Exception):
+    """An item failed; the text says how."""
+
+
+class PackItem(pytest.Item):
+    """One test or invariant of a pack."""
+
+    def __init__(self, *, ruleset: Ruleset, subject: Example | Invariant, **options: Any):
+        super().__init__(**options)
+        self.ruleset, self.subject = ruleset, subject
+
+    def runtest(self) -> None:
+        from dataclasses import replace
+
+        from powderdsl.model.types import Example
+        from powderdsl.testing.pack_tests.runner import run_examples
+
+        if isinstance(self.subject, Example):
+            (result,) = run_examples(replace(self.ruleset, tests=(self.subject,)))
+            if result.failed:
+                after = "\n".join(result.after)
+                raise Failed(f"{result.problem} (seed {result.seed}, after {result.step} steps)\n{after}")
+            return
+        from powderdsl.testing.properties.outcomes import counterexample_lines
+
+        whole = search_of(self.ruleset, self.config.getoption("--powderdsl-worlds"))
+        search = whole.only(" ".join(self.subject.span.text.split()))
+        if search.trials:
+            search.try_random()
+            for outcome in search.finish():
+                if outcome.counterexample is not None and not outcome.holds:
+                    raise Failed("\n".join(counterexample_lines(outcome.counterexample, self.ruleset)))
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
+        if isinstance(excinfo.value, Failed):
+            return f"{self.place}: {excinfo.value}"
+        return super().repr_failure(excinfo)
+
+    @property
+    def place(self) -> str:
+        """`file:line`."""
+        return f"{self.subject.span.source.name}:{self.subject.span.line}"
+
+    def reportinfo(self) -> tuple[Path, int, str]:
+        return self.path, self.subject.span.line - 1, self.name
