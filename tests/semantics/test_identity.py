@@ -263,3 +263,59 @@ def test_shapes_of_kernels_are_names_like_others() -> None:
     gem = pack("gem", '  diamond: {color: "#AAFFFF"}', "passes:\n"
                "  grow: {do: empty -> diamond if count(diamond in diamond(2)) > 3}\n")  # fmt: skip
     assert powderdsl.load("core", gem).element("diamond")
+
+
+NAMESAKE = """
+pack: snail
+needs: core
+tags: {slow: it creeps}
+properties: {age: {type: 0..9, snail: 4}}
+fields: {trail: {type: 0..9, at: place}, drift: {type: vec2(-9..9), at: place}}
+params: {pace: 50%}
+elements:
+  snail: {color: "#60C040", tags: slow}
+  shell: {color: "#C0C040"}
+passes:
+  creep: {do: [trail += 1 where slow, "shell -> empty with chance pace"]}
+"""
+READER = """
+pack: bird
+needs: [core, snail]
+elements: {bird: {color: "#402060"}}
+passes:
+  hunt:
+    do:
+      - snail.snail -> bird if above is snail.slow and movement < snail.pace and snail.trail > 0
+        and above.snail.trail > 0 and snail.age == 4 and above.drift.row == 0
+      - bird -> empty if snail.wings? > 0 or above.snail.wings? > 0 or above is snail.wings?
+    then:
+      do: snail.trail := 9 where bird
+      then: above.snail.trail -= 2 where bird
+"""
+
+
+def test_a_pack_that_has_an_element_of_its_name() -> None:
+    """As most packs have: after the pack's name every word that it defines is known, an element's name leads nowhere."""
+    Path("snail.yaml").write_text(NAMESAKE)
+    Path("bird.yaml").write_text(READER)
+    rules = powderdsl.load("core", "snail.yaml", "bird.yaml", params={"snail.pace": 1.0})
+    sim = powderdsl.compile(rules, "reference")
+    snail, bird = (rules.element(name).id for name in ("snail", "bird.bird"))
+    world = sim.step(sim.world(np.array([[[snail], [snail], [1]]], np.uint8)), steps=1)
+    assert world.ids[0, :, 0].tolist() == [snail, bird, 1]
+    assert world["trail"][0, :, 0].tolist() == [0, 9, 0]
+
+
+def test_names_of_a_block_come_before_packs() -> None:
+    """A pack may be called as somebody's loop variable is: there it stays the variable."""
+    Path("snail.yaml").write_text(NAMESAKE)
+    Path("looper.yaml").write_text(
+        "pack: looper\nneeds: core\nelements: {loop: {color: '#402060'}}\nfields: {trail: {type: 0..9, at: place}}\n"
+        "passes:\n  p:\n    for snail in sides:\n      - snail.trail += 1 where loop\n"
+    )
+    rules = powderdsl.load("core", "looper.yaml", "snail.yaml")
+    sim = powderdsl.compile(rules, "reference")
+    loop = rules.element("loop").id
+    world = sim.step(sim.world(np.array([[[0, 0, 0], [0, loop, 0], [0, 0, 0]]], np.uint8)))
+    assert world["trail"].tolist() == [[[0, 1, 0], [1, 0, 1], [0, 1, 0]]]
+    assert not world["snail.trail"].any()

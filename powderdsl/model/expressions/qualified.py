@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Span
-from powderdsl.model.expressions.operands import Absent, Asleep, Operand, look
+from powderdsl.model.expressions.operands import Absent, Asleep, Operand, Place, SetOf, look
 from powderdsl.model.expressions.scope import Scope
 from powderdsl.model.types import Expr
 from powderdsl.syntax.ast import Syntax
@@ -21,8 +21,7 @@ def of_pack(typer: Typer, syntax: Syntax, scope: Scope) -> Operand | None:
     if pack.kind not in ("name", "attribute"):
         return None
     name = typer.symbols.composition.names.qualified(pack.text, syntax.text)
-    inner = Scope("", scope.locals, scope.orientation)
-    if name is None or typer.find(pack.text, pack.span, inner) is not None:
+    if name is None or is_own_word(typer, pack, scope):
         return None
     found = typer.find(name, syntax.span, Scope("", {}, scope.orientation))
     if pack.kind == "name":
@@ -31,6 +30,17 @@ def of_pack(typer: Typer, syntax: Syntax, scope: Scope) -> Operand | None:
         return None
     place = typer.place(typer.evaluate(pack.children[0], scope), pack.children[0].span)
     return look(found, place.offset, syntax.span)
+
+
+def is_own_word(typer: Typer, word: Syntax, scope: Scope) -> bool:
+    """Whether a word before a dot is a place, a vector or a name of its block, and not the name of a pack.
+
+    Elements, tags and numbers have nothing after a dot: `salt.salt` is the element of the pack `salt`.
+    """
+    found = typer.find(word.text, word.span, Scope("", scope.locals, scope.orientation))
+    if word.text in scope.locals or isinstance(found, Place):
+        return True
+    return isinstance(found, Expr) and found.kind.name == "vec2"
 
 
 def optional_attribute(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
@@ -52,8 +62,10 @@ def certain(typer: Typer, syntax: Syntax, scope: Scope) -> Syntax:
         return plain
     if symbols.composition.names.qualified(before.text, syntax.text) is not None:
         return plain
-    if before.kind in ("name", "attribute") and typer.find(before.text, before.span, scope) is None:
-        raise Asleep(qualified)
+    if before.kind in ("name", "attribute"):
+        found = typer.find(before.text, before.span, scope)
+        if found is None or isinstance(found, SetOf):  # a pack that has an element of its name
+            raise Asleep(qualified)
     if typer.find(syntax.text, syntax.span, scope) is None:
         raise Asleep(syntax.text)
     return plain

@@ -33,7 +33,7 @@ from powderdsl.model.expressions.operands import (
     look,
     negation,
 )
-from powderdsl.model.expressions.qualified import of_pack, optional_attribute
+from powderdsl.model.expressions.qualified import is_own_word, of_pack, optional_attribute
 from powderdsl.model.expressions.scope import IDENTITY, Scope, turned
 from powderdsl.model.expressions.symbols import Symbols
 from powderdsl.model.expressions.unknown import UnknownNames
@@ -220,10 +220,7 @@ class Typer(Coercer):
         base_syntax = syntax.children[0]
         if base_syntax.kind == "name":
             qualified = f"{base_syntax.text}.{syntax.text}"
-            if (
-                qualified in self.symbols.params
-                and self.find(base_syntax.text, syntax.span, Scope("", scope.locals)) is None
-            ):
+            if qualified in self.symbols.params and not is_own_word(self, base_syntax, scope):
                 self.used.add(qualified)
                 param = self.symbols.params[qualified]
                 return Expr("param", param.kind, value=qualified, span=syntax.span)
