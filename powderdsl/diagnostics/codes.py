@@ -92,6 +92,7 @@ _ROWS = (
     ("PD515", "scope-outgrown", _NOTE),
     ("PD516", "write-lost", _WARNING),
     ("PD517", "conflict-with-added-pack", _WARNING),
+    ("PD518", "effect-undecided", _NOTE),
     # PD6xx: worlds, scenes, files
     ("PD601", "unknown-world", _ERROR),
     ("PD602", "invalid-world-file", _ERROR),

@@ -38,6 +38,7 @@ from powderdsl.model.logic.conflicts import check_logic, overridden_ids, produce
 from powderdsl.model.logic.lost_writes import report_lost_writes
 from powderdsl.model.logic.needless import report_needless, report_undrawn, silent_rules
 from powderdsl.model.logic.satisfy import Facts
+from powderdsl.model.logic.undecided import report_undecided
 from powderdsl.model.logic.unused import report_unused
 from powderdsl.model.ramps import element_ramps
 from powderdsl.model.types import (
@@ -123,7 +124,7 @@ def check(
     ids = {name: element.id for name, element in composition.elements.items()}
     check_assigned(examples, ids, symbols.properties, reporter)
     facts = _facts(symbols)
-    passes = check_logic(
+    passes, undecided = check_logic(
         passes,
         facts,
         elaborated,
@@ -133,8 +134,8 @@ def check(
     report_unused(composition, typer, produced_ids(passes, facts))
     matrix = matrix_channels(composition, symbols, passes, reporter)
     reporter.raise_if_errors()
-    report_needless(passes, facts, reporter)
-    report_lost_writes(passes, symbols.fields, facts, silent_rules(reporter), reporter)
+    undecided += report_needless(passes, facts, reporter)
+    undecided += report_lost_writes(passes, symbols.fields, facts, silent_rules(reporter), reporter)
     found = Ruleset(
         name=composition.name,
         about=composition.about,
@@ -153,7 +154,8 @@ def check(
         invariants=invariants,
         declared=Declared(tuple(packs), ruleset),
     )
-    report_undrawn(found, given, facts, reporter)
+    undecided += report_undrawn(found, given, facts, reporter)
+    report_undecided(undecided, reporter)
     return found
 
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from powderdsl.tasks.task import Task
 
 
-ALWAYS_TOLD = ("PD515",)
-"""Notes that stand below the summary without `--notes` too, in a line each: what added packs change."""
+ALWAYS_TOLD = ("PD515", "PD518")
+"""Notes below the summary without `--notes` too, in a line each: what added packs change, what was not decided."""
 
 
 @click.command("check")

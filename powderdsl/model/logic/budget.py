@@ -25,6 +25,8 @@ class Budget:
     """Work that is left for some questions, counted in nodes. It depends on what is asked, never on time or order."""
 
     left: int = BUDGET
+    most: int = MAX_QUESTION
+    """For one question."""
 
     def spend(self, nodes: int) -> None:
         self.left -= nodes
@@ -36,9 +38,9 @@ class Budget:
         return self.left < 0
 
     @contextmanager
-    def question(self, most: int = MAX_QUESTION) -> Iterator[None]:
+    def question(self, most: int | None = None) -> Iterator[None]:
         """Spend at most this much within. What one question may not spend is left for the next."""
-        reserve = max(self.left - most, 0)
+        reserve = max(self.left - (most or self.most), 0)
         self.left -= reserve
         try:
             yield

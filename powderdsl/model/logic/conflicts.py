@@ -83,15 +83,19 @@ def check_logic(
     elaborated: Elaborated,
     reporter: Reporter,
     added: AddedPacks | None = None,
-) -> tuple[Pass, ...]:
+) -> tuple[tuple[Pass, ...], list[Span]]:
     """Report conflicts (errors), rules that never fire or do nothing (warnings), and those that sleep (notes).
 
-    Conflicts that come from `added` packs alone are settled: the passes that are returned say how.
+    Conflicts that come from `added` packs alone are settled.
+
+    Returns:
+        The passes, which say how conflicts are settled, and the rules that may never fire or do nothing: to tell takes
+        too much work.
     """
-    relaxed = facts.relaxed()
+    relaxed = replace(facts.relaxed(), budget=Budget())
     silent: dict[Span, list[tuple[Expr, dict[str, Expr]]]] = {}
-    alive: dict[Span, bool] = {}
-    useful: dict[Span, bool] = {}
+    alive: dict[Span, bool | None] = {}
+    useful: dict[Span, bool | None] = {}
     conflicts: dict[Conflict, _Found] = {}
     work: list[tuple[int, int, Pass]] = []
     left = ALL_MOMENTS * BUDGET
@@ -102,10 +106,11 @@ def check_logic(
             earlier = lasting(lets)
             live = []
             for rule in moment.rules:
-                fires = rule.mask is None or satisfiable(facts, [(rule.mask, HERE)], lets)
-                alive[rule.span] = alive.get(rule.span, False) or fires
-                useful[rule.span] = useful.get(rule.span, False) or not fires or _changes(rule, facts, lets)
-                if fires:
+                fires = rule.mask is None or decide(facts, [(rule.mask, HERE)], lets)
+                alive[rule.span] = _either(alive.get(rule.span, False), fires)
+                changes = _changes(rule, facts, lets) if fires else fires is False or None
+                useful[rule.span] = _either(useful.get(rule.span, False), changes)
+                if fires is not False:
                     live.append(rule)
                 elif rule.mask is not None:
                     silent.setdefault(rule.span, []).append((rule.mask, lets))
@@ -119,16 +124,16 @@ def check_logic(
                 work.append((given - asked.budget.left, len(live), pass_))
                 left -= work[-1][0]
     if _too_much(work, reporter):
-        return passes
+        return passes, []
     passes = _report_conflicts(conflicts, passes, facts, added, reporter)
     for span, fires in alive.items():
+        if fires is None or (fires and useful[span] is None):
+            continue
         if not fires and span in elaborated.asleep:
             _report_sleep(f"`{elaborated.asleep[span]}` is not loaded", span, reporter)
         elif not fires and span in elaborated.empty:
             _report_sleep(f"no element is in `{elaborated.empty[span]}`", span, reporter)
-        elif not fires and any(
-            satisfiable(relaxed, [(mask, HERE)], lets) for mask, lets in silent.get(span, [])
-        ):
+        elif not fires and any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in silent.get(span, [])):
             _report_sleep("no loaded element has the properties it asks for", span, reporter)
         elif not fires:
             reporter.report(
@@ -143,7 +148,8 @@ def check_logic(
                 "PD509", "this rule changes nothing", span, "the cell already is what it becomes",
                 helps=["remove it, or name another element after `->`"],
             )  # fmt: skip
-    return passes
+    undecided = [span for span, fires in alive.items() if fires is None or (fires and useful[span] is None)]
+    return passes, undecided
 
 
 def _report_conflicts(
@@ -183,6 +189,11 @@ def _report_conflicts(
     )
 
 
+def _either(first: bool | None, second: bool | None) -> bool | None:
+    """Whether one of two copies does; None if neither is known to, and one may."""
+    return first or second or (None if None in (first, second) else False)
+
+
 def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
     """Report moments whose rules take too much work to compare. Work is counted: the same rules always take the same.
 
@@ -213,10 +224,10 @@ def _report_sleep(reason: str, span: Span, reporter: Reporter) -> None:
     )  # fmt: skip
 
 
-def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool:
+def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool | None:
     if isinstance(rule, Transform) and rule.target.op == "const" and not rule.effects:
         same = member_of(ELEMENT_HERE, (rule.target.value,))
-        return satisfiable(facts, [(rule.mask, HERE), (negation(same), HERE)], lets)
+        return decide(facts, [(rule.mask, HERE), (negation(same), HERE)], lets)
     return True
 
 

@@ -11,29 +11,34 @@ from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
-from powderdsl.model.logic.budget import Budget
-from powderdsl.model.logic.satisfy import Facts, satisfiable
+from powderdsl.model.logic.budget import Budget, Exhausted
+from powderdsl.model.logic.satisfy import Facts, decide
+from powderdsl.model.logic.undecided import settled
 from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule, Ruleset, Transform
 from powderdsl.syntax.ast import Syntax
 
 HERE: Offset = (0, 0)
 
 BUDGET = 100_000
-"""Nodes evaluated for these warnings: a quarter of a second. After that nothing more is found."""
+"""Nodes evaluated for these warnings: a quarter of a second. After that nothing more is found, and a note says so."""
 
-MAX_RULES = 100
-"""Rules of a moment, up to which each is compared with the others."""
+GLANCES = 10
+"""Rules of a moment that are looked at for the work of one node."""
 
 SILENT = ("PD503", "PD506", "PD509")
 """Who reads that a rule never happens does not want to read why twice."""
 
 
-def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) -> None:
-    """Report comparisons that ranges decide, and rules that others always overrule."""
-    quick = replace(facts, budget=Budget(BUDGET))
+def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) -> list[Span]:
+    """Report comparisons that ranges decide, and rules that others always overrule.
+
+    Returns:
+        The rules that may be overruled: to tell takes too much work.
+    """
+    quick = replace(facts, budget=Budget(BUDGET, BUDGET // 4))
     known = silent_rules(reporter)
     _report_decided(passes, known, reporter)
-    _report_overruled(passes, quick, known, reporter)
+    return _report_overruled(passes, quick, known, reporter)
 
 
 def silent_rules(reporter: Reporter) -> list[Span]:
@@ -110,19 +115,29 @@ def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:
 
 def _report_overruled(
     passes: tuple[Pass, ...], facts: Facts, known: Sequence[Span], reporter: Reporter
-) -> None:
-    found: dict[Span, Rule | None] = {}
+) -> list[Span]:
+    found: dict[Span, Rule] = {}
+    matter: dict[Span, None] = {}
+    undecided: dict[Span, None] = {}
     for pass_ in passes:
         for moment in pass_.moments:
-            if len(moment.rules) > MAX_RULES:
-                continue
             lets = {let.name: let.value for let in moment.lets}
             for place, rule in enumerate(moment.rules):
-                if found.get(rule.span, rule) is None:
-                    continue  # some copy of it matters
-                found[rule.span] = _overruling(rule, place, moment, facts, lets)
+                if rule.span in matter:
+                    continue
+                try:
+                    winner = _overruling(rule, place, moment, facts, lets)
+                except Exhausted:
+                    undecided[rule.span] = None
+                    continue
+                if winner is None:
+                    matter[rule.span] = None
+                else:
+                    found.setdefault(rule.span, winner)
     for span, winner in found.items():
-        if winner is None or winner.span == span or any(_inside(span, other) for other in known):
+        if span in matter or span in undecided or winner.span == span:
+            continue
+        if any(_inside(span, other) for other in known):
             continue
         words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
         reporter.report(
@@ -130,17 +145,21 @@ def _report_overruled(
             secondary=[Label(winner.span, words)],
             helps=["make their conditions exclude each other", "or remove one of them"],
         )  # fmt: skip
+    return [
+        span for span in undecided if span not in matter and not any(_inside(span, other) for other in known)
+    ]
 
 
 def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: dict[str, Expr]) -> Rule | None:
-    """One of the rules of a moment that never leave anything to this one; None if it matters."""
+    """One of the rules of a moment that never leave anything to this one; None if it matters. Raises Exhausted."""
     if rule.mask is None:
         return None
+    facts.budget.spend(len(moment.rules) // GLANCES)
     rivals = [other for other in _rivals(rule, place, moment) if other.mask is not None]
-    if not rivals or not satisfiable(facts, [(rule.mask, HERE)], lets):
+    if not rivals or decide(facts, [(rule.mask, HERE)], lets) is False:
         return None
     conditions = [(rule.mask, HERE), *((negation(other.mask), HERE) for other in rivals if other.mask)]
-    return None if satisfiable(facts, conditions, lets) else rivals[0]
+    return None if settled(facts, conditions, lets) else rivals[0]
 
 
 def _rivals(rule: Rule, place: int, moment: Moment) -> Iterator[Rule]:
@@ -167,13 +186,17 @@ def _rivals(rule: Rule, place: int, moment: Moment) -> Iterator[Rule]:
 
 def report_undrawn(
     ruleset: Ruleset, given: Sequence[tuple[str, int, Span]], facts: Facts, reporter: Reporter
-) -> None:
+) -> list[Span]:
     """Report chances of elements against which no rule draws there: mostly a tag is missing.
 
     Args:
         given: property, element id, and where an element's value of it stands.
+
+    Returns:
+        The chances that no rule may draw: to tell takes too much work.
     """
-    quick = replace(facts, budget=Budget(BUDGET))
+    quick = replace(facts, budget=Budget(BUDGET, BUDGET // 4))
+    undecided = []
     chances = {prop.name: prop for prop in ruleset.properties if prop.kind.name == "chance"}
     for name, number, span in given:
         prop = chances.get(name)
@@ -183,16 +206,22 @@ def report_undrawn(
             or prop.values[number] == 0
         ):
             continue
-        if not _drawn(prop, number, ruleset, quick):
+        try:
+            drawn = _drawn(prop, number, ruleset, quick)
+        except Exhausted:
+            undecided.append(span)
+            continue
+        if not drawn:
             element = facts.names.get(number, "?")
             reporter.report(
                 "PD507", f"`{name}` of `{element}` is never used", span, f"no rule asks `{element}` for it",
                 helps=["look for a tag that it lacks, or remove the value"],
             )  # fmt: skip
+    return undecided
 
 
 def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> bool:
-    """Whether some rule that reads the property may happen where this element stands. False is a proof."""
+    """Whether some rule that reads the property may happen where this element stands. Raises Exhausted."""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
         for moment in pass_.moments:
@@ -205,7 +234,7 @@ def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> bool:
                     return True
                 for at in reads.places:
                     here = (member(ELEMENT_HERE, (number,)), at)
-                    if satisfiable(facts, [(rule.mask, HERE), here], lets):  # type: ignore[list-item]
+                    if settled(facts, [(rule.mask, HERE), here], lets):  # type: ignore[list-item]
                         return True
     return False
 
