@@ -296,3 +296,15 @@ def test_nothing_is_written_for_a_study_that_is_refused(
     assert result.exit_code == 2
     assert "study.yaml:13:" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["study.yaml"]
+
+
+@pytest.mark.parametrize(("study", "right"), [(AGENTS, "trained"), (MODELS, "tuned")])
+def test_a_measure_of_the_step_that_evaluates_is_led_to_the_run(study: str, right: str) -> None:
+    """What the message proposes is accepted."""
+    wrong = study.replace(f"{{of: {right},", "{of: tested,")
+    with pytest.raises(CompileError) as caught:
+        read(wrong)
+    (found,) = caught.value.diagnostics
+    assert (found.code, under(found)) == ("PD806", "tested")
+    assert f"`of: {right}`" in found.helps[0]
+    assert read(study.replace("{of: tested,", f"{{of: {right},")).measures[0].step == right

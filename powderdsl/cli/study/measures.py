@@ -30,8 +30,8 @@ def check_measure(places: Places, measure: Measure, task_of: Callable[[Step, Val
     Args:
         task_of: the task that a step plays with some values; None if it is not known.
     """
-    if measure.step not in places.steps:
-        return
+    if measure.step not in places.steps or not places.steps[measure.step].makes_run:
+        return  # reported by who reads the file
     steps = [
         one
         for one in places.study.steps

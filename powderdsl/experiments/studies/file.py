@@ -291,9 +291,17 @@ class _StudyReader:
         scale = self.reader.choice(entries, "scale", SCALES) or "linear"
         if of is None or value is None:
             return None
-        names = [step.name for step in self.steps if step.makes_run]
-        if of.text not in names:
-            helps = suggest(of.text, names, "steps")
+        steps = {step.name: step for step in self.steps}
+        made = [name for name, step in steps.items() if step.makes_run]
+        if of.text in steps and of.text not in made:
+            judged = steps[of.text]
+            while judged.on_step and not judged.makes_run:
+                judged = steps[str(judged.on)]
+            cure = f"`of: {judged.name}`: what is found is kept with the run" if judged.makes_run else ""
+            helps = (f"write {cure}",) if cure else suggest(of.text, made, "steps")
+            self.reporter.error("PD806", f"the step `{of.text}` makes no run", of.span, helps=helps)
+        elif of.text not in made:
+            helps = suggest(of.text, made, "steps")
             self.reporter.error("PD806", f"no step `{of.text}` that makes a run", of.span, helps=helps)
         self.check_names(value.text, value.span)
         self.places["of", key.text], self.places["keys", key.text] = of.span, value.span
