@@ -319,3 +319,64 @@ def test_names_of_a_block_come_before_packs() -> None:
     world = sim.step(sim.world(np.array([[[0, 0, 0], [0, loop, 0], [0, 0, 0]]], np.uint8)))
     assert world["trail"].tolist() == [[[0, 1, 0], [1, 0, 1], [0, 1, 0]]]
     assert not world["snail.trail"].any()
+
+
+BOTH = """
+pack: guest
+needs: [core, one, two]
+properties: {taste: {type: 0..9, one.slime: 3, two.slime: 4, zork.slime?: 9}}
+sets: {goo: "(one.slime, two.slime)"}
+fields: {mark: {type: 0..9, at: element, of: one.sticky, one.slime: 2}}
+elements:
+  guest: {color: "#402060", tags: [one.sticky, zork.sticky?], one.wet: 5}
+also:
+  one.slime: {tags: two.sticky}
+  two.slime: {two.wet: 6}
+  zork.slime?: {tags: two.sticky}
+passes:
+  meet:
+    before: [one.creep, zork.creep?]
+    after: two.creep
+    do: goo -> guest if above is guest and taste > 3
+tests:
+  - drawn by qualified names:
+      legend: {a: one.slime, b: two.slime, g: guest}
+      given: a b g
+      after: 0 steps
+      fields: {one.wet: 1 . .}
+      expect_fields: {one.wet: 1 0 5, two.wet: 0 6 0, mark: 2 0 0}
+"""
+
+
+@pytest.mark.parametrize("order", [("one", "two"), ("two", "one")])
+def test_qualified_names_mean_the_same_wherever_a_pack_writes_them(order: tuple[str, str]) -> None:
+    """Also the names of the pack that was loaded first, which are plain outside."""
+    Path("guest.yaml").write_text(BOTH)
+    rules = powderdsl.load("core", *(f"{name}.yaml" for name in order), "guest.yaml")
+    sticky = {pack: "sticky" if pack == order[0] else f"{pack}.sticky" for pack in order}
+    tags = {
+        pack: {one.qualified for one in rules.elements if sticky[pack] in one.tags} for pack in ("one", "two")
+    }
+    assert tags == {"one": {"one.slime", "guest.guest"}, "two": {"one.slime", "two.slime"}}
+    (taste,) = [one for one in rules.properties if one.name == "taste"]
+    values = {one.qualified: taste.values[one.id] for one in rules.elements}
+    assert (values["one.slime"], values["two.slime"]) == (3, 4)
+    passes = [one.name for one in rules.passes][-3:]
+    assert passes == (["two.creep", "meet", "creep"] if order[0] == "one" else ["creep", "meet", "one.creep"])
+    assert [one.problem for one in run_examples(rules) if one.example.pack == "guest"] == [""]
+
+
+def test_an_element_that_overrides_has_the_name_of_its_pack() -> None:
+    Path("light.yaml").write_text(
+        "pack: light\nneeds: [core, sand]\nelements:\n"
+        "  sand: {override: yes, density: 2, gravity: yes, color: '#F3C23A'}\n"
+    )
+    path = pack(
+        "glass", "  glass: {color: '#402060'}", "passes: {melt: {do: light.sand -> glass if above is wall}}"
+    )
+    rules = powderdsl.load("core", "sand", "light.yaml", path)
+    sim = powderdsl.compile(rules, "reference")
+    sand = rules.element("light.sand").id
+    assert rules.element("sand.sand") is None
+    later = sim.step(sim.world(np.array([[[1], [sand], [1]]], np.uint8)))
+    assert later.ids[0, 1, 0] == rules.element("glass").id

@@ -263,7 +263,7 @@ def _chosen_elements(packs: Sequence[PackDecl], book: NameBook, reporter: Report
     chosen: dict[str, _Chosen] = {}
     for pack in packs:
         for decl in pack.elements:
-            known = book.find(decl.name.text, pack.name.text, "element") if decl.override else None
+            known = book.override(decl.name.text, pack.name.text) if decl.override else None
             if known is not None:
                 before = chosen[known]
                 _check_same_id(decl, before, reporter)

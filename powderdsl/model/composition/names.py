@@ -29,25 +29,36 @@ class Names:
     """By pack and word: the global name that the word means there, where that is not the word itself."""
     pass_meanings: Mapping[tuple[str, str], str]
     """The same for names of passes."""
+    defined: Mapping[tuple[str, str], str]
+    """By pack and word: the global name of what the pack defines, elements that it overrides among them."""
+    passes_defined: Mapping[tuple[str, str], str]
+    """The same for names of passes."""
     needs: Mapping[str, frozenset[str]]
     """A pack, and all packs that it needs, directly or not."""
 
     def of(self, pack: str, word: str) -> str:
-        """The global name that a word means in a pack. Words that nothing defines stay as they are."""
-        return self.meanings.get((pack, word), word)
+        """The global name that a word, plain or qualified, means in a pack. Unknown words stay as they are."""
+        return _meant(self.meanings, self.defined, pack, word)
 
     def of_pass(self, pack: str, word: str) -> str:
         """The same for the name of a pass."""
-        return self.pass_meanings.get((pack, word), word)
+        return _meant(self.pass_meanings, self.passes_defined, pack, word)
 
     def qualified(self, pack: str, word: str) -> str | None:
         """The global name of what a pack defines under a word."""
-        return next((name for name, owner in self.owners.items() if owner == (pack, word)), None)
+        return self.defined.get((pack, word))
 
     def knows(self, pack: str, name: str) -> bool:
         """Whether a pack can be expected to know a global name: its own, or one of a pack that it needs."""
         owner = self.owners.get(name)
         return owner is None or owner[0] in self.needs.get(pack, frozenset((pack,)))
+
+
+def _meant(
+    meanings: Mapping[tuple[str, str], str], defined: Mapping[tuple[str, str], str], pack: str, word: str
+) -> str:
+    owner, point, own = word.partition(".")
+    return (defined.get((owner, own)) if point else meanings.get((pack, word))) or word
 
 
 def a(noun: str) -> str:
@@ -100,6 +111,8 @@ class NameBook:
         """By the word in its own file."""
         self._known: dict[tuple[bool, str], _Definition] = {}
         """By global name."""
+        self._overridden: dict[tuple[str, str], str] = {}
+        """By pack and word: the global name of the element that the pack overrides."""
 
     def check_word(self, scalar: Scalar, kind: str) -> bool:
         """Whether a word may name something; reports one that belongs to the language."""
@@ -147,6 +160,13 @@ class NameBook:
         near = [one for one in written if one.pack in self.needs[pack]]
         return (near or written)[0].name if written else None
 
+    def override(self, word: str, pack: str) -> str | None:
+        """The global name of the element that a pack overrides, which is also known by the pack's name from now on."""
+        name = self.find(word, pack, "element")
+        if name is not None:
+            self._overridden[pack, word] = name
+        return name
+
     def finish(self) -> Names:
         """What every word means in every pack."""
         meanings: dict[bool, dict[tuple[str, str], str]] = {False: {}, True: {}}
@@ -158,10 +178,18 @@ class NameBook:
                 near = own or [one.name for one in written if one.pack in self.needs[pack]]
                 if near:
                     meanings[is_pass][pack, word] = near[0]
-        owners = {
-            name: (one.pack, one.scalar.text) for (is_pass, name), one in self._known.items() if not is_pass
-        }
-        return Names(owners, meanings[False], meanings[True], self.needs)
+        defined: dict[bool, dict[tuple[str, str], str]] = {False: {}, True: {}}
+        for (is_pass, name), one in self._known.items():
+            defined[is_pass][one.pack, one.scalar.text] = name
+        owners = {name: owner for owner, name in defined[False].items()}
+        return Names(
+            owners=owners,
+            meanings=meanings[False],
+            pass_meanings=meanings[True],
+            defined={**defined[False], **self._overridden},
+            passes_defined=defined[True],
+            needs=self.needs,
+        )
 
     def _related(self, pack: str, other: str) -> bool:
         return other in self.needs[pack] or pack in self.needs[other]
