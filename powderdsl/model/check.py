@@ -284,7 +284,10 @@ def _properties(symbols: Symbols, typer: Typer) -> None:
                 )
         except Poisoned:
             continue
-        symbols.properties[name] = Property(name, kind, (), frozenset(), named.pack, named.decl.name.span)
+        word = named.decl.name.text
+        symbols.properties[name] = Property(
+            name, kind, (), frozenset(), named.pack, named.decl.name.span, word if word != name else ""
+        )
 
 
 def _property_values(symbols: Symbols, typer: Typer) -> list[tuple[str, int, Span]]:

@@ -168,6 +168,13 @@ class Property:
     stored: frozenset[int]
     pack: str
     span: Span = field(compare=False, repr=False)
+    word: str = field(default="", repr=False, metadata=UNMEANING)
+    """Its name in its own file, where that is another."""
+
+    @property
+    def qualified(self) -> str:
+        """The name that it has whatever else is loaded."""
+        return f"{self.pack}.{self.word or self.name}"
 
 
 @dataclass(frozen=True)
@@ -186,6 +193,13 @@ class Field:
     pack: str
     span: Span = field(compare=False, repr=False)
     own: tuple[tuple[int, Any], ...] = ()
+    word: str = field(default="", repr=False, metadata=UNMEANING)
+    """Its name in its own file, where that is another."""
+
+    @property
+    def qualified(self) -> str:
+        """The name that it has whatever else is loaded."""
+        return f"{self.pack}.{self.word or self.name}"
 
     @property
     def defaults(self) -> tuple[Any, ...]:
@@ -488,11 +502,21 @@ class Ruleset:
         names = {element.id: element.qualified for element in self.elements}
         return tuple(names.get(number) for number in range(self.slots))
 
+    @property
+    def qualified_slots(self) -> dict[str, str]:
+        """The qualified name of each field and property."""
+        found = {one.name: one.qualified for one in self.fields}
+        return found | {one.name: one.qualified for one in self.properties}
+
     def property(self, name: str) -> Property | None:
         return next((p for p in self.properties if p.name == name), None)
 
     def field(self, name: str) -> Field | None:
         return next((f for f in self.fields if f.name == name), None)
+
+    def slot_name(self, name: str) -> str:
+        """The name in `World.state` of a field or property by its plain or qualified name; others as they are."""
+        return next((plain for plain, word in self.qualified_slots.items() if word == name), name)
 
     def with_params(self, values: dict[str, Value]) -> Ruleset:
         """The same ruleset with other defaults; the values are checked by `compiler.set_params`."""

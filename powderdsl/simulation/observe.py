@@ -52,6 +52,7 @@ class Observer:
         Raises:
             KeyError: for a name that the ruleset does not have. ValueError, TypeError: a buffer that does not fit.
         """
+        name = self.ruleset.slot_name(name)
         if name in self.slots:
             if out is None:
                 return state[name]

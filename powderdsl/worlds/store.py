@@ -43,6 +43,7 @@ def save(world: World, path: str | Path) -> None:
         "format": FORMAT,
         "ruleset": ruleset.name,
         "palette": {str(element.id): element.qualified for element in ruleset.elements},
+        "fields": {name: word for name, word in ruleset.qualified_slots.items() if name in world.state},
     }
     arrays = {f"{SLOT}{name}": value.cpu().numpy() for name, value in world.state.items()}
     clock = {name: getattr(world, name).cpu().numpy() for name in CLOCK}
@@ -80,7 +81,7 @@ def load_world(path: str | Path, sim: Simulator) -> World:
 def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
     import torch
 
-    palette, saved_in = _about(archive, source)
+    palette, qualified, saved_in = _about(archive, source)
     shape = _shape(archive, sim, source)
     clock = {name: torch.from_numpy(_clock(archive, name, source)).to(sim.device) for name in CLOCK}
     ids = archive.read(IDS)
@@ -89,19 +90,20 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
         name = key.removeprefix(SLOT)
         if key in ("about", IDS, *CLOCK):
             continue
-        slot = next((s for s in sim.slots if s.name == name), None)
+        known = sim.ruleset.slot_name(qualified[name]) if name in qualified else name
+        slot = next((s for s in sim.slots if s.name == known), None)
         if slot is None:
-            if sim.ruleset.property(name) is None and archive.read(key).any():
+            if sim.ruleset.property(known) is None and archive.read(key).any():
                 raise _mismatch(
                     source,
-                    f"the field `{name}` of {saved_in} is not in {sim.ruleset.name}",
+                    f"the field `{qualified.get(name, name)}` of {saved_in} is not in {sim.ruleset.name}",
                     "load the pack that has it",
                 )
             continue
         if archive.headers[key].shape != (shape if slot.planes != 2 else (shape[0], 2, *shape[1:])):
             raise _bad(source, f"is not a saved world: `{key}` does not fit its elements")
         value = archive.read(key)
-        fields[name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
+        fields[slot.name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
     try:
         world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
         return World(sim, world.state, **clock)
@@ -109,8 +111,8 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
         raise _bad(source, str(error)) from None
 
 
-def _about(archive: Archive, path: Path) -> tuple[dict[int, str], str]:
-    """The palette, and the name of the ruleset."""
+def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str], str]:
+    """The palette, the qualified name of each field (none in older files), and the name of the ruleset."""
     header = archive.headers.get("about")
     if header is None or header.shape != () or header.dtype.kind != "U" or header.size > MAX_ABOUT:
         raise _bad(path, "is not a saved world: it does not say what it is")
@@ -119,10 +121,11 @@ def _about(archive: Archive, path: Path) -> tuple[dict[int, str], str]:
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             raise _bad(path, f"was saved in another format than {FORMAT}")
         palette = {int(number): str(name) for number, name in about["palette"].items()}
+        fields = {str(name): str(one) for name, one in about.get("fields", {}).items()}
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         words = " ".join(str(error).split())[:200]
         raise _bad(path, f"is not a saved world: {type(error).__name__} {words}") from None
-    return palette, str(about.get("ruleset"))[:100]
+    return palette, fields, str(about.get("ruleset"))[:100]
 
 
 def _shape(archive: Archive, sim: Simulator, path: Path) -> tuple[int, ...]:

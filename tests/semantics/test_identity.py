@@ -380,3 +380,45 @@ def test_an_element_that_overrides_has_the_name_of_its_pack() -> None:
     assert rules.element("sand.sand") is None
     later = sim.step(sim.world(np.array([[[1], [sand], [1]]], np.uint8)))
     assert later.ids[0, 1, 0] == rules.element("glass").id
+
+
+def test_fields_of_worlds_are_known_by_their_pack() -> None:
+    """Saved beside one stranger's pack, loaded beside another, or in another order: each gets its own field back."""
+    sims = {
+        order: powderdsl.compile(powderdsl.load("core", *(f"{name}.yaml" for name in order)), "reference")
+        for order in (("one", "two"), ("two", "one"), ("two",))
+    }
+    start = sims["one", "two"]
+    ids = np.array([[[start.ruleset.element(f"{name}.slime").id for name in ("one", "two")]]], np.uint8)
+    save(start.replace(start.world(ids), **{"wet": [[[3, 0]]], "two.wet": [[[0, 7]]]}), "both.npz")
+    for order in (("one", "two"), ("two", "one")):
+        world = load_world("both.npz", sims[order])
+        assert world["one.wet"].tolist() == [[[3, 0]]]
+        assert world["two.wet"].tolist() == [[[0, 7]]]
+        assert world["wet"].tolist() == world[f"{order[0]}.wet"].tolist()
+    with pytest.raises(CompileError) as raised:
+        load_world("both.npz", sims["two",])
+    assert raised.value.diagnostics[0].code == "PD603"
+    alone = sims["two",]
+    save(alone.replace(alone.world([[[alone.ruleset.element("slime").id]]]), wet=5), "two.npz")
+    world = load_world("two.npz", start)
+    assert (world["two.wet"].tolist(), world["one.wet"].tolist()) == ([[[5]]], [[[0]]])
+
+
+def test_scenes_and_traces_take_qualified_fields() -> None:
+    Path("scene.yaml").write_text(
+        "scene: both\nsize: [2, 2]\nfill: one.slime\n"
+        "draw: [one.wet := 4 in box rows 0:1 columns 0:2, two.wet := 6 in box rows 1:2 columns 0:2]\n"
+    )
+    from powderdsl.simulation.tracing.trace import trace
+    from powderdsl.worlds.scene.start import load_start
+
+    for order in (("one", "two"), ("two", "one")):
+        rules = powderdsl.load("core", *(f"{name}.yaml" for name in order))
+        start = load_start("scene.yaml", rules)
+        fields = {name: field.values.tolist() for name, field in start.fields.items()}
+        mine, other = ("wet", "two.wet") if order[0] == "one" else ("one.wet", "wet")
+        assert (fields[mine][0], fields[other][1]) == ([4, 4], [6, 6])
+        sim = powderdsl.compile(rules, "reference")
+        world = sim.world(start.ids[None])
+        assert list(trace(world, 0, 0, 1, of=["one.wet"]).before) == [mine]

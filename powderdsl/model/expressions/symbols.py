@@ -173,7 +173,8 @@ def settled(default: Value, kind: Kind) -> Value:
 
 def field_from(named: Named[TypedDecl], kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
     decl = named.decl
-    return Field(named.name, kind, default, decl.at, decl.resets, of, named.pack, decl.name.span)
+    word = decl.name.text if decl.name.text != named.name else ""
+    return Field(named.name, kind, default, decl.at, decl.resets, of, named.pack, decl.name.span, word=word)
 
 
 def check_param_names(symbols: Symbols, reporter: Reporter) -> None:

@@ -121,7 +121,7 @@ def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
     for pass_ in world.sim.ruleset.passes:
         known.update((item.name, scratch_slot(item.name, pass_)) for item in pass_.scratch)
     found = []
-    for name in dict.fromkeys(names):
+    for name in dict.fromkeys(map(world.sim.ruleset.slot_name, names)):
         if name not in known:
             if world.sim.ruleset.property(name) is not None:
                 raise KeyError(f"`{name}` follows from the element: ask for `element`")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
             (PD402), settings that no cell can have (PD608), a bad `size` (PD607).
     """
     ids = draw_scene(scene, ruleset, size=size)
+    scene = _named_as(ruleset, scene)
     settings = [one for one in scene.paints if isinstance(one, Setting)]
     if not settings:
         return Start(ids, {})
@@ -84,6 +85,15 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
         number += 1
     reporter.raise_if_errors()
     return Start(ids, found)
+
+
+def _named_as(ruleset: Ruleset, scene: Scene) -> Scene:
+    """The scene with its fields' names as worlds have them: it may have qualified ones."""
+    paints = tuple(
+        replace(one, name=ruleset.slot_name(one.name)) if isinstance(one, Setting) else one
+        for one in scene.paints
+    )
+    return replace(scene, paints=paints)
 
 
 def _value(
