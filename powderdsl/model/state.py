@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from powderdsl.model.types import ELEMENT, Kind, Ruleset
+from powderdsl.model.types import ELEMENT, Field, Kind, Property, Ruleset
 
 SNAP = 2.0**-20
 """Real fields are kept to multiples of nothing, but what is smaller than this is zero: motion dies out, and no
@@ -50,6 +50,17 @@ def storage(kind: Kind) -> str:
         if -(1 << bits) <= kind.lo and kind.hi < 1 << bits:
             return dtype
     return "int32"
+
+
+def qualified_slots(ruleset: Ruleset) -> dict[str, str]:
+    """The name of each field and property that it has whatever else is loaded."""
+    held: list[Field | Property] = [*ruleset.fields, *ruleset.properties]
+    return {one.name: f"{one.pack}.{one.word or one.name}" for one in held}
+
+
+def slot_name(ruleset: Ruleset, name: str) -> str:
+    """The name in `World.state` of a field or property by its plain or qualified name; others as they are."""
+    return next((plain for plain, word in qualified_slots(ruleset).items() if word == name), name)
 
 
 def slots(ruleset: Ruleset) -> tuple[Slot, ...]:

@@ -135,7 +135,7 @@ class ColorRamp:
 class Element:
     """An element. `id` is its number in worlds of this ruleset; `glyph` is one ASCII character.
 
-    `name` is plain, or qualified where a pack that was loaded earlier has an element of the same name.
+    `name` is plain, or qualified where an earlier pack has an element of that name; `word` is that of its file then.
     """
 
     name: str
@@ -147,7 +147,6 @@ class Element:
     tags: frozenset[str] = field(metadata=UNMEANING)
     span: Span = field(compare=False, repr=False)
     word: str = field(default="", repr=False)
-    """Its name in its own file, where that is another."""
     ramp: ColorRamp | None = field(default=None, metadata=UNMEANING)
     """How its color follows a field; without one it is `color` everywhere."""
 
@@ -169,20 +168,12 @@ class Property:
     pack: str
     span: Span = field(compare=False, repr=False)
     word: str = field(default="", repr=False, metadata=UNMEANING)
-    """Its name in its own file, where that is another."""
-
-    @property
-    def qualified(self) -> str:
-        """The name that it has whatever else is loaded."""
-        return f"{self.pack}.{self.word or self.name}"
 
 
 @dataclass(frozen=True)
 class Field:
     """State of a cell. `at` is ``element`` (travels with it) or ``place``; `of` limits it to some elements.
-
-    `own` are the defaults of single elements, by id, in the order of ids.
-    """
+    `own` are the defaults of single elements, by id, in the order of ids. `word` is as in `Element`."""
 
     name: str
     kind: Kind
@@ -194,12 +185,6 @@ class Field:
     span: Span = field(compare=False, repr=False)
     own: tuple[tuple[int, Any], ...] = ()
     word: str = field(default="", repr=False, metadata=UNMEANING)
-    """Its name in its own file, where that is another."""
-
-    @property
-    def qualified(self) -> str:
-        """The name that it has whatever else is loaded."""
-        return f"{self.pack}.{self.word or self.name}"
 
     @property
     def defaults(self) -> tuple[Any, ...]:
@@ -502,21 +487,11 @@ class Ruleset:
         names = {element.id: element.qualified for element in self.elements}
         return tuple(names.get(number) for number in range(self.slots))
 
-    @property
-    def qualified_slots(self) -> dict[str, str]:
-        """The qualified name of each field and property."""
-        found = {one.name: one.qualified for one in self.fields}
-        return found | {one.name: one.qualified for one in self.properties}
-
     def property(self, name: str) -> Property | None:
         return next((p for p in self.properties if p.name == name), None)
 
     def field(self, name: str) -> Field | None:
         return next((f for f in self.fields if f.name == name), None)
-
-    def slot_name(self, name: str) -> str:
-        """The name in `World.state` of a field or property by its plain or qualified name; others as they are."""
-        return next((plain for plain, word in self.qualified_slots.items() if word == name), name)
 
     def with_params(self, values: dict[str, Value]) -> Ruleset:
         """The same ruleset with other defaults; the values are checked by `compiler.set_params`."""

@@ -13,7 +13,7 @@ from powderdsl.diagnostics import suggest
 from powderdsl.ir.gates import width as width_of
 from powderdsl.ir.lower.rules import plane_type
 from powderdsl.ir.ops import Type
-from powderdsl.model.state import Slot, slots, storage
+from powderdsl.model.state import Slot, slot_name, slots, storage
 from powderdsl.model.types import MatrixChannel, Property, Ruleset
 from powderdsl.simulation.draw import palette, ramps
 from powderdsl.simulation.views import (
@@ -52,7 +52,7 @@ class Observer:
         Raises:
             KeyError: for a name that the ruleset does not have. ValueError, TypeError: a buffer that does not fit.
         """
-        name = self.ruleset.slot_name(name)
+        name = slot_name(self.ruleset, name)
         if name in self.slots:
             if out is None:
                 return state[name]

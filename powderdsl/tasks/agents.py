@@ -6,6 +6,7 @@ import re
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.schema import Reader
+from powderdsl.model.state import slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.tasks.drawings import choice_ids
@@ -95,7 +96,7 @@ def _speed_field(
     """The vector that blowing sets: the one named, or the only one there is."""
     vectors = [one.name for one in ruleset.fields if one.kind.name == "vec2" and not one.resets]
     named = reader.scalar(entries, "speed_field")
-    if named is not None and ruleset.slot_name(named.text) not in vectors:
+    if named is not None and slot_name(ruleset, named.text) not in vectors:
         helps = suggest(named.text, vectors, "vectors of these rules")
         message = f"`{named.text}` is no vector field"
         reader.reporter.error("PD804", message, named.span, "blowing sets a vector", helps=helps)
@@ -103,7 +104,7 @@ def _speed_field(
     if not blows:
         return None
     if named is not None:
-        return ruleset.slot_name(named.text)
+        return slot_name(ruleset, named.text)
     if len(vectors) != 1:
         message = (
             "these rules have no field that blowing could set"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import ELEMENT
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.system.archives import Archive, BadArchive, open_archive
@@ -43,7 +44,7 @@ def save(world: World, path: str | Path) -> None:
         "format": FORMAT,
         "ruleset": ruleset.name,
         "palette": {str(element.id): element.qualified for element in ruleset.elements},
-        "fields": {name: word for name, word in ruleset.qualified_slots.items() if name in world.state},
+        "fields": {name: word for name, word in qualified_slots(ruleset).items() if name in world.state},
     }
     arrays = {f"{SLOT}{name}": value.cpu().numpy() for name, value in world.state.items()}
     clock = {name: getattr(world, name).cpu().numpy() for name in CLOCK}
@@ -90,7 +91,7 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
         name = key.removeprefix(SLOT)
         if key in ("about", IDS, *CLOCK):
             continue
-        known = sim.ruleset.slot_name(qualified[name]) if name in qualified else name
+        known = slot_name(sim.ruleset, qualified[name]) if name in qualified else name
         slot = next((s for s in sim.slots if s.name == known), None)
         if slot is None:
             if sim.ruleset.property(known) is None and archive.read(key).any():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from powderdsl.diagnostics import suggest
-from powderdsl.model.state import Slot
+from powderdsl.model.state import Slot, slot_name
 from powderdsl.model.types import Expr, Rule, Ruleset
 from powderdsl.simulation.provenance import NumberedRule
 from powderdsl.simulation.simulator import World
@@ -121,7 +121,7 @@ def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
     for pass_ in world.sim.ruleset.passes:
         known.update((item.name, scratch_slot(item.name, pass_)) for item in pass_.scratch)
     found = []
-    for name in dict.fromkeys(map(world.sim.ruleset.slot_name, names)):
+    for name in dict.fromkeys(slot_name(world.sim.ruleset, name) for name in names):
         if name not in known:
             if world.sim.ruleset.property(name) is not None:
                 raise KeyError(f"`{name}` follows from the element: ask for `element`")

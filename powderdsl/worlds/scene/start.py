@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.fields.words import WordProblem, read_word
-from powderdsl.model.state import Slot, slots
+from powderdsl.model.state import Slot, slot_name, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.worlds.raster import Paint, Setting, Size, mask
 from powderdsl.worlds.scene.load import draw_scene, element_ids, find_scene
@@ -90,7 +90,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
 def _named_as(ruleset: Ruleset, scene: Scene) -> Scene:
     """The scene with its fields' names as worlds have them: it may have qualified ones."""
     paints = tuple(
-        replace(one, name=ruleset.slot_name(one.name)) if isinstance(one, Setting) else one
+        replace(one, name=slot_name(ruleset, one.name)) if isinstance(one, Setting) else one
         for one in scene.paints
     )
     return replace(scene, paints=paints)
