@@ -126,6 +126,8 @@ OPS: dict[str, Op] = {
             "(low, high)",
             "not a number → 0, cut off at the bounds, smaller than SNAP → 0",
         ),
+        # variables of a schedule (`schedule/types.py`)
+        Op("load", (), "?", "name", "what a variable of the schedule holds"),
         # choices and movements
         Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),
         Op(
@@ -147,7 +149,7 @@ OPS: dict[str, Op] = {
 """Every operation of the IR."""
 
 COMMUTATIVE = frozenset({"and", "or", "xor", "eq", "add", "mul", "min", "max"})
-LEAVES = frozenset({"input", "const", "param", "coordinate", "inside", "draw"})
+LEAVES = frozenset({"input", "const", "param", "coordinate", "inside", "draw", "load"})
 
 
 @dataclass(frozen=True, eq=False)

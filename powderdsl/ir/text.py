@@ -53,15 +53,15 @@ def print_pass(pass_: PassGraph) -> str:
 def _node_text(node: Node, names: dict[int, str]) -> str:
     parts = [names[id(arg)] for arg in node.args]
     if node.attr is not None:
-        parts.append(_attr_text(node.attr))
+        parts.append(attr_text(node.attr))
     return f"{node.op} {', '.join(parts)} : {node.type}".replace("  ", " ")
 
 
-def _attr_text(attr: object) -> str:
+def attr_text(attr: object) -> str:
     if isinstance(attr, frozenset):
         return "{" + ", ".join(map(str, sorted(attr))) + "}"
     if isinstance(attr, tuple):
-        return "(" + ", ".join(_attr_text(part) for part in attr) + ")"
+        return "(" + ", ".join(attr_text(part) for part in attr) + ")"
     if isinstance(attr, float):
         return f"{attr!r}"
     return str(attr)

@@ -28,7 +28,7 @@ from powderdsl.targets.dense.mixed import Part, mixed_program
 Lowered = Callable[[], Program]
 """Gives a ruleset in IR; the work is done when it is first called."""
 
-SOURCES = ("compiler.py", "simulation/native_start.py", "model", "analysis", "ir", "targets")
+SOURCES = ("compiler.py", "simulation/native_start.py", "model", "analysis", "ir", "schedule", "targets")
 
 
 def start_key(ruleset: Ruleset) -> str:

@@ -1,4 +1,4 @@
-"""What generated code calls on the CPU (`targets.planes.source`): NumPy's arrays, and nothing done that need not be.
+"""What generated code calls on the CPU (`targets.arrays.source`): NumPy's arrays, and nothing done that need not be.
 
 An operation on a small array costs NumPy half a microsecond, torch several times that; a step is thousands of them.
 """
@@ -21,6 +21,9 @@ PIECE = 1 << 14
 
 FEW, SPARSE = 512, 2
 """Movements are carried out word by word where the movers' words are one in `SPARSE` at most, among `FEW` or more."""
+
+GLANCE = 61
+"""One in so many floats is looked at before all are."""
 
 _CHANGES: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply}
 
@@ -59,6 +62,12 @@ class ArrayKernels:
     def some(*flags: Array) -> bool:
         """Whether one of some flags holds anywhere."""
         return any(map(np.count_nonzero, flags))
+
+    @staticmethod
+    def all_zero(*fields: Array) -> bool:
+        """Whether some fields are zero everywhere."""
+        bits = [field.reshape(-1).view(np.int32) for field in fields]
+        return not any(np.count_nonzero(one[::GLANCE]) or np.count_nonzero(one) for one in bits)
 
     # Words
 

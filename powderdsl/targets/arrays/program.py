@@ -12,15 +12,11 @@ from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import PassGraph, Program
 from powderdsl.targets.arrays.draws import Draws, base_keys
 from powderdsl.targets.arrays.kernels import ArrayKernels
+from powderdsl.targets.arrays.source import pass_source
 from powderdsl.targets.arrays.words import Array, pack, unpack
 from powderdsl.targets.dense.source import load_source
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import Laps, unwatched
-from powderdsl.targets.planes.quiet import quiet_pass, real_inputs
-from powderdsl.targets.planes.source import planes_pass_source
-
-GLANCE = 61
-"""One in so many reals is looked at before all are."""
 
 State = dict[str, Array]
 
@@ -32,28 +28,9 @@ PassFunction = Callable[[ArrayKernels, State], State]
 
 
 def _function(pass_: PassGraph, number: int) -> PassFunction:
-    """A pass as a function; where its reals are all zero, a shorter one if there is one."""
-    full, quiet = _loaded(pass_, number), quiet_pass(pass_)
-    if quiet is None:
-        return full
-    short, slots = _loaded(quiet, number), real_inputs(pass_)
-
-    def either(kernels: ArrayKernels, state: State) -> State:
-        silent = all(_is_zero(state[slot]) for slot in slots)
-        return short(kernels, state) if silent else full(kernels, state)
-
-    return either
-
-
-def _loaded(pass_: PassGraph, number: int) -> PassFunction:
-    source, name, constants = planes_pass_source(pass_, number)
+    source, name, constants = pass_source(pass_, number)
     function: PassFunction = load_source(source, name, {k: np.float32(v) for k, v in constants.items()})
     return function
-
-
-def _is_zero(reals: Array) -> bool:
-    bits = reals.reshape(-1).view(np.int32)
-    return not np.count_nonzero(bits[::GLANCE]) and not np.count_nonzero(bits)
 
 
 class ArrayProgram:

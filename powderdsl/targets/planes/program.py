@@ -15,10 +15,10 @@ from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import Program, SlotType
 from powderdsl.targets import random
 from powderdsl.targets import words as torch_words
+from powderdsl.targets.arrays.source import pass_source
 from powderdsl.targets.dense.program import Kernels, PassFunction, compiled
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import Laps, unwatched
-from powderdsl.targets.planes.source import planes_pass_source
 
 _CHANGES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "add": torch.add,
@@ -63,6 +63,11 @@ class PlaneKernels:
     def some(*flags: Tensor) -> bool:
         """Whether one of some flags may hold anywhere: to know, one would have to wait for the device."""
         return True
+
+    @staticmethod
+    def all_zero(*fields: Tensor) -> bool:
+        """Whether some fields are zero everywhere: this would have to wait too."""
+        return False
 
     def stack(self, planes: tuple[Tensor, ...]) -> Tensor:
         return torch.stack([self.full(plane) for plane in planes])
@@ -236,7 +241,7 @@ class PlaneKernels:
 def planes_kernel_source(program: Program, only: str | None = None) -> str:
     """The generated source of all passes (or one) of a program on planes."""
     return "\n\n".join(
-        planes_pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
+        pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
     )
 
 
@@ -258,7 +263,7 @@ class PlanesProgram:
         )
         self._defaults = {slot.name: slot for slot in planes.slots}
         self._functions: list[tuple[str, PassFunction]] = [
-            (p.name, compiled(*planes_pass_source(p, i), device)) for i, p in enumerate(planes.passes)
+            (p.name, compiled(*pass_source(p, i), device)) for i, p in enumerate(planes.passes)
         ]
 
     def run(self, job: Job) -> Mapping[str, Tensor]:

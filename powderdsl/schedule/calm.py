@@ -1,4 +1,4 @@
-"""A pass on planes as it is where all reals that it reads are zero: much less, or nothing at all."""
+"""A pass on bit planes as it is where all reals that it reads are zero: much less, or nothing at all."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def real_inputs(pass_: PassGraph) -> tuple[str, ...]:
     return tuple(dict.fromkeys(str(n.attr) for n in nodes if n.op == "input" and n.type == REAL))
 
 
-def quiet_pass(pass_: PassGraph) -> PassGraph | None:
+def calm_pass(pass_: PassGraph) -> PassGraph | None:
     """The pass where its real inputs are zero everywhere; None if that is not much less."""
     slots = set(real_inputs(pass_))
     if not slots:

@@ -1,0 +1,164 @@
+"""Random bits only where they matter: thresholds of parameters, questions that take no draws, conditions of draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from powderdsl.ir.ops import FLAG, Graph, Node
+from powderdsl.schedule.rewrite import map_values, without_unread
+from powderdsl.schedule.types import (
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    load,
+    map_blocks,
+    ordered,
+)
+
+FEW_BITS = 2
+"""So many random bits are drawn without asking whether they matter."""
+
+MAX_CONDITIONS = 8
+"""Flags without which a draw does not matter, at most."""
+
+DRAWS = ("chance", "below_planes", "below_param")
+_POINTWISE = ("and", "or", "xor", "not", "select")
+
+
+def thresholds(schedule: Schedule) -> Schedule:
+    """A draw below all planes of one parameter is a draw below the parameter, which mostly is the same for all worlds.
+
+    `below_planes(p:16, p:15, …, p:0)` → `below_param(p)`.
+    """
+
+    def rule(node: Node) -> Node | None:
+        if node.op != "below_planes" or node.args[0].op != "param":
+            return None
+        (stream, bits), (name, view, _) = node.attr, node.args[0].attr
+        if [arg.attr for arg in node.args] != [(name, view, i) for i in range(bits, -1, -1)]:
+            return None
+        return schedule.graph.node("below_param", FLAG, (), (stream, bits, name, view), node.places)
+
+    return map_values(schedule, rule)
+
+
+def cheap_questions(schedule: Schedule) -> Schedule:
+    """A guard asks first for the part of its mask that takes no draws; the draws are made in its body.
+
+    `p = ice & many & below(melt); if any p` → `q = ice & many; if any q: p = …`.
+    """
+    namer, graph = Namer(schedule), schedule.graph
+
+    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        result: list[Statement] = []
+        for statement in block:
+            masks = result[-1] if result else None
+            if not isinstance(statement, Guard) or not isinstance(masks, Compute):
+                result.append(statement)
+                continue
+            late, early, questions = [], [], []
+            asked = {str(node.attr) for node in statement.when if node.op == "load"}
+            for out in masks.outs:
+                cheap = _without_draws(out.value, graph) if out.var.name in asked else None
+                if cheap is None:
+                    early.append(out)
+                    continue
+                late.append(out)
+                questions.append(Out(namer.var(FLAG), cheap))
+            gone = {out.var.name for out in late}
+            when = [node for node in statement.when if node.attr not in gone or node.op != "load"]
+            when += [load(graph, out.var) for out in questions]
+            body = (replace(masks, outs=tuple(late)), *statement.body) if late else statement.body
+            nothing = graph.node("const", FLAG, (), False)
+            kept = tuple((out.var, nothing) for out in late)
+            result[-1:] = [replace(masks, outs=(*early, *questions))] if early or questions else []
+            result.append(replace(statement, when=tuple(when), body=body, keeps=(*statement.keeps, *kept)))
+        return tuple(result)
+
+    return without_unread(replace(schedule, body=map_blocks(schedule.body, change)))
+
+
+def conditions(schedule: Schedule) -> Schedule:
+    """Draws get a last argument: where their result is asked for. Elsewhere it may be anything.
+
+    `busy & chance(s)` → `busy & chance(s, busy)`.
+    """
+    graph = schedule.graph
+
+    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        return tuple(
+            _with_conditions(statement, graph) if isinstance(statement, Compute) else statement
+            for statement in block
+        )
+
+    return replace(schedule, body=map_blocks(schedule.body, change))
+
+
+def _with_conditions(statement: Compute, graph: Graph) -> Compute:
+    roots = [out.value for out in statement.outs]
+    nodes = ordered(roots)
+    random: dict[int, bool] = {}
+    for node in nodes:
+        random[id(node)] = takes_bits(node) or any(random[id(arg)] for arg in node.args)
+    if not any(random.values()):
+        return statement
+    fixed = set(map(id, roots))
+    where: dict[int, dict[int, Node]] = {}
+    for node in reversed(nodes):
+        own = {} if id(node) in fixed else where.get(id(node), {})
+        for arg in node.args:
+            if random[id(arg)]:
+                flags = dict(own) if node.op in _POINTWISE else {}
+                for other in node.args:
+                    if node.op == "and" and not random[id(other)] and len(flags) < MAX_CONDITIONS:
+                        flags[id(other)] = other
+                known = where.get(id(arg), flags)
+                where[id(arg)] = {key: flag for key, flag in known.items() if key in flags}
+    done: dict[int, Node] = {}
+    for node in sorted(nodes, key=lambda node: random[id(node)]):  # conditions take no draws
+        args = [done[id(arg)] for arg in node.args]
+        flags = [done[id(flag)] for flag in where.get(id(node), {}).values()]
+        if node.op in DRAWS and takes_bits(node) and flags:
+            args.append(all_of(flags, graph))
+        same = len(args) == len(node.args) and all(a is b for a, b in zip(args, node.args, strict=True))
+        done[id(node)] = node if same else graph.node(node.op, node.type, tuple(args), node.attr, node.places)
+    return replace(statement, outs=tuple(replace(out, value=done[id(out.value)]) for out in statement.outs))
+
+
+def takes_bits(node: Node) -> bool:
+    """Whether a node is a draw that takes more than a few random bits."""
+    if node.op == "chance":
+        _, bits, limit = node.attr
+        return bits - ((limit & -limit).bit_length() - 1) > FEW_BITS
+    return node.op in ("below_planes", "below_param", "draw")
+
+
+def conjuncts(node: Node) -> list[Node]:
+    """What must hold for a flag to hold, in order."""
+    seen: dict[int, Node] = {}
+    stack = [node]
+    while stack:
+        top = stack.pop()
+        if id(top) not in seen:
+            seen[id(top)] = top
+            stack.extend(reversed(top.args) if top.op == "and" else ())
+    return [part for part in seen.values() if part.op != "and"]
+
+
+def all_of(flags: Iterable[Node], graph: Graph) -> Node:
+    """The conjunction of one or more flags."""
+    first, *rest = flags
+    for flag in rest:
+        first = graph.node("and", FLAG, (first, flag))
+    return first
+
+
+def _without_draws(mask: Node, graph: Graph) -> Node | None:
+    """The part of a mask that takes no draws; None if that is all of it, or nothing."""
+    parts = [(part, any(map(takes_bits, ordered([part])))) for part in conjuncts(mask)]
+    cheap = [part for part, random in parts if not random]
+    return all_of(cheap, graph) if 0 < len(cheap) < len(parts) else None

@@ -1,0 +1,96 @@
+"""IR on bit planes -> the first schedule: a guard for each substep; nothing is shared between statements or skipped."""
+
+from __future__ import annotations
+
+from powderdsl.ir.ops import Graph, Node, PassGraph, Step, Type, nodes_of
+from powderdsl.schedule.types import Compute, Guard, Namer, Out, Schedule, Statement, Var, load
+
+
+def lower(pass_: PassGraph) -> Schedule:
+    """The schedule of a pass on bit planes.
+
+    A substep whose masks hold nowhere changes nothing, so its writes stand in a guard, which keeps what slots held.
+    What has no such value (the first write of a scratch field) is computed in any case.
+    """
+    lowering = _Lowering(pass_)
+    for step in pass_.moments:
+        lowering.substep(step)
+    lowering.compute([node for _, node in pass_.outputs])
+    leaves = tuple((slot, lowering.value(node)) for slot, node in pass_.outputs)
+    return Schedule(pass_.name, tuple(lowering.finds.items()), tuple(lowering.body), leaves, lowering.graph)
+
+
+class _Lowering:
+    def __init__(self, pass_: PassGraph):
+        self.graph = Graph()
+        self.namer = Namer()
+        self.body: list[Statement] = []
+        self.finds: dict[str, Var] = {}
+        self.vars: dict[int, Var] = {}
+        """Variables of the pass's nodes, by id."""
+        self.current: dict[str, Node | None] = {}
+        """What each slot holds now: a node of the pass, None for one that nobody computes."""
+        self.alive = {id(node) for node in nodes_of(pass_, moments=False)}
+        self.kept = {slot: node.type for slot, node in pass_.outputs}
+        """Slots of the state that the pass changes: others that it writes are scratch."""
+
+    def substep(self, step: Step) -> None:
+        new = [(slot, node) for slot, node in step.writes if id(node) in self.alive and self.missing(node)]
+        guards = [node for node in dict.fromkeys(step.guards) if node.op != "const"]
+        always = not guards or any(node.op == "const" and node.attr for node in step.guards)
+        olds = {id(node): old for slot, node in new if not always and (old := self.old(slot)) is not None}
+        self.compute([node for _, node in new if id(node) not in olds], step.place)
+        guarded = [node for node in dict.fromkeys(node for _, node in new) if id(node) in olds]
+        if guarded:
+            self.compute(guards, step.place)
+            outer, self.body = self.body, []
+            when = tuple(self.value(guard) for guard in guards)
+            self.compute(guarded, step.place)
+            keeps = tuple((self.vars[id(node)], olds[id(node)]) for node in guarded)
+            outer.append(Guard(when, tuple(self.body), keeps, step.place))
+            self.body = outer
+        for slot, node in step.writes:
+            self.current[slot] = node if id(node) in self.alive else None
+
+    def missing(self, node: Node) -> bool:
+        return id(node) not in self.vars and node.op not in ("const", "input")
+
+    def old(self, slot: str) -> Node | None:
+        """The value of a slot before a substep, if it stands in a variable."""
+        if slot not in self.current:
+            return load(self.graph, self.find(slot, self.kept[slot])) if slot in self.kept else None
+        node = self.current[slot]
+        return self.value(node) if node is not None and not self.missing(node) else None
+
+    def find(self, slot: str, type: Type) -> Var:
+        if slot not in self.finds:
+            self.finds[slot] = self.namer.var(type)
+        return self.finds[slot]
+
+    def compute(self, nodes: list[Node], place: str = "") -> None:
+        """Variables for some nodes, in one statement."""
+        wanted = [node for node in dict.fromkeys(nodes) if self.missing(node)]
+        if wanted:
+            outs = tuple(Out(self.namer.var(node.type, node), self.value(node)) for node in wanted)
+            self.body.append(Compute(outs, place))
+            self.vars |= {id(out.var.means): out.var for out in outs}
+
+    def value(self, root: Node) -> Node:
+        """A node of the pass over the variables that are there."""
+        done: dict[int, Node] = {}
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in done:
+                continue
+            if node.op == "input":
+                done[id(node)] = load(self.graph, self.find(str(node.attr), node.type))
+            elif id(node) in self.vars:
+                done[id(node)] = load(self.graph, self.vars[id(node)])
+            elif ready:
+                args = tuple(done[id(arg)] for arg in node.args)
+                done[id(node)] = self.graph.node(node.op, node.type, args, node.attr, node.places)
+            else:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(node.args))
+        return done[id(root)]

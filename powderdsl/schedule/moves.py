@@ -1,0 +1,123 @@
+"""Movements: planes that go with the same movers in the same direction move together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from powderdsl.ir.ops import FLAG, Node
+from powderdsl.schedule.types import (
+    Carried,
+    Compute,
+    Move,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    Var,
+    load,
+    map_blocks,
+    ordered,
+)
+
+
+def moves(schedule: Schedule) -> Schedule:
+    """Every `swap` and `arrive` of a plane becomes part of a `Move`, by depth: what a movement needs moves before it.
+
+    `x = swap(a, m, a); y = swap(b, m, b)` → `swap by m: x = a, y = b`.
+    """
+    namer = Namer(schedule)
+
+    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        return tuple(
+            new
+            for statement in block
+            for new in (
+                _moved(statement, schedule, namer) if isinstance(statement, Compute) else (statement,)
+            )
+        )
+
+    return replace(schedule, body=map_blocks(schedule.body, change))
+
+
+def is_movement(node: Node) -> bool:
+    return node.op in ("swap", "arrive") and node.type == FLAG
+
+
+def _moved(statement: Compute, schedule: Schedule, namer: Namer) -> list[Statement]:
+    """A statement as statements: what movements need, the movements, what needs them."""
+    graph = schedule.graph
+    nodes = ordered(out.value for out in statement.outs)
+    movements = [node for node in nodes if is_movement(node)]
+    if not movements:
+        return [statement]
+    vars: dict[int, Var] = {}
+    result: list[Statement] = []
+    own = {id(out.value): out.var for out in reversed(statement.outs) if is_movement(out.value)}
+
+    def value(root: Node) -> Node:
+        done: dict[int, Node] = {}
+        for node in ordered_until(root, vars):
+            if id(node) in vars:
+                done[id(node)] = load(graph, vars[id(node)])
+                continue
+            args = tuple(done[id(arg)] for arg in node.args)
+            same = all(a is b for a, b in zip(args, node.args, strict=True))
+            done[id(node)] = node if same else graph.node(node.op, node.type, args, node.attr, node.places)
+        return done[id(root)]
+
+    def store(wanted: Iterable[Node]) -> None:
+        """Variables for what movements read in other cells."""
+        outs = []
+        for node in dict.fromkeys(wanted):
+            if id(node) not in vars and value(node).op != "load":
+                outs.append((node, Out(namer.var(node.type), value(node))))
+        if outs:
+            result.append(Compute(tuple(out for _, out in outs), statement.place))
+            vars.update((id(node), out.var) for node, out in outs)
+
+    for group in _groups(nodes, movements):
+        first = group[0]
+        store(arg for node in group for arg in node.args[:2])
+        carried = []
+        for node in group:
+            content, movers, rest = node.args
+            old = value(content)
+            leaves = old if rest is content else value(rest)
+            var = own.get(id(node)) or namer.var(FLAG)
+            carried.append((node, Carried(var, old, leaves)))
+        result.append(
+            Move(first.op, first.attr, value(first.args[1]), tuple(c for _, c in carried), statement.place)
+        )
+        vars.update((id(node), one.new) for node, one in carried)
+    moved = {var.name for var in own.values()}
+    rest = tuple(replace(out, value=value(out.value)) for out in statement.outs if out.var.name not in moved)
+    return [*result, replace(statement, outs=rest)] if rest else result
+
+
+def ordered_until(root: Node, known: dict[int, Var]) -> list[Node]:
+    """Nodes below one, arguments first; what is known is not looked into."""
+    seen: dict[int, Node] = {}
+    stack = [(root, False)]
+    while stack:
+        node, ready = stack.pop()
+        if ready:
+            seen.setdefault(id(node), node)
+        elif id(node) not in seen:
+            stack.append((node, True))
+            if id(node) not in known:
+                stack.extend((arg, False) for arg in reversed(node.args))
+    return list(seen.values())
+
+
+def _groups(nodes: list[Node], movements: list[Node]) -> list[list[Node]]:
+    """Movements that can be done together, each group after what it needs."""
+    wanted = set(map(id, movements))
+    depth: dict[int, int] = {}
+    groups: dict[tuple[object, ...], list[Node]] = {}
+    for node in nodes:
+        below = max((depth[id(arg)] for arg in node.args), default=0)
+        depth[id(node)] = below + (id(node) in wanted)
+        if id(node) in wanted:
+            groups.setdefault((depth[id(node)], node.op, id(node.args[1]), node.attr), []).append(node)
+    return [group for _, group in sorted(groups.items(), key=lambda item: item[0][0])]

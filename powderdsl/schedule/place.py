@@ -1,0 +1,178 @@
+"""Arrays of variables: which are released where, and which take over the array of one that nobody needs any more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from powderdsl.ir.ops import REAL
+from powderdsl.schedule.types import (
+    BLOCK,
+    Compute,
+    Guard,
+    Out,
+    Release,
+    Schedule,
+    Statement,
+    defined_by,
+    loaded,
+    values_of,
+)
+
+_OVER = {
+    "add": (0, 1), "mul": (0, 1), "sub": (0,), "settle": (0,),
+    "choose": (2,), "update": (1,), "carry": (2,), "swap": (0,), "leave": (0,),
+}  # fmt: skip
+"""Arguments in whose array an operation can leave its result."""
+
+_FULL = ("draw", "shift", "choose", "update", "carry", "settle")
+"""Operations that give a float for each cell, whatever their arguments are."""
+
+
+def place(schedule: Schedule) -> Schedule:
+    """Where each array comes from and goes: `into` for what is overwritten, `Release` for the rest.
+
+    `b = a + c`, where `a` is read for the last time → `b = a + c into a`. Takes single operations (`flatten`).
+    """
+    placing = _Placing({slot for slot, _ in schedule.leaves})
+    live = set(loaded(node for _, node in schedule.leaves))
+    for slot, var in schedule.finds:
+        placing.found(slot, var.name, var.type == REAL)
+    body = placing.block(schedule.body, live)
+    leaves = []
+    for slot, node in schedule.leaves:
+        alone = node.type != REAL or (node.op == "load" and node.attr in placing.own)
+        leaves.append((slot, node if alone else schedule.graph.node("copy", REAL, (node,))))
+        placing.own.discard(node.attr)  # no two slots share an array of floats
+    return replace(schedule, body=body, leaves=tuple(leaves))
+
+
+@dataclass
+class _Placing:
+    changed: set[str]
+    """Slots that the pass changes: their arrays may be overwritten."""
+    own: set[str] = field(default_factory=set)
+    """Blocks, and floats with a number for each cell, in arrays that nothing else refers to."""
+    full: set[str] = field(default_factory=set)
+    views: dict[str, set[str]] = field(default_factory=dict)
+    """Planes that lie in each block."""
+
+    def found(self, slot: str, name: str, real: bool) -> None:
+        if real:
+            self.full.add(name)
+            if slot in self.changed:
+                self.own.add(name)
+
+    def block(self, body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ...]:
+        """A block, with the variables that are live at its end."""
+        lives: list[set[str]] = []
+        live = set(live_end)
+        for statement in reversed(body):
+            lives.append(live)
+            live = _live_before(statement, live)
+        result: list[Statement] = []
+        for statement, after in zip(body, reversed(lives), strict=True):
+            match statement:
+                case Compute((out,), _):
+                    placed = self.operation(out, after)
+                    result.append(replace(statement, outs=(placed,)))
+                    gone = {*loaded([out.value]), out.var.name} - after - {placed.into}
+                case Guard():
+                    guard, taken = self.guard(statement, after)
+                    result.append(guard)
+                    gone = _reads(statement) - after - taken - _defined_in(statement.body)
+                    gone |= {var.name for var, _ in statement.keeps} - after
+                case _:
+                    raise AssertionError("only single operations have places")
+            if gone:
+                result.append(Release(tuple(sorted(gone, key=_number))))
+        return tuple(result)
+
+    def guard(self, guard: Guard, after: set[str]) -> tuple[Guard, set[str]]:
+        """A guard, and the variables from outside whose arrays its body takes over."""
+        before = set(self.own)
+        kept = {var.name for var, _ in guard.keeps}
+        outside = _reads(guard) - _defined_in(guard.body)
+        # What dies in the body is released after the guard, so that both ways leave the same behind.
+        body = self.block(guard.body, after | kept)
+        body = tuple(_without(statement, outside) for statement in body)
+        body = tuple(one for one in body if not isinstance(one, Release) or one.names)
+        taken = {
+            out.into
+            for statement in body
+            if isinstance(statement, Compute)
+            for out in statement.outs
+            if out.into in outside
+        } - {None}
+        olds = [value.attr for _, value in guard.keeps if value.op == "load"]
+        for var, value in guard.keeps:
+            alone = value.op == "load" and value.attr in before and value.attr not in after
+            if not (alone and olds.count(value.attr) == 1):
+                self.own.discard(var.name)
+            if value.op != "load" or value.attr not in self.full:
+                self.full.discard(var.name)
+            if value.op == "load":  # then it may be the old one
+                self.views.setdefault(var.name, set()).update(self.views.get(str(value.attr), ()))
+        self.own -= set(olds) - kept
+        return replace(guard, body=body), {name for name in taken if name is not None}
+
+    def operation(self, out: Out, after: set[str]) -> Out:
+        """One operation, in the array of an argument that is read for the last time, if there is one."""
+        node, name = out.value, out.var.name
+        args = [str(arg.attr) if arg.op == "load" else "" for arg in node.args]
+        places = _OVER.get(node.op, ())
+        if node.op == "div" and node.args[1].op == "const" and node.args[1].attr:
+            places = (0,)  # a division by what may be zero is a call
+        into = next((args[i] for i in places if self.is_last(args[i], args, after)), None)
+        if node.type == BLOCK and node.op != "load":
+            self.own.add(name)
+        elif node.op == "member":
+            self.views.setdefault(args[0], set()).add(name)
+        elif node.op == "load":
+            self.own.discard(str(node.attr))  # two names for one array
+            if node.attr in self.full:
+                self.full.add(name)
+        elif node.type == REAL and (node.op in _FULL or any(arg in self.full for arg in args)):
+            self.full.add(name)
+            if node.op != "draw":
+                self.own.add(name)
+        if into is not None:
+            self.own.discard(into)
+        return replace(out, into=into)
+
+    def is_last(self, name: str, args: list[str], after: set[str]) -> bool:
+        """Whether an array may be overwritten by an operation on it."""
+        seen = self.views.get(name, set()) & (after | set(args))
+        return name in self.own and name not in after and not seen
+
+
+def _live_before(statement: Statement, after: set[str]) -> set[str]:
+    live = after - {var.name for var in defined_by(statement)}
+    return live | (_reads(statement) - _defined_in([statement]))
+
+
+def _reads(statement: Statement) -> set[str]:
+    """Variables that a statement reads, with what is in it."""
+    found = set(loaded(values_of(statement)))
+    if isinstance(statement, Guard):
+        for inner in statement.body:
+            found |= _reads(inner)
+    return found
+
+
+def _defined_in(body: Sequence[Statement]) -> set[str]:
+    found = {var.name for statement in body for var in defined_by(statement)}
+    for statement in body:
+        if isinstance(statement, Guard):
+            found |= _defined_in(statement.body)
+    return found
+
+
+def _without(statement: Statement, names: set[str]) -> Statement:
+    if not isinstance(statement, Release):
+        return statement
+    return Release(tuple(name for name in statement.names if name not in names))
+
+
+def _number(name: str) -> int:
+    return int(name[1:])

@@ -1,0 +1,129 @@
+"""A stable printed form of schedules, for `--emit schedule`, golden tests and bug reports.
+
+`x[dy,dx]` is the value at a neighbor, with `|0` zero outside the grid; `a ? b : c` a choice; `any p3 | p4` asks whether
+a flag holds in some cell; `else p5 = p1` is what a variable is where a guard's body is skipped.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+
+from powderdsl.ir.ops import Node
+from powderdsl.ir.text import attr_text
+from powderdsl.schedule.types import Compute, Guard, Move, Release, Schedule, Statement, ordered, values_of
+
+_INFIX = {
+    "and": "&", "or": "|", "xor": "^", "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "lt": "<", "le": "<=",
+}  # fmt: skip
+
+
+def print_schedule(schedule: Schedule) -> str:
+    """A schedule as text, and its calm form below it."""
+    names = _Names()
+    lines = [f"schedule {schedule.name}"]
+    if schedule.finds:
+        found = ", ".join(f"{names.of(var.name)} = {slot}" for slot, var in schedule.finds)
+        lines.append(f"  find {found}")
+    lines += _block(schedule.body, "  ", names)
+    for slot, node in schedule.leaves:
+        lines.append(f"  leave {slot} = {_Values([node], names).text(node)}")
+    if schedule.calm is not None:
+        calm = print_schedule(schedule.calm).splitlines()
+        lines += ["  calm", *(f"  {line}" for line in calm[1:])]
+    return "\n".join(lines)
+
+
+class _Names:
+    """Variables as they are printed: numbered in the order of the text."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, str] = {}
+
+    def of(self, name: str) -> str:
+        return self.known.setdefault(name, f"{name[0]}{len(self.known)}")
+
+
+def _block(body: Sequence[Statement], indent: str, names: _Names) -> Iterator[str]:
+    place = ""
+    for statement in body:
+        written = getattr(statement, "place", "")
+        if written and written != place:
+            place = written
+            yield f"{indent}# {place}"
+        yield from _statement(statement, indent, names)
+
+
+def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str]:
+    values = _Values(values_of(statement), names)
+    match statement:
+        case Compute(outs):
+            for out in outs:
+                value = values.text(out.value)
+                yield from (f"{indent}{line}" for line in values.taken())
+                into = f" into {names.of(out.into)}" if out.into else ""
+                yield f"{indent}{names.of(out.var.name)} = {value}{into}"
+        case Move(op, (dy, dx), movers, planes):
+            yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
+            for plane in planes:
+                leaves = "" if plane.leaves is plane.old else f" leaving {values.text(plane.leaves)}"
+                yield f"{indent}  {names.of(plane.new.name)} = {values.text(plane.old)}{leaves}"
+        case Guard(when, inner, keeps):
+            asked = " | ".join(values.text(node) for node in when)
+            yield from (f"{indent}{line}" for line in values.taken())
+            yield f"{indent}if any {asked}"
+            yield from _block(inner, indent + "  ", names)
+            kept = ", ".join(f"{names.of(var.name)} = {values.text(value)}" for var, value in keeps)
+            if kept:
+                yield f"{indent}else {kept}"
+        case Release(gone):
+            yield f"{indent}release {', '.join(names.of(name) for name in gone)}"
+
+
+class _Values:
+    """The values of one statement; what is used twice gets a line of its own."""
+
+    def __init__(self, roots: Iterable[Node], names: _Names):
+        roots = list(roots)
+        self.names = names
+        self.uses = Counter(id(node) for node in roots)
+        self.uses.update(id(arg) for node in ordered(roots) for arg in node.args)
+        self.known: dict[int, str] = {}
+        self.lines: list[str] = []
+        self.count = 0
+
+    def taken(self) -> list[str]:
+        """Lines that have been added since the last time."""
+        lines, self.lines = self.lines, []
+        return lines
+
+    def text(self, root: Node) -> str:
+        for node in ordered([root]):
+            if id(node) not in self.known:
+                text = self._node(node)
+                if self.uses[id(node)] > 1 and node.args and node is not root:
+                    self.count += 1
+                    self.lines.append(f"  t{self.count} = {text}")
+                    text = f"t{self.count}"
+                self.known[id(node)] = text
+        return self.known[id(root)]
+
+    def _node(self, node: Node) -> str:
+        args = [self.known[id(arg)] for arg in node.args]
+        if node.op == "load":
+            return self.names.of(node.attr)
+        if node.op in _INFIX and len(args) == 2:
+            return f"({args[0]} {_INFIX[node.op]} {args[1]})"
+        match node.op:
+            case "const":
+                return str(int(node.attr)) if node.type.name == "flag" else repr(node.attr)
+            case "not":
+                return f"~{args[0]}"
+            case "select":
+                return f"({args[0]} ? {args[1]} : {args[2]})"
+            case "shift":
+                dy, dx, wraps = node.attr
+                return f"{args[0]}[{dy},{dx}{'' if wraps else '|0'}]"
+        if node.attr is not None:
+            args.append(attr_text(node.attr))
+        return f"{node.op}({', '.join(args)})"

@@ -1,0 +1,219 @@
+"""The schedule of a pass: a frozen, printable value between IR on bit planes and the text of a target.
+
+A schedule names what it computes: a `Var` is assigned once, in one place, and says which node of the pass it `means`.
+Values are IR nodes whose leaves are constants, parameters, draws and `load`s of variables. Stages map a schedule to
+a schedule (`schedule/stages.py`); a target prints the last one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, walk
+
+BLOCK, CELLS, PLACES = Type("block"), Type("cells"), Type("places")
+"""What array kernels have besides flags and floats: planes in one array, flags as bool cells, numbers of cells."""
+
+_PREFIX = {"flag": "p", "real": "f", "block": "b", "cells": "s", "places": "i"}
+
+
+@dataclass(frozen=True, eq=False)
+class Var:
+    """A variable, assigned once. `means` is the node of the pass whose value it holds, None for helpers."""
+
+    name: str
+    type: Type
+    means: Node | None = None
+
+
+@dataclass(frozen=True)
+class Out:
+    """A variable and its value. `into` names the variable whose array it takes over (set by `place`)."""
+
+    var: Var
+    value: Node
+    into: str | None = None
+
+
+@dataclass(frozen=True)
+class Compute:
+    """Values of cells, all from what stood in variables before. `place` is the rule: ``rules/acme.yaml:12``."""
+
+    outs: tuple[Out, ...]
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A plane in a movement: what it is afterwards, what it was, and what stands where movers left if nothing arrives.
+
+    `leaves` is a flag of that cell: a value over `load`s; the old plane itself means that it stays.
+    """
+
+    new: Var
+    old: Node
+    leaves: Node
+
+
+@dataclass(frozen=True)
+class Move:
+    """Planes that move together: `swap` or `arrive` of the IR, by the same movers and offset."""
+
+    op: str
+    offset: tuple[int, int]
+    movers: Node
+    planes: tuple[Carried, ...]
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Statements that run only if one of the flags `when` holds in some cell.
+
+    `keeps` lists every variable of the body that is needed after it, with its value where the body is skipped.
+    """
+
+    when: tuple[Node, ...]
+    body: tuple[Statement, ...]
+    keeps: tuple[tuple[Var, Node], ...]
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class Release:
+    """Variables that are not needed any more: their buffers are free."""
+
+    names: tuple[str, ...]
+
+
+Statement = Compute | Move | Guard | Release
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """One pass. `finds`: slots that it reads; `leaves`: slots that it changes. Nothing else outlives it."""
+
+    name: str
+    finds: tuple[tuple[str, Var], ...]
+    body: tuple[Statement, ...]
+    leaves: tuple[tuple[str, Node], ...]
+    graph: Graph = field(compare=False, repr=False)
+    """Interns the values, so that equal ones are one object in all stages."""
+    calm: Schedule | None = None
+    """The pass where all float slots that it reads are zero everywhere, if that is much less work."""
+
+
+# Values
+
+
+def load(graph: Graph, var: Var) -> Node:
+    """The value of a variable in the cell itself."""
+    return graph.node("load", var.type, (), var.name)
+
+
+def loaded(nodes: Iterable[Node]) -> Iterator[str]:
+    """Names of the variables that values read, with repetitions."""
+    for node in nodes:
+        for inner in walk(node):
+            if inner.op == "load":
+                yield str(inner.attr)
+
+
+def ordered(roots: Iterable[Node]) -> list[Node]:
+    """All nodes of some values, arguments before their users, in a stable order."""
+    seen: dict[int, Node] = {}
+    for root in roots:
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if ready:
+                seen.setdefault(id(node), node)
+            elif id(node) not in seen:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(node.args))
+    return list(seen.values())
+
+
+def rewritten(roots: Iterable[Node], graph: Graph, rule: Callable[[Node], Node | None]) -> dict[int, Node]:
+    """Values rebuilt bottom-up in a graph, by the id of the old node; `rule` sees nodes with their new arguments."""
+    done: dict[int, Node] = {}
+    for node in ordered(roots):
+        args = tuple(done[id(arg)] for arg in node.args)
+        same = all(a is b for a, b in zip(args, node.args, strict=True))
+        new = node if same else graph.node(node.op, node.type, args, node.attr, node.places)
+        done[id(node)] = rule(new) or new
+    return done
+
+
+# Statements
+
+
+def values_of(statement: Statement) -> Iterator[Node]:
+    """The values that a statement reads itself, not those of statements in it."""
+    match statement:
+        case Compute(outs):
+            yield from (out.value for out in outs)
+        case Move(_, _, movers, planes):
+            yield movers
+            for plane in planes:
+                yield from (plane.old, plane.leaves)
+        case Guard(when, _, keeps):
+            yield from when
+            yield from (value for _, value in keeps)
+
+
+def defined_by(statement: Statement) -> Iterator[Var]:
+    """Variables that exist after a statement and did not before."""
+    match statement:
+        case Compute(outs):
+            yield from (out.var for out in outs)
+        case Move(_, _, _, planes):
+            yield from (plane.new for plane in planes)
+        case Guard(_, _, keeps):
+            yield from (var for var, _ in keeps)
+
+
+def flat(body: Iterable[Statement]) -> Iterator[Statement]:
+    """All statements, also nested ones, each guard before what it holds."""
+    for statement in body:
+        yield statement
+        if isinstance(statement, Guard):
+            yield from flat(statement.body)
+
+
+def variables(schedule: Schedule) -> dict[str, Var]:
+    """All variables by name."""
+    found = {var.name: var for _, var in schedule.finds}
+    for statement in flat(schedule.body):
+        found |= {var.name: var for var in defined_by(statement)}
+    return found
+
+
+def map_blocks(
+    body: Sequence[Statement], change: Callable[[tuple[Statement, ...]], tuple[Statement, ...]]
+) -> tuple[Statement, ...]:
+    """A body with a change made to every block of statements, inner ones first."""
+    inner = tuple(
+        replace(one, body=map_blocks(one.body, change)) if isinstance(one, Guard) else one for one in body
+    )
+    return change(inner)
+
+
+class Namer:
+    """Makes variables with new names."""
+
+    def __init__(self, schedule: Schedule | None = None):
+        names = variables(schedule) if schedule else ()
+        self.count = max((int(name[1:]) for name in names), default=0)
+
+    def var(self, type: Type, means: Node | None = None) -> Var:
+        self.count += 1
+        return Var(f"{_PREFIX[type.name]}{self.count}", type, means)
+
+
+__all__ = [
+    "BLOCK", "CELLS", "FLAG", "PLACES", "REAL",
+    "Carried", "Compute", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Var",
+    "defined_by", "flat", "load", "loaded", "map_blocks", "ordered", "rewritten", "values_of", "variables",
+]  # fmt: skip

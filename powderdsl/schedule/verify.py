@@ -1,0 +1,110 @@
+"""What a legal schedule is. Checked after every stage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from powderdsl.ir.ops import FLAG, OPS
+from powderdsl.ir.verify import InvalidIR
+from powderdsl.schedule.types import (
+    BLOCK,
+    CELLS,
+    PLACES,
+    Compute,
+    Guard,
+    Move,
+    Release,
+    Schedule,
+    Statement,
+    Var,
+    defined_by,
+    ordered,
+    values_of,
+)
+
+_KINDS = ("flag", "real", BLOCK.name, CELLS.name, PLACES.name)
+
+
+def verify(schedule: Schedule, after: str) -> None:
+    """Raise InvalidIR unless the schedule is legal.
+
+    Variables are assigned once, and read only where they are: after their statement, in the same block or one in it,
+    and not after their release. A guard keeps what its body has made, of the same type. Values have no inputs.
+    """
+    try:
+        checker = _Checker({var.name: var for _, var in schedule.finds})
+        end = checker.block(schedule.body, set(checker.vars))
+        for _, node in schedule.leaves:
+            checker.value(node, end)
+    except InvalidIR as error:
+        raise InvalidIR(f"after {after}, pass {schedule.name}: {error}") from None
+
+
+class _Checker:
+    def __init__(self, vars: dict[str, Var]):
+        self.vars = vars
+        self.checked: set[int] = set()
+
+    def block(self, body: Sequence[Statement], live: set[str]) -> set[str]:
+        """The variables that are there after a block."""
+        live = set(live)
+        for statement in body:
+            for node in values_of(statement):
+                self.value(node, live)
+            match statement:
+                case Guard(when, inner, keeps):
+                    _demand(all(node.type == FLAG for node in when), "a guard asks what is not a flag")
+                    before = set(live)
+                    # The body makes the variables that are kept: outside they come into being at its end.
+                    end = self.block(inner, live)
+                    for var, value in keeps:
+                        _demand(var.name in end, f"{var.name} is kept, but not made")
+                        _demand(var.type == value.type, f"{var.name} is a {var.type}, else a {value.type}")
+                    live = (before & end) | {var.name for var, _ in keeps}
+                    continue
+                case Compute(outs):
+                    for out in outs:
+                        _demand(out.var.type == out.value.type, f"{out.var.name} gets a {out.value.type}")
+                        if out.into is not None:
+                            _demand(out.into in live, f"{out.into} is overwritten, but not there")
+                            live.discard(out.into)
+                case Move(op, _, movers, planes):
+                    _demand(op in ("swap", "arrive"), f"a movement by {op}")
+                    _demand(all(n.type == FLAG for p in planes for n in (p.old, p.leaves)), "only flags move")
+                    _demand(movers.type == FLAG, "movers are flags")
+                case Release(names):
+                    _demand(set(names) <= live, f"{names} are released, but not there")
+                    live -= set(names)
+            for var in defined_by(statement):
+                _demand(self.vars.setdefault(var.name, var) is var, f"two variables are called {var.name}")
+                _demand(var.name not in live, f"{var.name} is assigned twice")
+                live.add(var.name)
+        return live
+
+    def value(self, root: object, live: set[str]) -> None:
+        for node in ordered([root]):  # type: ignore[list-item]
+            if node.op == "load":
+                _demand(node.attr in live, f"{node.attr} is read, but not there")
+                _demand(self.vars[node.attr].type == node.type, f"{node.attr} is read as a {node.type}")
+            elif id(node) not in self.checked:
+                self.checked.add(id(node))
+                _demand(node.op in OPS or node.op in ARRAY_OPS, f"unknown operation {node.op}")
+                _demand(node.op != "input", "a value reads a slot")
+                _demand(node.type.name in _KINDS, f"a value is a {node.type}")
+
+
+ARRAY_OPS = frozenset({
+    "stack", "member", "swap_onto", "leave", "cells", "choose", "places", "moved", "update", "carry", "copy",
+    "below_param",
+})  # fmt: skip
+"""Operations that only schedules have: `stack` planes → block; `member` (block) → a plane; `swap` (block, movers) and
+`leave` (block, movers) → block; `arrive` and `swap_onto` (block, movers, rest) → block; `cells` (flag) → bool cells;
+`choose` (cells, yes, no) → floats; `places` (flag) → where it holds, `moved` (places) → their neighbors; `update`
+(places, no, other) → `no`, and there `other` added to it, taken off or multiplied; `carry` (places, moved, no, other) →
+the same at neighbors with what `other` has at the places; `copy` (floats) → the same in an array of their own;
+`below_param` → a draw below a parameter."""
+
+
+def _demand(holds: bool, message: str) -> None:
+    if not holds:
+        raise InvalidIR(message)

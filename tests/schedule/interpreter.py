@@ -1,0 +1,265 @@
+"""A small, slow interpreter of schedules, and of the pass graphs that they mean: arrays [H, W] of bool and float32.
+
+Variables of a body that is skipped, and released ones, are gone: reading one is an error. Where a draw is not asked
+for, it is the opposite of what it would be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph
+from powderdsl.schedule.types import (
+    Compute,
+    Guard,
+    Move,
+    Release,
+    Schedule,
+    Statement,
+    Var,
+    ordered,
+    variables,
+)
+
+SNAP = np.float32(2.0**-20)
+Array = np.ndarray[Any, Any]
+
+
+@dataclass
+class World:
+    """What a pass finds: slots, parameters (as thresholds where a chance is asked for), draws by stream, the step."""
+
+    shape: tuple[int, int]
+    slots: Mapping[str, Array]
+    params: Mapping[str, float]
+    draws: Mapping[str, Array]
+    step: int = 0
+
+
+def run_graph(pass_: PassGraph, world: World) -> dict[int, Array]:
+    """The value of every node of a pass, by id."""
+    roots = [node for _, node in pass_.outputs]
+    roots += [node for step in pass_.moments for _, node in step.writes]
+    roots += [guard for step in pass_.moments for guard in step.guards]
+    return _evaluate(roots, world, {})
+
+
+def run_schedule(schedule: Schedule, world: World, truth: Mapping[int, Array]) -> dict[str, Array]:
+    """What a schedule leaves in the slots. Every variable is compared with what it means, in `truth`."""
+    silent = not any(np.any(world.slots[slot]) for slot, var in schedule.finds if var.type == REAL)
+    if schedule.calm is not None and silent:
+        return run_schedule(schedule.calm, world, {})
+    state = _State(world, truth, {var.name: world.slots[slot] for slot, var in schedule.finds})
+    state.names = variables(schedule)
+    state.block(schedule.body)
+    return {slot: np.array(_evaluate([node], world, state.held)[id(node)]) for slot, node in schedule.leaves}
+
+
+@dataclass
+class _State:
+    world: World
+    truth: Mapping[int, Array]
+    held: dict[str, Array]
+    names: Mapping[str, Var] = field(default_factory=dict)
+
+    def block(self, body: Sequence[Statement]) -> None:
+        for statement in body:
+            match statement:
+                case Compute(outs):
+                    found = self.values([out.value for out in outs])
+                    for out, value in zip(outs, found, strict=True):
+                        if out.into is not None:
+                            del self.held[out.into]
+                        self.set(out.var, value)
+                case Move(op, (dy, dx), movers, planes):
+                    values = self.values([movers, *(n for p in planes for n in (p.old, p.leaves))])
+                    m, targets = values[0], _shift(values[0], -dy, -dx, True)
+                    for i, plane in enumerate(planes):
+                        old, leaves = values[1 + 2 * i], values[2 + 2 * i]
+                        moved = np.where(targets, _shift(old, -dy, -dx, True), leaves)
+                        if op == "swap":
+                            moved = np.where(m, _shift(old, dy, dx, True), moved)
+                        self.set(plane.new, moved)
+                case Guard(when, inner, keeps):
+                    before = dict(self.held)
+                    if any(np.any(flag) for flag in self.values(when)):
+                        self.block(inner)
+                        kept = {var.name: self.held[var.name] for var, _ in keeps}
+                    else:
+                        found = self.values([value for _, value in keeps])
+                        kept = {var.name: value for (var, _), value in zip(keeps, found, strict=True)}
+                    # What the body released or overwrote is gone in either case.
+                    gone = set(before) - set(self.held)
+                    for inside in _all(inner):
+                        if isinstance(inside, Release):
+                            gone |= set(inside.names)
+                        if isinstance(inside, Compute):
+                            gone |= {out.into for out in inside.outs if out.into}
+                    self.held = {name: value for name, value in before.items() if name not in gone}
+                    for var, _ in keeps:
+                        self.set(var, kept[var.name])
+                case Release(names):
+                    for name in names:
+                        del self.held[name]
+
+    def values(self, nodes: Sequence[Node]) -> list[Array]:
+        found = _evaluate(nodes, self.world, self.held)
+        return [found[id(node)] for node in nodes]
+
+    def set(self, var: Var, value: Array) -> None:
+        if var.means is not None and id(var.means) in self.truth:
+            expected = np.broadcast_to(self.truth[id(var.means)], self.world.shape)
+            found = np.broadcast_to(value, self.world.shape)
+            assert np.array_equal(found.view(_BITS[var.type.name]), expected.view(_BITS[var.type.name])), (
+                var.name
+            )
+        assert var.name not in self.held, f"{var.name} is assigned twice"
+        self.held[var.name] = value
+
+
+_BITS = {"flag": bool, "real": np.int32}
+
+
+def _all(body: Sequence[Statement]) -> list[Statement]:
+    found = list(body)
+    for statement in body:
+        if isinstance(statement, Guard):
+            found += _all(statement.body)
+    return found
+
+
+def _shift(x: Array, dy: int, dx: int, wraps: bool) -> Array:
+    if wraps:
+        return np.roll(x, (-dy, -dx), (-2, -1))
+    height, width = x.shape
+    result = np.zeros_like(x)
+    for y in range(height):
+        for c in range(width):
+            if 0 <= y + dy < height and 0 <= c + dx < width:
+                result[y, c] = x[y + dy, c + dx]
+    return result
+
+
+def _evaluate(roots: Sequence[Node], world: World, held: Mapping[str, Array]) -> dict[int, Array]:
+    done: dict[int, Array] = {}
+    with np.errstate(all="ignore"):
+        for node in ordered(roots):
+            args = [done[id(arg)] for arg in node.args]
+            value = held[node.attr] if node.op == "load" else _node(node, args, world)
+            if node.type in (FLAG, REAL):
+                value = np.broadcast_to(value, world.shape).astype(bool if node.type == FLAG else np.float32)
+            done[id(node)] = value
+    return done
+
+
+def _node(node: Node, args: list[Array], world: World) -> Any:
+    attr = node.attr
+    match node.op:
+        case "input":
+            return world.slots[attr]
+        case "const":
+            return np.array(attr)
+        case "param":
+            name, view, *bit = attr
+            if not bit:
+                return np.float32(world.params[name]) if node.type == REAL else bool(world.params[name])
+            return int(_limit(world.params[name], view)) >> bit[0] & 1 != 0
+        case "coordinate":
+            axis, modulus, bit = attr
+            height, width = world.shape
+            index = {
+                "row": np.arange(height)[:, None],
+                "column": np.arange(width)[None],
+                "step": np.array(world.step),
+            }
+            return index[axis] % modulus >> bit & 1 != 0
+        case "inside":
+            return _shift(np.ones(world.shape, bool), *attr, False)
+        case "chance":
+            stream, _, limit = attr
+            return _wanted(world.draws[stream] < limit, args)
+        case "below_planes":
+            stream, bits = attr
+            limit = sum(plane.astype(np.int64) << (bits - i) for i, plane in enumerate(args[: bits + 1]))
+            return _wanted(world.draws[stream] < limit, args[bits + 1 :])
+        case "below_param":
+            stream, _, name, view = attr
+            return _wanted(world.draws[stream] < _limit(world.params[name], view), args)
+        case "draw":
+            stream, bits = attr
+            return ((world.draws[stream] + 0.5) / 2.0**bits).astype(np.float32)
+        case "shift":
+            return _shift(args[0], *attr)
+        case "not":
+            return ~args[0]
+        case "select" | "choose":
+            return np.where(*args)
+        case "settle":
+            cut = np.clip(np.where(np.isnan(args[0]), 0, args[0]), *map(np.float32, attr))
+            return np.where(np.abs(cut) < SNAP, 0, cut)
+        case "swap" | "arrive" if node.type == FLAG:
+            content, movers, rest = args
+            dy, dx = attr
+            moved = np.where(_shift(movers, -dy, -dx, True), _shift(content, -dy, -dx, True), rest)
+            return np.where(movers, _shift(content, dy, dx, True), moved) if node.op == "swap" else moved
+        case "div":
+            return np.where(args[1] == 0, np.float32(0), args[0] / args[1])
+        case "swap" | "arrive" | "swap_onto" | "leave" | "stack" | "member":
+            return _block(node, args)
+        case "cells" | "places" | "copy":
+            return args[0]
+        case "moved":
+            return _shift(args[0], *attr, True)
+        case "update":
+            places, no, other = args
+            return np.where(places, _CHANGES[attr](no, other), no)
+        case "carry":
+            source, target, no, other = args
+            change, dy, dx = attr
+            assert np.array_equal(target, _shift(source, dy, dx, True))
+            return np.where(
+                target, _CHANGES[change](no, _shift(np.broadcast_to(other, no.shape), dy, dx, True)), no
+            )
+    return _SIMPLE[node.op](*args)
+
+
+def _block(node: Node, args: list[Array]) -> Array:
+    """Blocks: arrays [P, H, W]."""
+    if node.op == "stack":
+        return np.stack(args)
+    if node.op == "member":
+        return args[0][node.attr]
+    dy, dx, *rest = node.attr
+    block, movers = args[:2]
+    stays = args[2] if len(args) > 2 else block.copy()
+    if node.op == "leave":
+        stays = block & ~movers
+        for plane in rest[0]:
+            stays[plane] = block[plane] | movers
+    targets = _shift(movers, -dy, -dx, True)
+    moved = np.where(targets, np.roll(block, (dy, dx), (1, 2)), stays)
+    return np.where(movers, np.roll(block, (-dy, -dx), (1, 2)), moved) if "swap" in node.op else moved
+
+
+def _limit(value: float, view: str) -> int:
+    count = 1 << int(view[2:])
+    scaled = np.float64(value) * count - 0.5
+    limit = np.ceil(scaled) if view[:2] == "lt" else np.floor(scaled) + 1
+    return int(limit.clip(0, count))
+
+
+def _wanted(holds: Array, where: list[Array]) -> Array:
+    """A draw, wrong where it is not asked for."""
+    return np.where(where[0], holds, ~holds) if where else holds
+
+
+_CHANGES: dict[str, Callable[..., Any]] = {"add": np.add, "sub": np.subtract, "mul": np.multiply}
+_SIMPLE: dict[str, Callable[..., Any]] = {
+    "and": np.logical_and, "or": np.logical_or, "xor": np.logical_xor, "eq": np.equal, "lt": np.less,
+    "le": np.less_equal, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt, "min": np.minimum, "max": np.maximum,
+    **_CHANGES,
+}  # fmt: skip
