@@ -40,7 +40,16 @@ def with_values(statement: Statement, graph: Graph, rule: Rule) -> Statement:
     new = rewritten(values_of(statement), graph, rule)
     match statement:
         case Compute(outs):
-            return replace(statement, outs=tuple(replace(out, value=new[id(out.value)]) for out in outs))
+            changed = (
+                replace(
+                    out,
+                    value=new[id(out.value)],
+                    otherwise=None if out.otherwise is None else new[id(out.otherwise)],
+                )
+                for out in outs
+            )
+            region = None if statement.region is None else new[id(statement.region)]
+            return replace(statement, outs=tuple(changed), region=region)
         case Move(_, _, movers, planes):
             moved = (replace(p, old=new[id(p.old)], leaves=new[id(p.leaves)]) for p in planes)
             return replace(statement, movers=new[id(movers)], planes=tuple(moved))

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from powderdsl.ir.ops import PassGraph
 from powderdsl.schedule.blocks import blocks
 from powderdsl.schedule.calm import calm_pass
 from powderdsl.schedule.choices import choices
+from powderdsl.schedule.cut import Costs, cut
 from powderdsl.schedule.draws import cheap_questions, conditions, thresholds
 from powderdsl.schedule.flatten import flatten
+from powderdsl.schedule.floats import late, led
 from powderdsl.schedule.lower import lower
 from powderdsl.schedule.moves import moves
+from powderdsl.schedule.narrow import narrow
 from powderdsl.schedule.place import place
+from powderdsl.schedule.rewrite import without_unread
 from powderdsl.schedule.share import share
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.verify import verify
@@ -46,12 +50,32 @@ ARRAYS = (
 """For targets that carry out one operation over all cells of all worlds before the next."""
 
 
+CUDA = (
+    Stage("late", late, "floats where they are asked for"),
+    Stage("led", led, "comparisons under others"),
+    Stage("conditions", conditions, "where each draw matters"),
+    Stage("cut", cut(Costs(gates=24, floats=2)), "loops; a barrier costs about as much as 24 gates"),
+    Stage("unread", without_unread, "floats that were stored for neighbors who then did not ask"),
+    Stage("narrow", narrow, "loops over cells where something happens"),
+)
+"""For blocks of threads that share some worlds."""
+
+
 def plan(pass_: PassGraph, stages: tuple[Stage, ...]) -> Schedule:
-    """The schedule of a pass on bit planes, and of its calm form if it has one. Every stage is verified."""
+    """The schedule of a pass on bit planes, and of its calm form if it has one.
+
+    Only the last schedule is verified here: verifying every one takes as long as making them. Tests do.
+    """
+    *_, (_, schedule) = steps(pass_, stages)
+    verify(schedule, stages[-1].name)
+    calm = calm_pass(pass_) if stages is ARRAYS else None
+    return schedule if calm is None else replace(schedule, calm=plan(calm, stages))
+
+
+def steps(pass_: PassGraph, stages: tuple[Stage, ...]) -> Iterator[tuple[str, Schedule]]:
+    """The schedule of a pass after each stage, with the stage's name."""
     schedule = lower(pass_)
-    verify(schedule, "lower")
+    yield "lower", schedule
     for stage in stages:
         schedule = stage.apply(schedule)
-        verify(schedule, stage.name)
-    calm = calm_pass(pass_)
-    return schedule if calm is None else replace(schedule, calm=plan(calm, stages))
+        yield stage.name, schedule

@@ -11,7 +11,17 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from powderdsl.ir.ops import Node
 from powderdsl.ir.text import attr_text
-from powderdsl.schedule.types import Compute, Guard, Move, Release, Schedule, Statement, ordered, values_of
+from powderdsl.schedule.types import (
+    Compute,
+    Guard,
+    Move,
+    Release,
+    Schedule,
+    Statement,
+    Sync,
+    ordered,
+    values_of,
+)
 
 _INFIX = {
     "and": "&", "or": "|", "xor": "^", "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "lt": "<", "le": "<=",
@@ -57,12 +67,19 @@ def _block(body: Sequence[Statement], indent: str, names: _Names) -> Iterator[st
 def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str]:
     values = _Values(values_of(statement), names)
     match statement:
-        case Compute(outs):
+        case Compute(outs, _, over, region):
+            if over:
+                where = f" over {values.text(region)}" if region is not None else ""
+                yield f"{indent}loop {over}{where}{' held' if statement.held else ''}"
+                indent += "  "
             for out in outs:
                 value = values.text(out.value)
                 yield from (f"{indent}{line}" for line in values.taken())
                 into = f" into {names.of(out.into)}" if out.into else ""
-                yield f"{indent}{names.of(out.var.name)} = {value}{into}"
+                rest = f" else {values.text(out.otherwise)}" if out.otherwise is not None else ""
+                yield f"{indent}{names.of(out.var.name)} = {value}{rest}{into}"
+        case Sync():
+            yield f"{indent}sync"
         case Move(op, (dy, dx), movers, planes):
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
             for plane in planes:

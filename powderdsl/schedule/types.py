@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, walk
+
+ANSWER = Type("answer")
+"""Whether a flag holds in some cell: one value for all cells."""
 
 BLOCK, CELLS, PLACES = Type("block"), Type("cells"), Type("places")
 """What array kernels have besides flags and floats: planes in one array, flags as bool cells, numbers of cells."""
 
-_PREFIX = {"flag": "p", "real": "f", "block": "b", "cells": "s", "places": "i"}
+_PREFIX = {"flag": "p", "real": "f", "answer": "q", "block": "b", "cells": "s", "places": "i"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,19 +33,31 @@ class Var:
 
 @dataclass(frozen=True)
 class Out:
-    """A variable and its value. `into` names the variable whose array it takes over (set by `place`)."""
+    """A variable and its value. `into` names the variable whose array it takes over (set by `place`).
+
+    `otherwise` is what it is where the statement's `region` does not hold: a constant, or what a variable holds.
+    """
 
     var: Var
     value: Node
     into: str | None = None
+    otherwise: Node | None = None
 
 
 @dataclass(frozen=True)
 class Compute:
-    """Values of cells, all from what stood in variables before. `place` is the rule: ``rules/acme.yaml:12``."""
+    """Values of cells, all from what stood in variables before. `place` is the rule: ``rules/acme.yaml:12``.
+
+    `over` says how it loops, once `cut` has decided: over words of flags, or over cells for floats. Where `region`
+    holds nowhere in a word, nothing is computed there.
+    """
 
     outs: tuple[Out, ...]
     place: str = ""
+    over: Literal["", "words", "cells"] = ""
+    region: Node | None = None
+    held: bool = False
+    """Whether all is computed before anything is stored: it writes what it reads at neighbors (set by `buffers`)."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +94,8 @@ class Guard:
     body: tuple[Statement, ...]
     keeps: tuple[tuple[Var, Node], ...]
     place: str = ""
+    otherwise: tuple[Statement, ...] = ()
+    """What gives `keeps` their values where the body is skipped, if they do not share buffers (set by `buffers`)."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +105,12 @@ class Release:
     names: tuple[str, ...]
 
 
-Statement = Compute | Move | Guard | Release
+@dataclass(frozen=True)
+class Sync:
+    """All threads have done what stands before this."""
+
+
+Statement = Compute | Move | Guard | Release | Sync
 
 
 @dataclass(frozen=True)
@@ -100,6 +123,8 @@ class Schedule:
     leaves: tuple[tuple[str, Node], ...]
     graph: Graph = field(compare=False, repr=False)
     """Interns the values, so that equal ones are one object in all stages."""
+    buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
+    """For each variable the kind and number of its buffer, where buffers are numbered."""
     calm: Schedule | None = None
     """The pass where all float slots that it reads are zero everywhere, if that is much less work."""
 
@@ -154,6 +179,9 @@ def values_of(statement: Statement) -> Iterator[Node]:
     match statement:
         case Compute(outs):
             yield from (out.value for out in outs)
+            yield from (out.otherwise for out in outs if out.otherwise is not None)
+            if statement.region is not None:
+                yield statement.region
         case Move(_, _, movers, planes):
             yield movers
             for plane in planes:
@@ -180,6 +208,7 @@ def flat(body: Iterable[Statement]) -> Iterator[Statement]:
         yield statement
         if isinstance(statement, Guard):
             yield from flat(statement.body)
+            yield from flat(statement.otherwise)
 
 
 def variables(schedule: Schedule) -> dict[str, Var]:
@@ -195,7 +224,10 @@ def map_blocks(
 ) -> tuple[Statement, ...]:
     """A body with a change made to every block of statements, inner ones first."""
     inner = tuple(
-        replace(one, body=map_blocks(one.body, change)) if isinstance(one, Guard) else one for one in body
+        replace(one, body=map_blocks(one.body, change), otherwise=map_blocks(one.otherwise, change))
+        if isinstance(one, Guard)
+        else one
+        for one in body
     )
     return change(inner)
 
@@ -213,7 +245,7 @@ class Namer:
 
 
 __all__ = [
-    "BLOCK", "CELLS", "FLAG", "PLACES", "REAL",
-    "Carried", "Compute", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Var",
+    "ANSWER", "BLOCK", "CELLS", "FLAG", "PLACES", "REAL",
+    "Carried", "Compute", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sync", "Var",
     "defined_by", "flat", "load", "loaded", "map_blocks", "ordered", "rewritten", "values_of", "variables",
 ]  # fmt: skip

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from powderdsl.ir.ops import FLAG, OPS
 from powderdsl.ir.verify import InvalidIR
 from powderdsl.schedule.types import (
+    ANSWER,
     BLOCK,
     CELLS,
     PLACES,
@@ -22,7 +23,7 @@ from powderdsl.schedule.types import (
     values_of,
 )
 
-_KINDS = ("flag", "real", BLOCK.name, CELLS.name, PLACES.name)
+_KINDS = ("flag", "real", ANSWER.name, BLOCK.name, CELLS.name, PLACES.name)
 
 
 def verify(schedule: Schedule, after: str) -> None:
@@ -52,15 +53,20 @@ class _Checker:
             for node in values_of(statement):
                 self.value(node, live)
             match statement:
-                case Guard(when, inner, keeps):
-                    _demand(all(node.type == FLAG for node in when), "a guard asks what is not a flag")
+                case Guard(when, inner, keeps, _, otherwise):
+                    _demand(
+                        all(node.type in (FLAG, ANSWER) for node in when), "a guard asks what is not a flag"
+                    )
                     before = set(live)
                     # The body makes the variables that are kept: outside they come into being at its end.
                     end = self.block(inner, live)
                     for var, value in keeps:
                         _demand(var.name in end, f"{var.name} is kept, but not made")
                         _demand(var.type == value.type, f"{var.name} is a {var.type}, else a {value.type}")
-                    live = (before & end) | {var.name for var, _ in keeps}
+                    kept = {var.name for var, _ in keeps}
+                    made = self.block(otherwise, live) - before
+                    _demand(made <= kept, f"{made - kept} are made only where a body is skipped")
+                    live = (before & end) | kept
                     continue
                 case Compute(outs):
                     for out in outs:
@@ -88,21 +94,23 @@ class _Checker:
                 _demand(self.vars[node.attr].type == node.type, f"{node.attr} is read as a {node.type}")
             elif id(node) not in self.checked:
                 self.checked.add(id(node))
-                _demand(node.op in OPS or node.op in ARRAY_OPS, f"unknown operation {node.op}")
+                _demand(node.op in OPS or node.op in SCHEDULE_OPS, f"unknown operation {node.op}")
                 _demand(node.op != "input", "a value reads a slot")
                 _demand(node.type.name in _KINDS, f"a value is a {node.type}")
 
 
-ARRAY_OPS = frozenset({
+SCHEDULE_OPS = frozenset({
     "stack", "member", "swap_onto", "leave", "cells", "choose", "places", "moved", "update", "carry", "copy",
-    "below_param",
+    "below_param", "any", "when", "led", "live",
 })  # fmt: skip
 """Operations that only schedules have: `stack` planes → block; `member` (block) → a plane; `swap` (block, movers) and
 `leave` (block, movers) → block; `arrive` and `swap_onto` (block, movers, rest) → block; `cells` (flag) → bool cells;
 `choose` (cells, yes, no) → floats; `places` (flag) → where it holds, `moved` (places) → their neighbors; `update`
 (places, no, other) → `no`, and there `other` added to it, taken off or multiplied; `carry` (places, moved, no, other) →
 the same at neighbors with what `other` has at the places; `copy` (floats) → the same in an array of their own;
-`below_param` → a draw below a parameter."""
+`below_param` → a draw below a parameter; `any` (flag) → whether it holds in some cell; `when` (flag, flag) → both, the
+second computed only in words where the first holds somewhere; `led` (comparison, comparison) → the same in cells; `live` (floats), attribute (rows, reach) → whether the field may be
+other than zero so many rows down, at most so many columns to either side."""
 
 
 def _demand(holds: bool, message: str) -> None:

@@ -17,12 +17,13 @@ from powderdsl.schedule.types import (
     Compute,
     Guard,
     Move,
+    Out,
     Release,
     Schedule,
     Statement,
     Var,
+    defined_by,
     ordered,
-    variables,
 )
 
 SNAP = np.float32(2.0**-20)
@@ -54,7 +55,7 @@ def run_schedule(schedule: Schedule, world: World, truth: Mapping[int, Array]) -
     if schedule.calm is not None and silent:
         return run_schedule(schedule.calm, world, {})
     state = _State(world, truth, {var.name: world.slots[slot] for slot, var in schedule.finds})
-    state.names = variables(schedule)
+    state.buffers = dict(schedule.buffers)
     state.block(schedule.body)
     return {slot: np.array(_evaluate([node], world, state.held)[id(node)]) for slot, node in schedule.leaves}
 
@@ -64,13 +65,16 @@ class _State:
     world: World
     truth: Mapping[int, Array]
     held: dict[str, Array]
-    names: Mapping[str, Var] = field(default_factory=dict)
+    buffers: Mapping[str, tuple[str, int]] = field(default_factory=dict)
 
     def block(self, body: Sequence[Statement]) -> None:
         for statement in body:
             match statement:
                 case Compute(outs):
                     found = self.values([out.value for out in outs])
+                    found = [
+                        self.inside(statement, out, value) for out, value in zip(outs, found, strict=True)
+                    ]
                     for out, value in zip(outs, found, strict=True):
                         if out.into is not None:
                             del self.held[out.into]
@@ -84,7 +88,7 @@ class _State:
                         if op == "swap":
                             moved = np.where(m, _shift(old, dy, dx, True), moved)
                         self.set(plane.new, moved)
-                case Guard(when, inner, keeps):
+                case Guard(when, inner, keeps, _, otherwise):
                     before = dict(self.held)
                     if any(np.any(flag) for flag in self.values(when)):
                         self.block(inner)
@@ -92,6 +96,9 @@ class _State:
                     else:
                         found = self.values([value for _, value in keeps])
                         kept = {var.name: value for (var, _), value in zip(keeps, found, strict=True)}
+                        self.block(otherwise)
+                        for name in {var.name for one in otherwise for var in defined_by(one)}:
+                            assert np.array_equal(self.held[name], kept[name]), name
                     # What the body released or overwrote is gone in either case.
                     gone = set(before) - set(self.held)
                     for inside in _all(inner):
@@ -99,6 +106,14 @@ class _State:
                             gone |= set(inside.names)
                         if isinstance(inside, Compute):
                             gone |= {out.into for out in inside.outs if out.into}
+                    if self.buffers:  # skipped or not, what shares a buffer with what the body makes is gone
+                        made = {
+                            self.buffers[v.name]
+                            for one in _all(inner)
+                            for v in defined_by(one)
+                            if v.name in self.buffers
+                        }
+                        gone |= {name for name in before if self.buffers.get(name) in made}
                     self.held = {name: value for name, value in before.items() if name not in gone}
                     for var, _ in keeps:
                         self.set(var, kept[var.name])
@@ -110,6 +125,13 @@ class _State:
         found = _evaluate(nodes, self.world, self.held)
         return [found[id(node)] for node in nodes]
 
+    def inside(self, statement: Compute, out: Out, value: Array) -> Array:
+        """What a variable gets: outside the region something else, which must be the same."""
+        if statement.region is None or out.otherwise is None:
+            return value
+        region, rest = self.values([statement.region, out.otherwise])
+        return np.where(region, value, rest)
+
     def set(self, var: Var, value: Array) -> None:
         if var.means is not None and id(var.means) in self.truth:
             expected = np.broadcast_to(self.truth[id(var.means)], self.world.shape)
@@ -119,6 +141,10 @@ class _State:
             )
         assert var.name not in self.held, f"{var.name} is assigned twice"
         self.held[var.name] = value
+        if var.name in self.buffers:  # what stood in the buffer is gone
+            others = [n for n in self.held if n != var.name and self.buffers.get(n) == self.buffers[var.name]]
+            for name in others:
+                del self.held[name]
 
 
 _BITS = {"flag": bool, "real": np.int32}
@@ -208,6 +234,12 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             return np.where(movers, _shift(content, dy, dx, True), moved) if node.op == "swap" else moved
         case "div":
             return np.where(args[1] == 0, np.float32(0), args[0] / args[1])
+        case "live":
+            dy, reach = attr
+            near = [_shift(args[0] != 0, dy, dx, True) for dx in range(-reach, reach + 1)]
+            return np.logical_or.reduce(near)
+        case "any":
+            return bool(np.any(args[0]))
         case "swap" | "arrive" | "swap_onto" | "leave" | "stack" | "member":
             return _block(node, args)
         case "cells" | "places" | "copy":
@@ -259,7 +291,7 @@ def _wanted(holds: Array, where: list[Array]) -> Array:
 
 _CHANGES: dict[str, Callable[..., Any]] = {"add": np.add, "sub": np.subtract, "mul": np.multiply}
 _SIMPLE: dict[str, Callable[..., Any]] = {
-    "and": np.logical_and, "or": np.logical_or, "xor": np.logical_xor, "eq": np.equal, "lt": np.less,
+    "and": np.logical_and, "when": np.logical_and, "led": np.logical_and, "or": np.logical_or, "xor": np.logical_xor, "eq": np.equal, "lt": np.less,
     "le": np.less_equal, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt, "min": np.minimum, "max": np.maximum,
     **_CHANGES,
 }  # fmt: skip

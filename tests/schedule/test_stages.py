@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from powderdsl.compiler import load, lower
+from powderdsl.ir.bits import plane_slots
 from powderdsl.ir.gates import width
 from powderdsl.ir.ops import PassGraph, Program
 from powderdsl.ir.segments import segments
-from powderdsl.schedule.lower import lower as first_schedule
-from powderdsl.schedule.stages import ARRAYS
+from powderdsl.schedule.barriers import Pending, barriers
+from powderdsl.schedule.buffers import Pool, buffers
+from powderdsl.schedule.stages import ARRAYS, CUDA, Stage, steps
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.verify import verify
 from tests.schedule.interpreter import World, run_graph, run_schedule
@@ -70,17 +72,37 @@ RULES = (
 )
 
 
+@pytest.mark.parametrize("stages", [ARRAYS, CUDA], ids=["arrays", "cuda"])
 @pytest.mark.parametrize("rules", RULES)
-def test_every_stage(rules: str) -> None:
+def test_every_stage(rules: str, stages: tuple[Stage, ...]) -> None:
     for program, pass_ in packed_passes(rules):
         worlds = [random_world(program, pass_, seed) for seed in range(WORLDS)]
         truths = [run_graph(pass_, world) for world in worlds]
-        schedule = first_schedule(pass_)
-        for stage in (None, *ARRAYS):
-            schedule = stage.apply(schedule) if stage else schedule
-            verify(schedule, stage.name if stage else "lower")
+        for stage, schedule in steps(pass_, stages):
+            verify(schedule, stage)
             for world, truth in zip(worlds, truths, strict=True):
                 compare(pass_, schedule, world, truth)
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+@pytest.mark.parametrize("rules", RULES)
+def test_buffers(rules: str, in_place: bool) -> None:
+    """No variable is read after its buffer has been written over; values end in their slots' own buffers."""
+    pool: Pool | None = None
+    for program, pass_ in packed_passes(rules):
+        planes = [plane for slot in program.slots for plane in plane_slots(slot)]
+        kinds = {slot.name: "real" if slot.type.name == "real" else "flag" for slot in planes}
+        homes = {name: [n for n in kinds if kinds[n] == kinds[name]].index(name) for name in kinds}
+        own = {kind: sum(1 for one in kinds.values() if one == kind) for kind in ("flag", "real")}
+        pool = pool or Pool(own, dict(own))
+        *_, (_, schedule) = steps(pass_, CUDA)
+        schedule = barriers(buffers(schedule, homes, pool, in_place=in_place), Pending())
+        verify(schedule, "buffers")
+        ends = dict(schedule.buffers)
+        assert all(ends[node.attr][1] == homes[slot] for slot, node in schedule.leaves)
+        for seed in range(WORLDS):
+            world = random_world(program, pass_, seed)
+            compare(pass_, schedule, world, run_graph(pass_, world))
 
 
 def compare(pass_: PassGraph, schedule: Schedule, world: World, truth: Mapping[int, np.ndarray]) -> None:

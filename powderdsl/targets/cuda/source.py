@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from importlib.resources import files
 
 from powderdsl.ir.ops import Program
-from powderdsl.targets.cuda.emit import Emitter, Pending
-from powderdsl.targets.cuda.passes import PassSchedule
-from powderdsl.targets.cuda.schedule import Pool, make_plan
+from powderdsl.schedule.barriers import Pending, barriers
+from powderdsl.schedule.buffers import Pool, buffers
+from powderdsl.schedule.stages import CUDA, plan
+from powderdsl.targets.cuda.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Part of every cache key: raise it when generated code changes meaning."""
 
 SNAP = 2.0**-20
@@ -60,26 +61,14 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     group = max(1, SMALL // words)
     wanted = -(-group * words // WARP) * WARP * (2 if layout.reals else 1)
     threads = min(MAX_THREADS, wanted)
-    pool = Pool(
-        {"p": len(layout.planes), "f": len(layout.reals)}, {"p": len(layout.planes), "f": len(layout.reals)}
-    )
-    pending = Pending()
+    own = {"flag": len(layout.planes), "real": len(layout.reals)}
+    pool, pending = Pool(own, dict(own)), Pending()
+    homes = layout.planes | layout.reals
+    in_place = -(-group * words // threads) <= HELD
     passes = []
     for number, pass_ in enumerate(program.passes):
-        schedule = PassSchedule(pass_, layout)
-        rounds = -(-group * words // threads)
-        plan = make_plan(
-            schedule.statements,
-            schedule.homes,
-            schedule.changed,
-            schedule.open_homes,
-            schedule.prefers,
-            pool,
-            rounds <= HELD,
-        )
-        emitter = Emitter(plan, pending)
-        body = emitter.text(schedule.statements)
-        pending = emitter.pending
+        schedule = buffers(plan(pass_, CUDA), homes, pool, in_place=in_place)
+        body = pass_text(barriers(schedule, pending), layout)
         passes.append(f"DEVICE void pass_{number}(const Block& c) {{\n(void)c;\n{body}\n}}")
     uniform = (
         4
@@ -92,8 +81,8 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
             + len(layout.param_reals)
         )
     )
-    planes = 4 * group * words * pool.size["p"]
-    fields = 4 * group * (height * width + words) * pool.size["f"]
+    planes = 4 * group * words * pool.size["flag"]
+    fields = 4 * group * (height * width + words) * pool.size["real"]
     planes_fit = uniform + planes <= shared_limit
     fields_fit = planes_fit and uniform + planes + fields <= shared_limit
     shared = uniform + (planes if planes_fit else 0) + (fields if fields_fit else 0)
@@ -102,7 +91,7 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     head = {
         "HEIGHT": height, "WIDTH": width, "ROW_WORDS": row_words, "GROUP": group,
         "PLANES_ON_CHIP": int(planes_fit), "FIELDS_ON_CHIP": int(fields_fit),
-        "PLANES": pool.size["p"], "FIELDS": pool.size["f"], "SLOTS": len(layout.planes), "REALS": len(layout.reals),
+        "PLANES": pool.size["flag"], "FIELDS": pool.size["real"], "SLOTS": len(layout.planes), "REALS": len(layout.reals),
         "STREAMS": len(layout.streams), "STEP_PLANES": len(layout.step_planes),
         "PARAM_PLANES": len(layout.param_planes), "PARAM_REALS": len(layout.param_reals), "SNAP": literal(SNAP),
     }  # fmt: skip

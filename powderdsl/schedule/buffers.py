@@ -1,0 +1,243 @@
+"""Numbered buffers for variables, each for as long as it is needed; what takes another's place takes its buffer.
+
+A variable that follows on another takes over its buffer if it can, so a guard that is skipped costs nothing. What
+cannot is copied, by statements of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.schedule.types import (
+    ANSWER,
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    Var,
+    load,
+    ordered,
+    values_of,
+)
+
+FOREVER = 1 << 30
+
+Buffer = tuple[str, int]
+"""Kind (`flag` or `real`) and number."""
+
+
+@dataclass
+class Pool:
+    """Buffers by kind: how many are the slots' own, and how many there are in all."""
+
+    slots: dict[str, int]
+    size: dict[str, int]
+
+
+def buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_place: bool) -> Schedule:
+    """The schedule with a buffer for every variable; `leaves` are loads from the slots' own buffers.
+
+    Args:
+        homes: the number of each slot's own buffer.
+        pool: shared by all passes; it grows.
+        in_place: whether a loop may write planes whose other words it reads, holding back all that it writes.
+    """
+    found = {var.name: homes[slot] for slot, var in schedule.finds}
+    types = {var.name: var.type.name for _, var in schedule.finds}
+    changed = {slot for slot, _ in schedule.leaves}
+    plan = _Plan(schedule, pool, in_place)
+    plan.buffer = {name: (types[name], number) for name, number in found.items()}
+    plan.open = {(node.type.name, homes[slot]) for slot, node in schedule.leaves}
+    plan.wanted = {}
+    for slot, node in schedule.leaves:
+        if node.op == "load":
+            plan.wanted.setdefault(node.attr, homes[slot])
+    for slot, var in schedule.finds:
+        if slot not in changed:
+            plan.last[var.name] = FOREVER
+    plan.run()
+    return _explicit(schedule, plan, homes)
+
+
+@dataclass
+class _Plan:
+    schedule: Schedule
+    pool: Pool
+    in_place: bool
+    buffer: dict[str, Buffer] = field(default_factory=dict)
+    open: set[Buffer] = field(default_factory=set)
+    """Buffers of all slots that the pass changes: until its end they may hold anything."""
+    wanted: dict[str, int] = field(default_factory=dict)
+    """The slot's buffer in which a variable ends."""
+    last: dict[str, int] = field(default_factory=dict)
+    defined: dict[str, int] = field(default_factory=dict)
+    follows: dict[str, str] = field(default_factory=dict)
+    """What a variable is where its statement is skipped."""
+    ends: dict[str, int] = field(default_factory=dict)
+    """Where that is made good."""
+
+    def run(self) -> None:
+        order = list(_in_order(self.schedule.body))
+        for position, statement in enumerate(order):
+            self.number(statement, position)
+        end = len(order)
+        for _, node in self.schedule.leaves:
+            if node.op == "load":
+                self.last[node.attr] = max(self.last.get(node.attr, -1), end)
+        for name, old in self.follows.items():
+            if name in self.defined:
+                self.last[old] = max(self.last.get(old, -1), self.defined[name])
+        busy = {number: name for name, number in self.buffer.items()}
+        for position, statement in enumerate(order):
+            busy = {key: name for key, name in busy.items() if self.last.get(name, -1) >= position}
+            if not isinstance(statement, Compute):
+                continue
+            reads = neighbors(statement)
+            for out in statement.outs:
+                if out.var.type == ANSWER:
+                    continue
+                found = self.taken_over(out.var, statement, reads, position, busy)
+                if found is None:
+                    found = self.free(out.var, busy)
+                    if old := self.follows.get(out.var.name, ""):  # it must still be there to be copied
+                        self.last[old] = max(self.last.get(old, -1), self.ends[out.var.name])
+                kind, number = found
+                self.pool.size[kind] = max(self.pool.size[kind], number + 1)
+                self.buffer[out.var.name] = found
+                busy[found] = out.var.name
+
+    def number(self, statement: Statement, position: int) -> None:
+        """First and last places of variables, and what they follow on."""
+        if isinstance(statement, Compute):
+            for name in neighbors(statement):
+                self.last[name] = position
+            for out in statement.outs:
+                self.defined[out.var.name] = position
+                self.last.setdefault(out.var.name, position)
+                if out.otherwise is not None and out.otherwise.op == "load":
+                    self.follow(out.var.name, out.otherwise.attr, position)
+        elif isinstance(statement, Guard):
+            for var, value in statement.keeps:
+                self.ends[var.name] = position
+                if value.op == "load":
+                    self.follow(var.name, value.attr, position)
+                    self.last[value.attr] = max(self.last.get(value.attr, -1), position)
+
+    def follow(self, name: str, old: str, position: int) -> None:
+        self.follows[name], self.ends[name] = old, position
+
+    def taken_over(
+        self, var: Var, loop: Compute, reads: Mapping[str, bool], position: int, busy: Mapping[Buffer, str]
+    ) -> Buffer | None:
+        """The buffer of a variable that nobody needs after this loop: of what it follows on, or in its slot's home."""
+        home = busy.get((var.type.name, self.wanted.get(var.name, -1)), "")
+        for old in (self.follows.get(var.name, ""), home):
+            if not old or self.last.get(old, -1) > position:
+                continue
+            if busy.get(self.buffer[old]) != old:
+                continue
+            if reads.get(old) and not (self.in_place and loop.over == "words"):
+                continue
+            if old in reads and loop.over == "cells" and var.type == FLAG:
+                continue  # one lane writes what the others read
+            return self.buffer[old]
+        return None
+
+    def free(self, var: Var, busy: Mapping[Buffer, str]) -> Buffer:
+        """The buffer of the slot that the variable ends in, or the first that nobody needs."""
+        kind = var.type.name
+        home = self.wanted.get(var.name)
+        if home is not None and (kind, home) not in busy:
+            return kind, home
+        return kind, next(
+            n
+            for n in range(FOREVER)
+            if (kind, n) not in busy and (n >= self.pool.slots[kind] or (kind, n) in self.open)
+        )
+
+
+def _in_order(body: Sequence[Statement]) -> Iterator[Statement]:
+    """All statements in order of place; a guard after what it holds."""
+    for statement in body:
+        if isinstance(statement, Guard):
+            yield from _in_order(statement.body)
+        yield statement
+
+
+def neighbors(statement: Statement) -> dict[str, bool]:
+    """Variables that a statement reads, and whether also at neighbors."""
+    found: dict[str, bool] = {}
+    for node in ordered(values_of(statement)):
+        if node.op == "load":
+            found.setdefault(node.attr, False)
+        elif node.op in ("shift", "live") and node.args[0].op == "load" and any(node.attr[:2]):
+            found[node.args[0].attr] = True
+    return found
+
+
+def _explicit(schedule: Schedule, plan: _Plan, homes: Mapping[str, int]) -> Schedule:
+    """The schedule with the copies that the plan makes necessary."""
+    graph, namer = schedule.graph, Namer(schedule)
+    numbers = dict(plan.buffer)
+
+    def block(body: Sequence[Statement]) -> tuple[Statement, ...]:
+        result: list[Statement] = []
+        for statement in body:
+            if isinstance(statement, Guard):
+                pairs = [
+                    (var, value)
+                    for var, value in statement.keeps
+                    if value.op != "load" or numbers[value.attr] != numbers[var.name]
+                ]
+                result.append(
+                    replace(statement, body=block(statement.body), otherwise=tuple(copies(pairs, graph)))
+                )
+            elif isinstance(statement, Compute):
+                across = {numbers[name] for name, far in neighbors(statement).items() if far}
+                held = any(numbers.get(out.var.name) in across for out in statement.outs)
+                moved = any(
+                    out.otherwise is not None
+                    and out.otherwise.op == "load"
+                    and numbers[out.otherwise.attr] != numbers[out.var.name]
+                    for out in statement.outs
+                )
+                result.append(replace(statement, held=held, region=None if moved else statement.region))
+            else:
+                result.append(statement)
+        return tuple(result)
+
+    body = block(schedule.body)
+    leaves, pairs = [], []
+    for slot, node in schedule.leaves:
+        home = (node.type.name, homes[slot])
+        if node.op == "load" and numbers[node.attr] == home:
+            leaves.append((slot, node))
+            continue
+        var = namer.var(node.type)
+        numbers[var.name] = home
+        pairs.append((var, node))
+        leaves.append((slot, load(graph, var)))
+    end = tuple(copies(pairs, graph))
+    return replace(schedule, body=(*body, *end), leaves=tuple(leaves), buffers=tuple(sorted(numbers.items())))
+
+
+def copies(pairs: Sequence[tuple[Var, Node]], graph: Graph) -> Iterator[Compute]:
+    """Loops that give variables their values; each reads everything before it writes anything."""
+    flags = tuple(Out(var, value) for var, value in pairs if var.type == FLAG)
+    if flags:
+        yield Compute(flags, "", "words")
+    floats = [(var, value) for var, value in pairs if var.type == REAL]
+    if floats:
+        zero = graph.node("const", REAL, (), 0.0)
+        region: Node = graph.node("const", FLAG, (), False)
+        outs = []
+        for var, value in floats:
+            if value.op == "load":
+                live = graph.node("live", FLAG, (value,), (0, 0))
+                region = live if region.op == "const" else graph.node("or", FLAG, (region, live))
+            outs.append(Out(var, value, None, zero))
+        yield Compute(tuple(outs), "", "cells", region)

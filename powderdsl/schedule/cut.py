@@ -1,0 +1,457 @@
+"""Where one loop ends and the next begins: what must be stored before a loop can read it, what is computed again.
+
+A loop over words sees flags of its own word; at a neighbor it reads what is stored, or computes again what is cheap.
+A loop over cells sees floats, and flags that are stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from powderdsl.ir.ops import FLAG, REAL, Node, Offset, walk
+from powderdsl.schedule.draws import DRAWS, all_of
+from powderdsl.schedule.floats import conjuncts, is_comparison, of_floats
+from powderdsl.schedule.types import (
+    ANSWER,
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    Var,
+    flat,
+    load,
+    ordered,
+    values_of,
+)
+
+FAR = 100
+"""The cost of what cannot be computed again."""
+
+UNIFORM = ("const", "param", "coordinate", "inside")
+_LOGIC = ("not", "and", "or", "xor", "select", "when")
+_ARITHMETIC = ("add", "sub", "mul", "neg")
+
+Have = Callable[[Node], bool]
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What storing costs a target. `gates`: summed over all neighbors that ask, up to which a flag is computed again;
+    `floats`: operations up to which a float is."""
+
+    gates: int
+    floats: int
+
+
+def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
+    """The stage for a target: every `Compute` becomes loops over words and loops over cells.
+
+    `p = f(a)[0,1] & b`, where f is costly → `loop words: t = f(a)`, `loop words: p = t[0,1] & b`.
+    """
+
+    def stage(schedule: Schedule) -> Schedule:
+        cutter = _Cutter(schedule, costs)
+        body = cutter.block(schedule.body, top=True)
+        return replace(schedule, body=tuple(body))
+
+    return stage
+
+
+# What is computed again
+
+
+def sources_of(node: Node) -> list[tuple[Node, Offset]]:
+    """What a node asks for at neighbors, and where."""
+    if node.op == "shift":
+        return [(node.args[0], node.attr[:2])]
+    if node.op in ("swap", "arrive"):
+        (dy, dx), (content, movers, _) = node.attr, node.args
+        back = [(content, (-dy, -dx)), (movers, (-dy, -dx))]
+        return [*back, (content, (dy, dx))] if node.op == "swap" else back
+    return []
+
+
+def movable(node: Node, have: Have, most: int) -> bool:
+    """Whether a flag can be computed at a neighbor with at most so many gates."""
+    seen: set[tuple[int, Offset]] = set()
+    stack = [(node, (0, 0))]
+    while stack:
+        top, (dy, dx) = stack.pop()
+        if (id(top), (dy, dx)) in seen or is_constant(top):
+            continue
+        seen.add((id(top), (dy, dx)))
+        if len(seen) > most:
+            return False
+        if have(top):
+            continue
+        if top.op == "shift" and top.attr[2]:
+            stack.append((top.args[0], (dy + top.attr[0], dx + top.attr[1])))
+        elif top.op in _LOGIC and not of_floats(top):
+            stack.extend((arg, (dy, dx)) for arg in top.args)
+        else:
+            return False
+    return True
+
+
+def is_constant(node: Node) -> bool:
+    """Whether a value is the same in all cells of a world."""
+    return node.op in ("const", "param") or (node.op == "coordinate" and node.attr[0] == "step")
+
+
+def float_cost(node: Node, have: Have) -> int:
+    """Operations that computing a float at a neighbor takes; FAR if it cannot be done there."""
+    if have(node) or node.op in ("const", "param"):
+        return 0
+    if node.op in _ARITHMETIC:
+        total = 1
+        for arg in node.args:
+            total += float_cost(arg, have)
+            if total >= FAR:  # graphs share nodes: counting on would take forever
+                return FAR
+        return total
+    return float_cost(node.args[0], have) if node.op == "shift" and node.attr[2] else FAR
+
+
+def stored_parts(source: Node, have: Have, most: int) -> list[Node]:
+    """What must be stored so that a float can be computed at a neighbor: itself, or the costly things in it."""
+    if float_cost(source, have) <= most:
+        return []
+    if source.op in _ARITHMETIC:
+        parts = [part for arg in source.args for part in stored_parts(arg, have, most)]
+        ids = {id(part) for part in parts}
+        if float_cost(source, lambda node: have(node) or id(node) in ids) <= most:
+            return parts
+    return [source]
+
+
+# Loops
+
+
+class _Cutter:
+    def __init__(self, schedule: Schedule, costs: Costs):
+        self.namer, self.graph, self.costs = Namer(schedule), schedule.graph, costs
+        self.known: dict[int, Var] = {}
+        """Variables of values, by id, that are stored where we are."""
+        self.statements: list[Statement] = []
+        nodes = ordered(node for one in flat(schedule.body) for node in values_of(one))
+        self.comparisons = [node for node in nodes if is_comparison(node)]
+        offsets: dict[int, set[Offset]] = {}
+        for node in nodes:
+            for source, offset in sources_of(node):
+                offsets.setdefault(id(source), set()).add(offset)
+        self.askers = {key: len(found) for key, found in offsets.items()}
+        """How many neighbors' values of each node are asked for."""
+        shifted = [node.args[0] for node in nodes if node.op == "shift" and node.type == REAL]
+        self.wanted = {
+            id(part)
+            for node in shifted
+            for part in stored_parts(node, lambda node: node.op == "load", costs.floats)
+            if part.op != "load"
+        }
+        """Floats that neighbors will be asked for."""
+        led = [node for node in nodes if node.op == "led"]
+        self.led = {id(node.args[1]): node for node in led}
+
+    def have(self, node: Node) -> bool:
+        return node.op == "load" or id(node) in self.known
+
+    def variable(self, node: Node) -> Node:
+        """The load of a node that is stored."""
+        return node if node.op == "load" else load(self.graph, self.known[id(node)])
+
+    # Statements
+
+    def block(self, body: Sequence[Statement], *, top: bool = False) -> list[Statement]:
+        outer, self.statements = self.statements, []
+        known = dict(self.known)
+        for i, statement in enumerate(body):
+            match statement:
+                case Compute(outs, place):
+                    guard = body[i + 1] if i + 1 < len(body) else None
+                    if isinstance(guard, Guard):
+                        if top:
+                            self.hoist_comparisons([out.value for out in outs], place)
+                        self.guarded(statement, guard)
+                    else:
+                        self.compute(outs, place)
+                case Guard() if not (i and isinstance(body[i - 1], Compute)):
+                    self.ask([], statement)
+                case Guard():
+                    pass  # with the masks before it
+                case _:
+                    raise AssertionError("movements and buffers come after loops")
+        found, self.statements = self.statements, outer
+        self.known = known if not top else self.known
+        return found
+
+    def compute(self, outs: Iterable[Out], place: str) -> None:
+        """Store values under the names of their variables."""
+        named = {id(out.value): out.var for out in reversed(list(outs)) if not self.have(out.value)}
+        self.ensure([out.value for out in outs], place, named)
+        for out in outs:
+            if named.get(id(out.value)) is not out.var:  # stored under another name
+                self.words([(out.var, out.value)], place)
+
+    def hoist_comparisons(self, masks: list[Node], place: str) -> None:
+        """Comparisons that masks ask for, outside any guard, with all others that can be had in one loop."""
+        asked = [
+            self.led.get(id(node), node)
+            for mask in masks
+            for node in walk(mask)
+            if is_comparison(node) and not self.have(node) and not self.have(self.led.get(id(node), node))
+        ]
+        if not asked:
+            return
+        asked = list(dict.fromkeys(asked))
+        self.ensure([need for node in asked for need in self.needs(node)], place)
+        others = [self.led.get(id(node), node) for node in self.comparisons]
+        ready = [node for node in others if not self.have(node) and not self.needs(node)]
+        self.ensure([*asked, *ready], place)
+
+    def guarded(self, masks: Compute, guard: Guard) -> None:
+        """Masks and the guard that asks for them: first what is cheap, and the rest only where that leaves something."""
+        graph, place = self.graph, masks.place
+        split = {out.var.name: self.split(out.value) for out in masks.outs}
+        needs = [need for out in masks.outs for need in self.needs(out.value)]
+        asked = {node.attr for node in guard.when if node.op == "load"}
+        mine = [out for out in masks.outs if out.var.name in asked]
+        if len(mine) < len(masks.outs):
+            self.compute([out for out in masks.outs if out.var.name not in asked], place)
+        lazy = [Out(out.var, self.lazily(*split[out.var.name])) for out in mine]
+        cheap = {name: parts for name, (parts, _) in split.items()}
+        if not needs or not all(cheap[out.var.name] for out in mine):
+            self.ensure([need for out in lazy for need in self.needs(out.value)], place)
+            self.ask(lazy, guard)
+            return
+        # Whether the cheap parts hold anywhere: only then are the others, and what they need, computed.
+        first = [all_of(cheap[node.attr], graph) if node.attr in cheap else node for node in guard.when]
+        outer, self.statements = self.statements, []
+        known = dict(self.known)
+        self.ensure([need for out in lazy for need in self.needs(out.value)], place)
+        self.ask(lazy, guard)
+        inner, self.statements = self.statements, outer
+        self.known = known
+        nothing = graph.node("const", FLAG, (), False)
+        kept = (*((out.var, nothing) for out in mine), *guard.keeps)
+        self.statements.append(Compute((self.answer(first),), place, "words"))
+        when = (load(graph, self.statements[-1].outs[0].var),)  # type: ignore[union-attr]
+        self.statements.append(Guard(when, tuple(inner), kept, guard.place))
+
+    def ask(self, masks: list[Out], guard: Guard) -> None:
+        """Store masks, ask whether they hold anywhere, and what the guard does then."""
+        values = {out.var.name: out.value for out in masks}
+        asked = [values.get(node.attr, node) if node.op == "load" else node for node in guard.when]
+        self.ensure([need for node in asked for need in self.needs(node)], guard.place)
+        words = tuple(Out(out.var, self.word(out.value)) for out in masks)
+        question = self.answer(asked)
+        self.statements.append(Compute((*words, question), guard.place, "words"))
+        body = tuple(self.block(guard.body))
+        self.statements.append(Guard((load(self.graph, question.var),), body, guard.keeps, guard.place))
+
+    def answer(self, flags: Sequence[Node]) -> Out:
+        """Whether one of some flags holds in any cell."""
+        some = self.word(flags[0])
+        for flag in flags[1:]:
+            some = self.graph.node("or", FLAG, (some, self.word(flag)))
+        return Out(self.namer.var(ANSWER), self.graph.node("any", ANSWER, (some,)))
+
+    def split(self, mask: Node) -> tuple[list[Node], list[Node]]:
+        """Conjuncts that one loop can compute from what is there, and those that take more."""
+        cheap: list[Node] = []
+        rest: list[Node] = []
+        for part in conjuncts(mask):
+            draws = any(node.op in DRAWS for node in walk(part)) and not self.have(part)
+            more = (of_floats(part) and not self.have(part)) or self.needs(part)
+            (rest if draws or more else cheap).append(part)
+        return cheap, rest
+
+    def lazily(self, cheap: list[Node], rest: list[Node]) -> Node:
+        """The conjunction; the rest is computed only in words where the cheap parts hold somewhere, draws last."""
+        if not rest or not cheap:
+            return all_of([*cheap, *rest], self.graph)
+        rest = sorted(rest, key=lambda part: part.op in DRAWS)
+        first = all_of(cheap, self.graph)
+        return self.graph.node("when", FLAG, (first, all_of(rest, self.graph)))
+
+    # What must be stored
+
+    def needs(self, node: Node) -> list[Node]:
+        """What must be stored before a node can be computed."""
+        if self.have(node):
+            return []
+        return self.cell_needs(node) if of_floats(node) else self.word_needs(node)
+
+    def again(self, node: Node) -> bool:
+        """Whether a flag's value at a neighbor is at hand or cheap."""
+        most = max(1, self.costs.gates // max(1, self.askers.get(id(node), 1)))
+        return self.have(node) or movable(node, self.have, most)
+
+    def word_needs(self, node: Node) -> list[Node]:
+        found: dict[int, Node] = {}
+        seen: set[int] = set()
+        stack = [node]
+        while stack:
+            top = stack.pop()
+            if id(top) in seen or self.have(top) or top.op in UNIFORM:
+                continue
+            seen.add(id(top))
+            if of_floats(top):
+                found[id(top)] = top
+                continue
+            sources = {id(source): source for source, _ in sources_of(top)}
+            for source in sources.values():
+                if not self.again(source):
+                    found[id(source)] = source
+                else:
+                    stack.append(source)
+            stack.extend(arg for arg in top.args if id(arg) not in sources)
+        return list(found.values())
+
+    def cell_needs(self, node: Node) -> list[Node]:
+        flags: dict[int, Node] = {}
+        floats: dict[int, Node] = {}
+        seen: set[int] = set()
+        stack = [node]
+        while stack:
+            top = stack.pop()
+            if id(top) in seen or (top is not node and self.have(top)):
+                continue
+            seen.add(id(top))
+            if top.op == "led":
+                stack.extend(top.args)
+            elif top.type != REAL and top is not node and not is_comparison(top):
+                if top.op != "param":
+                    flags[id(top)] = top
+            elif top.op == "shift":
+                source = top.args[0]
+                if self.have(source):
+                    continue
+                parts = stored_parts(source, self.have, self.costs.floats) if top.attr[2] else [source]
+                floats |= {id(part): part for part in parts}
+                if not parts:
+                    stack.append(source)
+            else:
+                stack.extend(top.args)
+        return [*flags.values(), *floats.values()]
+
+    def ensure(self, nodes: Iterable[Node], place: str, named: dict[int, Var] | None = None) -> None:
+        """Store nodes, and before them everything they need."""
+        named = named or {}
+        wanted = [
+            node
+            for node in dict.fromkeys(nodes)
+            if not self.have(node) and not (node.op in UNIFORM and node.type == REAL)
+        ]
+        if not wanted:
+            return
+        before = [
+            need
+            for need in dict.fromkeys(n for node in wanted for n in self.needs(node))
+            if not self.have(need)
+        ]
+        if before:
+            self.ensure(before, place, named)
+            self.ensure(wanted, place, named)
+            return
+        floats = [node for node in wanted if of_floats(node)]
+        # What neighbors will be asked for later is stored while it is computed anyway.
+        floats += [i for node in floats for i in walk(node) if id(i) in self.wanted and not self.have(i)]
+        flags = [node for node in wanted if node not in floats]
+        if floats:
+            self.cells(
+                [(named.get(id(n)) or self.namer.var(n.type), n) for n in dict.fromkeys(floats)], place
+            )
+        if flags:
+            self.words([(named.get(id(n)) or self.namer.var(FLAG), n) for n in flags], place)
+
+    def words(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
+        outs = tuple(Out(var, self.word(node)) for var, node in pairs)
+        self.statements.append(Compute(outs, place, "words"))
+        self.known |= {id(node): var for var, node in pairs if not self.have(node)}
+
+    def cells(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
+        """A loop over cells: floats first, then comparisons, those that lead before those that they lead."""
+        pairs = sorted(pairs, key=lambda pair: (pair[1].type != REAL, pair[1].op == "led"))
+        cells = _Cells(self)
+        outs = tuple(Out(var, cells.value(node)) for var, node in pairs)
+        self.statements.append(Compute(outs, place, "cells"))
+        self.known |= {id(node): var for var, node in pairs}
+
+    # Values of a loop
+
+    def word(self, root: Node) -> Node:
+        """A flag in a loop over words: neighbors are read from variables only."""
+        memo: dict[tuple[int, int, int], Node] = {}
+        graph = self.graph
+
+        def value(node: Node, dy: int = 0, dx: int = 0) -> Node:
+            key = (id(node), dy, dx)
+            if key not in memo:
+                memo[key] = compute(node, dy, dx)
+            return memo[key]
+
+        def compute(node: Node, dy: int, dx: int) -> Node:
+            if self.have(node):
+                found = self.variable(node)
+                return graph.node("shift", FLAG, (found,), (dy, dx, True)) if (dy, dx) != (0, 0) else found
+            if is_constant(node):
+                return node
+            if node.op == "shift":
+                sy, sx, wraps = node.attr
+                if not wraps and self.have(node.args[0]):
+                    assert dy == dx == 0
+                    return graph.node("shift", FLAG, (self.variable(node.args[0]),), node.attr)
+                moved = value(node.args[0], dy + sy, dx + sx)
+                if wraps:
+                    return moved
+                assert dy == dx == 0
+                inside = graph.node("inside", FLAG, (), (sy, sx))
+                return graph.node("and", FLAG, (moved, inside))
+            if node.op in _LOGIC:
+                return graph.node(node.op, FLAG, tuple(value(arg, dy, dx) for arg in node.args))
+            assert dy == dx == 0
+            if node.op in ("swap", "arrive"):
+                content, movers, rest = node.args
+                sy, sx = node.attr
+                moved = (value(movers, -sy, -sx), value(content, -sy, -sx), value(rest))
+                found = graph.node("select", FLAG, moved)
+                if node.op == "swap":
+                    found = graph.node("select", FLAG, (value(movers), value(content, sy, sx), found))
+                return found
+            return graph.node(node.op, FLAG, tuple(value(arg) for arg in node.args), node.attr, node.places)
+
+        return value(root)
+
+
+class _Cells:
+    """Values of one loop over cells: floats at neighbors are read from variables, or computed again."""
+
+    def __init__(self, cutter: _Cutter):
+        self.cutter, self.graph = cutter, cutter.graph
+        self.memo: dict[tuple[int, int, int], Node] = {}
+
+    def value(self, node: Node, dy: int = 0, dx: int = 0) -> Node:
+        key = (id(node), dy, dx)
+        if key not in self.memo:
+            self.memo[key] = self.compute(node, dy, dx)
+        return self.memo[key]
+
+    def compute(self, node: Node, dy: int, dx: int) -> Node:
+        graph = self.graph
+        if self.cutter.have(node):
+            found = self.cutter.variable(node)
+            return graph.node("shift", node.type, (found,), (dy, dx, True)) if (dy, dx) != (0, 0) else found
+        if node.op in ("const", "param"):
+            return node
+        if node.op == "shift":
+            sy, sx, wraps = node.attr
+            if wraps:
+                return self.value(node.args[0], dy + sy, dx + sx)
+            assert dy == dx == 0
+            return graph.node("shift", REAL, (self.cutter.variable(node.args[0]),), node.attr)
+        assert dy == dx == 0 or node.op in _ARITHMETIC
+        args = tuple(self.value(arg, dy, dx) for arg in node.args)
+        return graph.node(node.op, node.type, args, node.attr, node.places)

@@ -1,0 +1,130 @@
+"""Floats for targets with loops: computed when somebody asks, comparisons only where another comparison holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.schedule.rewrite import Rule, map_values, with_values
+from powderdsl.schedule.types import (
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    flat,
+    load,
+    ordered,
+    rewritten,
+    values_of,
+)
+
+COMPARISONS = ("eq", "lt", "le")
+
+
+def late(schedule: Schedule) -> Schedule:
+    """Floats that substeps write are not stored: what needs them computes them, from what the pass finds and the masks.
+
+    Where a guard's masks fail, the choices in the value give the old one, so it holds outside the guard as well.
+    `if any m: v2 = select(m, a, v1); … v3 = select(n, b, v2)` → `v3 = select(n, b, select(m, a, v1))`.
+    """
+    graph = schedule.graph
+    known: dict[str, Node] = {}
+
+    def rule(node: Node) -> Node | None:
+        return known.get(node.attr) if node.op == "load" else None
+
+    def block(body: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        result: list[Statement] = []
+        for given in body:
+            statement = with_values(given, graph, rule) if known else given
+            match statement:
+                case Compute(outs):
+                    known.update({out.var.name: out.value for out in outs if out.var.type == REAL})
+                    outs = tuple(out for out in outs if out.var.type != REAL)
+                    if outs:
+                        result.append(replace(statement, outs=outs))
+                case Guard(_, inner, keeps):
+                    inner = block(inner)
+                    keeps = tuple(keep for keep in keeps if keep[0].type != REAL)
+                    if inner:
+                        result.append(replace(statement, body=inner, keeps=keeps))
+        return tuple(result)
+
+    body = block(schedule.body)
+    namer = Namer(schedule)
+    outs: dict[int, Out] = {}
+    leaves = []
+    for slot, node in schedule.leaves:
+        value = rewritten([node], graph, rule)[id(node)]
+        if value.type == REAL and value.op != "load":
+            out = outs.setdefault(id(value), Out(namer.var(REAL), value))
+            value = load(graph, out.var)
+        leaves.append((slot, value))
+    end = (Compute(tuple(outs.values())),) if outs else ()
+    return replace(schedule, body=(*body, *end), leaves=tuple(leaves))
+
+
+def led(schedule: Schedule) -> Schedule:
+    """A comparison that is only asked together with another one is computed only where that holds.
+
+    `w & (a | b)` → `w & (led(w, a) | led(w, b))`: all ways from a value to `a` lead through a conjunction with `w`.
+    """
+    roots = [node for statement in flat(schedule.body) for node in values_of(statement)]
+    comparisons = [node for node in ordered(roots) if is_comparison(node)]
+    leaders: dict[int, Node] = {}
+    leading: set[int] = set()
+    for node in comparisons:
+        for leader in comparisons:
+            free = leader is not node and id(leader) not in leaders and id(node) not in leading
+            if free and leader.args != node.args and all(_covered(root, node, leader) for root in roots):
+                leaders[id(node)] = leader
+                leading.add(id(leader))
+                break
+    return map_values(schedule, _rule(leaders, schedule.graph)) if leaders else schedule
+
+
+def _rule(leaders: dict[int, Node], graph: Graph) -> Rule:
+    def rule(node: Node) -> Node | None:
+        leader = leaders.get(id(node))
+        return graph.node("led", FLAG, (leader, node)) if leader is not None else None
+
+    return rule
+
+
+def is_comparison(node: Node) -> bool:
+    """Whether a flag compares floats."""
+    return node.op in COMPARISONS and node.args[0].type == REAL
+
+
+def of_floats(node: Node) -> bool:
+    """Whether loops over cells make a node: floats, and flags that compare them."""
+    return node.type == REAL or node.op == "led" or is_comparison(node)
+
+
+def _covered(root: Node, node: Node, leader: Node) -> bool:
+    """Whether each way from the root to the node leads through a conjunction with the leader."""
+    seen: set[int] = set()
+    stack = [root]
+    while stack:
+        top = stack.pop()
+        if id(top) in seen:
+            continue
+        seen.add(id(top))
+        if top is node:
+            return False
+        if top.op == "and":
+            parts = conjuncts(top)
+            if any(part is leader for part in parts):
+                stack.append(leader)  # the other parts are asked together with it
+                continue
+        stack.extend(top.args)
+    return True
+
+
+def conjuncts(node: Node) -> list[Node]:
+    """The parts of nested conjunctions."""
+    if node.op != "and":
+        return [node]
+    return [part for arg in node.args for part in conjuncts(arg)]

@@ -1,0 +1,196 @@
+"""Where loops over cells have nothing to do: no choice is made, and all floats that they read are zero."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.schedule.types import (
+    ANSWER,
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    load,
+    map_blocks,
+    ordered,
+    rewritten,
+)
+
+
+def narrow(schedule: Schedule) -> Schedule:
+    """Loops over cells get a region, what they give outside it, and a guard that asks for the region.
+
+    `v' = settle(m ? a : v)`, where v was settled → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
+    """
+    found = {var.name for _, var in schedule.finds}
+    namer, graph = Namer(schedule), schedule.graph
+
+    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        result: list[Statement] = []
+        for statement in block:
+            if not isinstance(statement, Compute) or statement.over != "cells":
+                result.append(statement)
+                continue
+            loop = _narrowed(statement, graph, found)
+            if loop.region is None:
+                result.append(loop)
+                continue
+            question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (_anywhere(loop.region, graph),)))
+            keeps = tuple((out.var, out.otherwise) for out in loop.outs if out.otherwise is not None)
+            result.append(Compute((question,), loop.place, "words"))
+            result.append(Guard((load(graph, question.var),), (loop,), keeps, loop.place))
+        return tuple(result)
+
+    return replace(schedule, body=map_blocks(schedule.body, change))
+
+
+def _narrowed(loop: Compute, graph: Graph, found: set[str]) -> Compute:
+    """A loop with its region, if it has one."""
+    values = [out.value for out in loop.outs]
+    kept = [unchanged(value, found) for value in values]
+    if all(kept):
+        olds = [old for old, _ in kept if old is not None]  # type: ignore[misc]
+        masks = [mask for _, chosen in kept for mask in chosen]  # type: ignore[misc]
+        region = _any_of(masks, graph)
+        return _with_region(loop, region, olds)
+    calm = _calm(values)
+    if calm is None:
+        return loop
+    numbers, masks = calm
+    if any(mask.op == "param" for mask in masks):
+        return loop
+    flags = [*masks, *(_live(field, dy, dx, graph) for field, dy, dx in _reads(values))]
+    rest = [
+        graph.node("const", out.var.type, (), bool(number) if out.var.type == FLAG else 0.0)
+        for out, number in zip(loop.outs, numbers, strict=True)
+    ]
+    return _with_region(loop, _any_of(flags, graph), rest)
+
+
+def _with_region(loop: Compute, region: Node, rest: Iterable[Node]) -> Compute:
+    outs = (replace(out, otherwise=other) for out, other in zip(loop.outs, rest, strict=True))
+    return replace(loop, outs=tuple(outs), region=region)
+
+
+def _any_of(flags: Iterable[Node], graph: Graph) -> Node:
+    result: Node | None = None
+    for flag in dict.fromkeys(flags):
+        result = flag if result is None else graph.node("or", FLAG, (result, flag))
+    return result if result is not None else graph.node("const", FLAG, (), False)
+
+
+def _live(field: Node, dy: int, reach: int, graph: Graph) -> Node:
+    return graph.node("live", FLAG, (field,), (dy, reach))
+
+
+def _anywhere(region: Node, graph: Graph) -> Node:
+    """A flag that holds somewhere if a region does: fields are asked in the cell itself."""
+
+    def rule(node: Node) -> Node | None:
+        return _live(node.args[0], 0, 0, graph) if node.op == "live" else None
+
+    return rewritten([region], graph, rule)[id(region)]
+
+
+def unchanged(value: Node, found: set[str]) -> tuple[Node, list[Node]] | None:
+    """For a clamped slot under choices: what it was, and the masks without which it still is: it was clamped then."""
+    masks = []
+    if value.op != "settle":
+        return None
+    node = value.args[0]
+    while node.op == "select":
+        masks.append(node.args[0])
+        node = node.args[2]
+    known = node.op == "load" and node.attr in found and all(mask.op != "param" for mask in masks)
+    return (node, masks) if known else None
+
+
+def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
+    """What values are where all floats are zero and no mask holds, and the masks; None if a float is not zero there,
+    or draws and parameters enter."""
+    memo: dict[int, Any] = {}
+    masks: dict[int, Node] = {}
+
+    def visit(node: Node) -> Any:
+        if id(node) in memo:
+            return memo[id(node)]
+        if node.op == "load":
+            result: Any = np.float32(0)
+        elif node.op == "led" and node.args[0].op == "load":
+            result = visit(node.args[1])
+            if result:  # then it depends on the flag
+                raise LookupError
+        elif node.op == "const":
+            result = np.float32(node.attr)
+        elif node.op == "select":
+            masks[id(node.args[0])] = node.args[0]
+            result = visit(node.args[2])
+        elif node.op in ("param", "draw"):
+            raise LookupError
+        else:
+            args = [visit(arg) for arg in node.args]
+            if node.op == "shift" and not node.attr[2] and args[0]:
+                raise LookupError
+            result = _CALM[node.op](node, *args)
+        memo[id(node)] = result
+        return result
+
+    with np.errstate(all="ignore"):
+        try:
+            found = [visit(value) for value in values]
+        except LookupError:
+            return None
+    if any(isinstance(number, np.floating) and number != 0 for number in found):
+        return None
+    return found, list(masks.values())
+
+
+_CALM: dict[str, Callable[..., Any]] = {
+    "add": lambda n, a, b: a + b,
+    "sub": lambda n, a, b: a - b,
+    "mul": lambda n, a, b: a * b,
+    "div": lambda n, a, b: np.float32(0) if b == 0 else a / b,
+    "neg": lambda n, a: -a,
+    "abs": lambda n, a: abs(a),
+    "min": lambda n, a, b: np.minimum(a, b),
+    "max": lambda n, a, b: np.maximum(a, b),
+    "sqrt": lambda n, a: np.sqrt(a),
+    "shift": lambda n, a: a,
+    "settle": lambda n, a: np.float32(min(max(a, n.attr[0]), n.attr[1])) if a == a else np.float32(0),
+    "eq": lambda n, a, b: bool(a == b),
+    "lt": lambda n, a, b: bool(a < b),
+    "le": lambda n, a, b: bool(a <= b),
+    "led": lambda n, a, b: a and b,
+}
+
+
+def _reads(values: list[Node]) -> list[tuple[Node, int, int]]:
+    """Fields that values read where no mask holds: the field, rows down, and columns at most to either side."""
+    reach: dict[tuple[int, int], int] = {}
+    fields: dict[int, Node] = {}
+    below = [(value, 0, 0) for value in values]
+    seen: set[tuple[int, int, int]] = set()
+    while below:
+        node, dy, dx = below.pop()
+        if (id(node), dy, dx) in seen:
+            continue
+        seen.add((id(node), dy, dx))
+        if node.op == "load" and node.type == REAL:
+            fields[id(node)] = node
+            reach[id(node), dy] = max(reach.get((id(node), dy), 0), abs(dx))
+        elif node.op == "shift":
+            below.append((node.args[0], dy + node.attr[0], dx + node.attr[1]))
+        elif node.op == "select":
+            below.append((node.args[2], dy, dx))
+        else:
+            below += [(arg, dy, dx) for arg in node.args]
+    order = [node for node in ordered(values) if id(node) in fields]
+    found = [(node, dy, dx) for node in order for (key, dy), dx in reach.items() if key == id(node)]
+    return sorted(found, key=lambda one: (order.index(one[0]), one[1]))

@@ -1,0 +1,366 @@
+"""Schedules -> CUDA C++: loops over words and cells, with buffers for variables. Nothing is decided here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from powderdsl.ir.ops import REAL, Node
+from powderdsl.schedule.buffers import Buffer
+from powderdsl.schedule.types import ANSWER, Compute, Guard, Out, Schedule, Statement, Sync, ordered
+from powderdsl.targets.layout import Layout, literal, param_key
+
+_LOGIC = {"and": "&", "or": "|", "xor": "^"}
+_ARITHMETIC = {"add": "+", "sub": "-", "mul": "*", "eq": "==", "lt": "<", "le": "<="}
+_CALLS = {"abs": "MAGNITUDE", "sqrt": "ROOT", "div": "divide", "min": "smaller", "max": "larger"}
+
+
+def pass_text(schedule: Schedule, layout: Layout) -> str:
+    """The statements of a pass."""
+    return "\n".join(_Printer(dict(schedule.buffers), layout).block(schedule.body))
+
+
+class _Printer:
+    def __init__(self, buffers: dict[str, Buffer], layout: Layout):
+        self.buffers, self.layout = buffers, layout
+
+    def number(self, name: str) -> int:
+        return self.buffers[name][1]
+
+    def block(self, body: Sequence[Statement]) -> Iterator[str]:
+        for statement in body:
+            match statement:
+                case Sync():
+                    yield "SYNC();"
+                case Compute() if statement.over == "words":
+                    yield from self.words(statement)
+                case Compute():
+                    yield from self.cells(statement)
+                case Guard((when,), inner, _, _, otherwise):
+                    yield f"if ({when.attr}) {{"
+                    yield from self.block(inner)
+                    if otherwise:
+                        yield "} else {"
+                        yield from self.block(otherwise)
+                    yield "}"
+                case _:
+                    raise AssertionError("no such statement on the GPU")
+
+    def words(self, loop: Compute) -> Iterator[str]:
+        answers = [out for out in loop.outs if out.var.type == ANSWER]
+        stored = [out for out in loop.outs if out.var.type != ANSWER]
+        values = _Words(self)
+        places = {out.var.name: f"P({self.number(out.var.name)})" for out in stored}
+        for out in answers:
+            yield f"bool {out.var.name} = false;"
+        if loop.held:
+            yield f"{{ u32 {', '.join(f'o_{out.var.name}[ROUNDS]' for out in stored)};"
+        stores = []
+        for out in stored:
+            value = f"{values.of(out.value)} & valid"
+            if loop.held:
+                stores.append(f"o_{out.var.name}[k] = {value};")
+            else:
+                stores.append(f"const u32 o_{out.var.name} = {value};")
+        asks = [f"{out.var.name} |= ({values.of(out.value.args[0])} & valid) != 0;" for out in answers]
+        if not loop.held:
+            stores += [f"{places[out.var.name]}[i] = o_{out.var.name};" for out in stored]
+        yield "\n".join(["FOR_WORDS(k, i) { PLACE(i);", *values.lines, *asks, *stores, "}"])
+        if loop.held:
+            yield "SYNC();"
+            back = " ".join(f"{places[out.var.name]}[i] = o_{out.var.name}[k];" for out in stored)
+            yield f"FOR_WORDS(k, i) {{ {back} }} }}"
+        for out in answers:
+            yield f"{out.var.name} = ANY({out.var.name});"
+
+    def cells(self, loop: Compute) -> Iterator[str]:
+        cells = _Cells(self, loop.outs)
+        lives = {out.var.name: f"n_{out.var.name}" for out in loop.outs}
+        stores, ends, quiet = [], [], []
+        for out in loop.outs:
+            name, number = out.var.name, self.number(out.var.name)
+            value = cells.of(out.value)
+            if out.var.type == REAL:
+                stores.append(
+                    f"{{ const float v = {value}; if (inside) F({number})[cell] = v; BALLOT({lives[name]}, inside && v != 0); }}"
+                )
+                ends.append(f"N({number})[i] = {lives[name]};")
+            else:
+                stores.append(f"BALLOT({lives[name]}, inside && {value});")
+                ends.append(f"P({number})[i] = {lives[name]};")
+                if out.otherwise is not None:
+                    quiet.append(f"P({number})[i] = {'valid' if out.otherwise.attr else '0'};")
+        yield f"FOR_BUSY_WORDS(i, [&](int i) {{ PLACE(i); {self.need(loop, quiet)} }}) {{ PLACE(i);"
+        yield "".join(f" u32 {name} = 0;" for name in lives.values())
+        yield from (f"const u32 {name} = P({number})[i];" for number, name in cells.masks.items())
+        yield from ("LANES { CELL;", *cells.lines, *stores, "}", f"ONCE {{ {' '.join(ends)} }}", "}")
+
+    def need(self, loop: Compute, quiet: list[str]) -> str:
+        """What says whether a word has work: the region, and fields that hold what is now zero."""
+        if loop.region is None:
+            return "return true;"
+        region = _Words(self)
+        busy = region.of(loop.region)
+        dirty = [
+            f" | N({self.number(out.var.name)})[i]"
+            for out in loop.outs
+            if out.var.type == REAL and out.otherwise is not None and out.otherwise.op == "const"
+        ]
+        lines = " ".join(region.lines)
+        return f"{lines} if (({busy}) != 0{''.join(dirty)}) return true; {' '.join(quiet)} return false;"
+
+
+class _Words:
+    """Values of a word of 32 columns, each as an expression or the name of a constant."""
+
+    def __init__(self, printer: _Printer):
+        self.printer, self.layout = printer, printer.layout
+        self.lines: list[str] = []
+        self.known: dict[int, str] = {}
+        self.rows: dict[int, str] = {}
+        self.count = 0
+
+    def of(self, root: Node) -> str:
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            if not ready:
+                stack.append((node, True))
+                below = node.args[:1] if node.op == "when" else () if node.op == "live" else node.args
+                stack.extend((arg, False) for arg in reversed(below))
+                continue
+            text = self.lazy(node) if node.op == "when" else self.node(node)
+            self.known[id(node)] = text if text.isidentifier() else self.name(text)
+        return self.known[id(root)]
+
+    def name(self, text: str) -> str:
+        self.count += 1
+        self.lines.append(f"const u32 t{self.count} = {text};")
+        return f"t{self.count}"
+
+    def lazy(self, node: Node) -> str:
+        """Both; the second only where the first holds in the word."""
+        self.count += 1
+        name = f"t{self.count}"
+        self.lines.append(f"u32 {name} = {self.known[id(node.args[0])]} & valid;")
+        outer, self.lines = self.lines, []
+        known, rows = dict(self.known), dict(self.rows)
+        value = self.of(node.args[1])
+        inner, self.lines = self.lines, outer
+        self.known, self.rows = known, rows
+        self.lines.append("\n".join([f"if ({name}) {{", *inner, f"{name} &= {value};", "}"]))
+        return name
+
+    def row(self, dy: int) -> str:
+        if dy not in self.rows:
+            self.count += 1
+            self.lines.append(f"const int r{self.count} = row(l, y, {dy});")
+            self.rows[dy] = f"r{self.count}"
+        return self.rows[dy]
+
+    def node(self, node: Node) -> str:
+        args = [self.known[id(arg)] for arg in node.args] if node.op != "live" else []
+        attr = node.attr
+        if node.op in _LOGIC:
+            return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
+        match node.op:
+            case "load":
+                return f"P({self.printer.number(attr)})[i]"
+            case "shift":
+                return self.shift(node)
+            case "const":
+                return "valid" if attr else "0u"
+            case "param":
+                return f"PARAM_FLAG({self.layout.param_planes[param_key(node)]})"
+            case "coordinate":
+                axis, modulus, bit = attr
+                if axis == "step":
+                    return f"STEP_FLAG({self.layout.step_planes[modulus, bit]})"
+                if axis == "row":
+                    return f"spread(y % {modulus} >> {bit} & 1)"
+                return f"COLUMNS_{self.layout.fixed[1, modulus, bit]}[w]"
+            case "inside":
+                return f"inside_word(y, w, {attr[0]}, {attr[1]})"
+            case "chance":
+                stream, bits, limit = attr
+                where = f"{args[0]} & valid" if args else "valid"
+                return f"draw_below({self.layout.streams[stream]}, l, y, w, {where}, {bits}, {limit}ull)"
+            case "below_planes":
+                return self.below_planes(node, args)
+            case "not":
+                return f"~{args[0]}"
+            case "select":
+                return f"mux({', '.join(args)})"
+            case "live":
+                number = self.printer.number(node.args[0].attr)
+                dy, reach = attr
+                return f"near(N({number}), l, y, w, {dy}, {reach})" if dy or reach else f"N({number})[i]"
+        raise AssertionError(f"no cuda kernel for {node.op}")
+
+    def shift(self, node: Node) -> str:
+        dy, dx, wraps = node.attr
+        plane = f"P({self.printer.number(node.args[0].attr)})"
+        row = self.row(dy) if dy else "(i - w)"
+        value = f"columns({plane} + {row}, w, {dx})" if dx else f"{plane}[{row} + w]"
+        return value if wraps else f"{value} & inside_word(y, w, {dy}, {dx})"
+
+    def below_planes(self, node: Node, args: list[str]) -> str:
+        stream, bits = node.attr
+        where = f"{args[bits + 1]} & valid" if len(args) > bits + 1 else "valid"
+        self.count += 1
+        name = f"limit{self.count}"
+        self.lines.append(f"const u32 {name}[] = {{{', '.join(args[: bits + 1])}}};")
+        return f"draw_below_planes({self.layout.streams[stream]}, l, y, w, {where}, {bits}, {name})"
+
+
+class _Cells:
+    """Values of one cell, which a warp computes for the 32 cells of a word; masks are tested by word."""
+
+    def __init__(self, printer: _Printer, outs: Sequence[Out]):
+        self.printer, self.layout = printer, printer.layout
+        self.lines: list[str] = []
+        self.known: dict[int, str] = {}
+        self.masks: dict[int, str] = {}
+        """Words of flags by buffer, read before the cells."""
+        self.places: dict[tuple[str, int], str] = {}
+        nodes = ordered(out.value for out in outs)
+        self.choices = [node for node in nodes if node.op == "select"]
+        self.count = 0
+
+    def fresh(self, prefix: str) -> str:
+        self.count += 1
+        return f"{prefix}{self.count}"
+
+    def name(self, text: str) -> str:
+        name = self.fresh("v")
+        self.lines.append(f"const float {name} = {text};")
+        return name
+
+    def of(self, root: Node) -> str:
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            if node.op == "select":
+                self.choice(node)
+            elif node.op == "led":
+                self.known[id(node)] = self.led(node)
+            elif ready or not node.args or node.op == "shift":
+                self.known[id(node)] = self.node(node)
+            else:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(node.args))
+        return self.known[id(root)]
+
+    def nested(self, root: Node, known: dict[int, str]) -> tuple[list[str], str]:
+        """Statements of a block, and the value that it computes."""
+        outer, self.lines = self.lines, []
+        before, places = self.known, dict(self.places)
+        self.known = known
+        value = self.of(root)
+        inner, self.lines = self.lines, outer
+        self.known, self.places = before, places
+        return inner, value
+
+    def node(self, node: Node) -> str:
+        attr = node.attr
+        match node.op:
+            case "const":
+                return literal(float(attr))
+            case "load" if node.type == REAL:
+                return self.name(f"F({self.printer.number(attr)})[cell]")
+            case "param":
+                return self.name(f"PARAM_REAL({self.layout.param_reals[attr[0]]})")
+            case "draw":
+                stream, bits = attr
+                return self.name(f"draw_cell({self.layout.streams[stream]}, l, y, x, {bits})")
+            case "shift":
+                return self.name(self.shift(node))
+        args = [self.known[id(arg)] for arg in node.args]
+        if node.op in ("eq", "lt", "le"):
+            name = self.fresh("b")
+            self.lines.append(f"const bool {name} = {args[0]} {_ARITHMETIC[node.op]} {args[1]};")
+            return name
+        if node.op in _ARITHMETIC:
+            return self.name(f"{args[0]} {_ARITHMETIC[node.op]} {args[1]}")
+        if node.op in _CALLS:
+            return self.name(f"{_CALLS[node.op]}({', '.join(args)})")
+        if node.op == "neg":
+            return self.name(f"-{args[0]}" if args[0][0] != "-" else f"-({args[0]})")
+        if node.op == "settle":
+            lo, hi = attr
+            return self.name(f"settle({args[0]}, {literal(lo)}, {literal(hi)})")
+        raise AssertionError(f"no cuda kernel for {node.op}")
+
+    def shift(self, node: Node) -> str:
+        dy, dx, wraps = node.attr
+        row, column = self.place("row", dy), self.place("column", dx)
+        value = f"F({self.printer.number(node.args[0].attr)})[{row} + {column}]"
+        if wraps:
+            return value
+        within = f"y + {dy} >= 0 && y + {dy} < HEIGHT && x + {dx} >= 0 && x + {dx} < WIDTH"
+        return f"{within} ? {value} : 0.0f"
+
+    def place(self, axis: str, by: int) -> str:
+        """The row's first cell or the column at a neighbor."""
+        if (axis, by) not in self.places:
+            self.places[axis, by] = name = self.fresh("a")
+            what = f"row(l, y, {by}) / ROW_WORDS * WIDTH" if axis == "row" else f"around(x, {by}, WIDTH)"
+            self.lines.append(f"const int {name} = {what};")
+        return self.places[axis, by]
+
+    def mask(self, node: Node) -> str:
+        """The word of a flag."""
+        if node.op == "param":
+            return f"PARAM_FLAG({self.layout.param_planes[param_key(node)]})"
+        return self.masks.setdefault(self.printer.number(node.attr), f"m{len(self.masks)}")
+
+    def led(self, node: Node) -> str:
+        """A comparison, computed only where another one holds."""
+        leader, comparison = node.args
+        first = f"BIT({self.mask(leader)})" if leader.op == "load" else self.of(leader)
+        lines, value = self.nested(comparison, dict(self.known))
+        name = self.fresh("b")
+        self.lines.append(
+            "\n".join([f"bool {name} = false; if ({first}) {{", *lines, f"{name} = {value}; }}"])
+        )
+        return name
+
+    def chain(self, node: Node) -> list[Node]:
+        """A choice and those below it in its third argument, the outermost first."""
+        chain: list[Node] = []
+        while node.op == "select" and id(node) not in self.known:
+            chain.append(node)
+            node = node.args[2]
+        return chain
+
+    def choice(self, node: Node) -> None:
+        """Choices laid over each other. Where no cell of the word is chosen, nothing of a choice is computed."""
+        chain = self.chain(node)
+        masks = [choice.args[0] for choice in chain]
+        # Parts of a vector depend on the same masks: they are tested once for both.
+        alike = [
+            self.chain(other) for other in self.choices if other is not node and id(other) not in self.known
+        ]
+        chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
+        names = []
+        for one in chains:
+            base = self.of(one[-1].args[2])
+            names.append(self.fresh("v"))
+            self.lines.append(f"float {names[-1]} = {base};")
+        for level in reversed(range(len(chain))):
+            running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
+            known = self.known | running  # only here: the names' values change
+            mask = self.mask(masks[level])
+            lines, blends = [], []
+            outer, self.lines = self.lines, lines
+            before, places = self.known, dict(self.places)
+            self.known = known
+            for one, name in zip(chains, names, strict=True):
+                blends.append(f"if (BIT({mask})) {name} = {self.of(one[level].args[1])};")
+            self.lines, self.known, self.places = outer, before, places
+            self.lines.append("\n".join([f"if ({mask}) {{", *lines, *blends, "}"]))
+        for one, name in zip(chains, names, strict=True):
+            self.known[id(one[0])] = name
