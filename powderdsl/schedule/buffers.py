@@ -125,7 +125,7 @@ class _Plan:
                 self.ends[var.name] = position
                 if value.op == "load":
                     self.follow(var.name, value.attr, position)
-                    self.last[value.attr] = max(self.last.get(value.attr, -1), position)
+                    self.last[var.name] = max(self.last.get(var.name, -1), position)
 
     def follow(self, name: str, old: str, position: int) -> None:
         self.follows[name], self.ends[name] = old, position

@@ -55,7 +55,8 @@ def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
     def stage(schedule: Schedule) -> Schedule:
         cutter = _Cutter(schedule, costs)
         body = cutter.block(schedule.body, top=True)
-        return replace(schedule, body=tuple(body))
+        leaves = tuple((slot, cutter.renamed(node)) for slot, node in schedule.leaves)
+        return replace(schedule, body=tuple(body), leaves=leaves)
 
     return stage
 
@@ -154,17 +155,29 @@ class _Cutter:
         """Floats that neighbors will be asked for."""
         led = [node for node in nodes if node.op == "led"]
         self.led = {id(node.args[1]): node for node in led}
+        self.same: dict[str, Node] = {}
+        """Loads of variables that have the same value as others, by the others' names."""
 
     def have(self, node: Node) -> bool:
         return node.op == "load" or id(node) in self.known
 
     def variable(self, node: Node) -> Node:
         """The load of a node that is stored."""
-        return node if node.op == "load" else load(self.graph, self.known[id(node)])
+        found = node if node.op == "load" else load(self.graph, self.known[id(node)])
+        return self.same.get(found.attr, found)
+
+    def renamed(self, node: Node) -> Node:
+        return self.variable(node) if node.op == "load" else node
+
+    def kept(self, guard: Guard) -> tuple[tuple[Var, Node], ...]:
+        return tuple((var, self.renamed(value)) for var, value in guard.keeps)
 
     # Statements
 
-    def block(self, body: Sequence[Statement], *, top: bool = False) -> list[Statement]:
+    def block(
+        self, body: Sequence[Statement], kept: frozenset[str] = frozenset(), *, top: bool = False
+    ) -> list[Statement]:
+        """`kept`: variables that a guard around the block keeps."""
         outer, self.statements = self.statements, []
         known = dict(self.known)
         for i, statement in enumerate(body):
@@ -176,7 +189,7 @@ class _Cutter:
                             self.hoist_comparisons([out.value for out in outs], place)
                         self.guarded(statement, guard)
                     else:
-                        self.compute(outs, place)
+                        self.compute(outs, place, kept)
                 case Guard() if not (i and isinstance(body[i - 1], Compute)):
                     self.ask([], statement)
                 case Guard():
@@ -187,13 +200,17 @@ class _Cutter:
         self.known = known if not top else self.known
         return found
 
-    def compute(self, outs: Iterable[Out], place: str) -> None:
+    def compute(self, outs: Iterable[Out], place: str, kept: frozenset[str] = frozenset()) -> None:
         """Store values under the names of their variables."""
         named = {id(out.value): out.var for out in reversed(list(outs)) if not self.have(out.value)}
         self.ensure([out.value for out in outs], place, named)
         for out in outs:
-            if named.get(id(out.value)) is not out.var:  # stored under another name
-                self.words([(out.var, out.value)], place)
+            if named.get(id(out.value)) is out.var:
+                continue
+            if out.var.name in kept:
+                self.statements.append(Compute((Out(out.var, self.variable(out.value)),), place, "words"))
+            else:  # stored under another name
+                self.same[out.var.name] = self.variable(out.value)
 
     def hoist_comparisons(self, masks: list[Node], place: str) -> None:
         """Comparisons that masks ask for, outside any guard, with all others that can be had in one loop."""
@@ -214,6 +231,8 @@ class _Cutter:
     def guarded(self, masks: Compute, guard: Guard) -> None:
         """Masks and the guard that asks for them: first what is cheap, and the rest only where that leaves something."""
         graph, place = self.graph, masks.place
+        self.same |= {out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)}
+        masks = replace(masks, outs=tuple(out for out in masks.outs if out.var.name not in self.same))
         split = {out.var.name: self.split(out.value) for out in masks.outs}
         needs = [need for out in masks.outs for need in self.needs(out.value)]
         asked = {node.attr for node in guard.when if node.op == "load"}
@@ -235,7 +254,7 @@ class _Cutter:
         inner, self.statements = self.statements, outer
         self.known = known
         nothing = graph.node("const", FLAG, (), False)
-        kept = (*((out.var, nothing) for out in mine), *guard.keeps)
+        kept = (*((out.var, nothing) for out in mine), *self.kept(guard))
         self.statements.append(Compute((self.answer(first),), place, "words"))
         when = (load(graph, self.statements[-1].outs[0].var),)  # type: ignore[union-attr]
         self.statements.append(Guard(when, tuple(inner), kept, guard.place))
@@ -248,8 +267,9 @@ class _Cutter:
         words = tuple(Out(out.var, self.word(out.value)) for out in masks)
         question = self.answer(asked)
         self.statements.append(Compute((*words, question), guard.place, "words"))
-        body = tuple(self.block(guard.body))
-        self.statements.append(Guard((load(self.graph, question.var),), body, guard.keeps, guard.place))
+        body = tuple(self.block(guard.body, frozenset(var.name for var, _ in guard.keeps)))
+        when = (load(self.graph, question.var),)
+        self.statements.append(Guard(when, body, self.kept(guard), guard.place))
 
     def answer(self, flags: Sequence[Node]) -> Out:
         """Whether one of some flags holds in any cell."""
@@ -416,8 +436,8 @@ class _Cutter:
             if node.op in ("swap", "arrive"):
                 content, movers, rest = node.args
                 sy, sx = node.attr
-                moved = (value(movers, -sy, -sx), value(content, -sy, -sx), value(rest))
-                found = graph.node("select", FLAG, moved)
+                arriving = (value(movers, -sy, -sx), value(content, -sy, -sx), value(rest))
+                found = graph.node("select", FLAG, arriving)
                 if node.op == "swap":
                     found = graph.node("select", FLAG, (value(movers), value(content, sy, sx), found))
                 return found

@@ -121,9 +121,9 @@ def _with_conditions(statement: Compute, graph: Graph) -> Compute:
     done: dict[int, Node] = {}
     for node in sorted(nodes, key=lambda node: random[id(node)]):  # conditions take no draws
         args = [done[id(arg)] for arg in node.args]
-        flags = [done[id(flag)] for flag in where.get(id(node), {}).values()]
-        if node.op in DRAWS and takes_bits(node) and flags:
-            args.append(all_of(flags, graph))
+        asked = [done[id(flag)] for flag in where.get(id(node), {}).values()]
+        if node.op in DRAWS and takes_bits(node) and asked:
+            args.append(all_of(asked, graph))
         same = len(args) == len(node.args) and all(a is b for a, b in zip(args, node.args, strict=True))
         done[id(node)] = node if same else graph.node(node.op, node.type, tuple(args), node.attr, node.places)
     return replace(statement, outs=tuple(replace(out, value=done[id(out.value)]) for out in statement.outs))

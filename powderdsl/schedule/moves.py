@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, Node
+from powderdsl.ir.ops import FLAG, Node, Offset
 from powderdsl.schedule.types import (
     Carried,
     Compute,
@@ -81,9 +81,9 @@ def _moved(statement: Compute, schedule: Schedule, namer: Namer) -> list[Stateme
         store(arg for node in group for arg in node.args[:2])
         carried = []
         for node in group:
-            content, movers, rest = node.args
+            content, _, stays = node.args
             old = value(content)
-            leaves = old if rest is content else value(rest)
+            leaves = old if stays is content else value(stays)
             var = own.get(id(node)) or namer.var(FLAG)
             carried.append((node, Carried(var, old, leaves)))
         result.append(
@@ -114,7 +114,7 @@ def _groups(nodes: list[Node], movements: list[Node]) -> list[list[Node]]:
     """Movements that can be done together, each group after what it needs."""
     wanted = set(map(id, movements))
     depth: dict[int, int] = {}
-    groups: dict[tuple[object, ...], list[Node]] = {}
+    groups: dict[tuple[int, str, int, Offset], list[Node]] = {}
     for node in nodes:
         below = max((depth[id(arg)] for arg in node.args), default=0)
         depth[id(node)] = below + (id(node) in wanted)

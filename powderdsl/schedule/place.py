@@ -102,8 +102,8 @@ class _Placing:
             for statement in body
             if isinstance(statement, Compute)
             for out in statement.outs
-            if out.into in outside
-        } - {None}
+            if out.into is not None and out.into in outside
+        }
         olds = [value.attr for _, value in guard.keeps if value.op == "load"]
         for var, value in guard.keeps:
             alone = value.op == "load" and value.attr in before and value.attr not in after
@@ -114,7 +114,7 @@ class _Placing:
             if value.op == "load":  # then it may be the old one
                 self.views.setdefault(var.name, set()).update(self.views.get(str(value.attr), ()))
         self.own -= set(olds) - kept
-        return replace(guard, body=body), {name for name in taken if name is not None}
+        return replace(guard, body=body), taken
 
     def operation(self, out: Out, after: set[str]) -> Out:
         """One operation, in the array of an argument that is read for the last time, if there is one."""

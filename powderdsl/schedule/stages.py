@@ -51,6 +51,7 @@ ARRAYS = (
 
 
 CUDA = (
+    Stage("thresholds", thresholds, "draws below a parameter"),
     Stage("late", late, "floats where they are asked for"),
     Stage("led", led, "comparisons under others"),
     Stage("conditions", conditions, "where each draw matters"),

@@ -187,7 +187,12 @@ class _Words:
                 where = f"{args[0]} & valid" if args else "valid"
                 return f"draw_below({self.layout.streams[stream]}, l, y, w, {where}, {bits}, {limit}ull)"
             case "below_planes":
-                return self.below_planes(node, args)
+                bits = attr[1]
+                return self.below(node, args[: bits + 1], args[bits + 1 :])
+            case "below_param":
+                _, bits, name, view = attr
+                numbers = [self.layout.param_planes[name, view, i] for i in range(bits, -1, -1)]
+                return self.below(node, [f"PARAM_FLAG({number})" for number in numbers], args)
             case "not":
                 return f"~{args[0]}"
             case "select":
@@ -205,13 +210,14 @@ class _Words:
         value = f"columns({plane} + {row}, w, {dx})" if dx else f"{plane}[{row} + w]"
         return value if wraps else f"{value} & inside_word(y, w, {dy}, {dx})"
 
-    def below_planes(self, node: Node, args: list[str]) -> str:
-        stream, bits = node.attr
-        where = f"{args[bits + 1]} & valid" if len(args) > bits + 1 else "valid"
+    def below(self, node: Node, limit: list[str], where: list[str]) -> str:
+        """A draw below a limit, given plane by plane from the highest."""
+        stream, bits = node.attr[:2]
+        wanted = f"{where[0]} & valid" if where else "valid"
         self.count += 1
         name = f"limit{self.count}"
-        self.lines.append(f"const u32 {name}[] = {{{', '.join(args[: bits + 1])}}};")
-        return f"draw_below_planes({self.layout.streams[stream]}, l, y, w, {where}, {bits}, {name})"
+        self.lines.append(f"const u32 {name}[] = {{{', '.join(limit)}}};")
+        return f"draw_below_planes({self.layout.streams[stream]}, l, y, w, {wanted}, {bits}, {name})"
 
 
 class _Cells:
@@ -354,7 +360,8 @@ class _Cells:
             running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
             known = self.known | running  # only here: the names' values change
             mask = self.mask(masks[level])
-            lines, blends = [], []
+            lines: list[str] = []
+            blends: list[str] = []
             outer, self.lines = self.lines, lines
             before, places = self.known, dict(self.places)
             self.known = known
