@@ -15,6 +15,7 @@ from powderdsl.schedule.floats import conjuncts, is_comparison, of_floats
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
+    Forget,
     Guard,
     Namer,
     Out,
@@ -53,7 +54,7 @@ def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
     """
 
     def stage(schedule: Schedule) -> Schedule:
-        cutter = _Cutter(schedule, costs)
+        cutter = Cutter(schedule, costs)
         body = cutter.block(schedule.body, top=True)
         leaves = tuple((slot, cutter.renamed(node)) for slot, node in schedule.leaves)
         return replace(schedule, body=tuple(body), leaves=leaves)
@@ -131,7 +132,9 @@ def stored_parts(source: Node, have: Have, most: int) -> list[Node]:
 # Loops
 
 
-class _Cutter:
+class Cutter:
+    """Loops for targets where a question costs a barrier, and everything is computed word by word."""
+
     def __init__(self, schedule: Schedule, costs: Costs):
         self.namer, self.graph, self.costs = Namer(schedule), schedule.graph, costs
         self.known: dict[int, Var] = {}
@@ -194,6 +197,8 @@ class _Cutter:
                     self.ask([], statement)
                 case Guard():
                     pass  # with the masks before it
+                case Forget():
+                    self.statements.append(statement)
                 case _:
                     raise AssertionError("movements and buffers come after loops")
         found, self.statements = self.statements, outer
@@ -449,7 +454,7 @@ class _Cutter:
 class _Cells:
     """Values of one loop over cells: floats at neighbors are read from variables, or computed again."""
 
-    def __init__(self, cutter: _Cutter):
+    def __init__(self, cutter: Cutter):
         self.cutter, self.graph = cutter, cutter.graph
         self.memo: dict[tuple[int, int, int], Node] = {}
 

@@ -25,21 +25,34 @@ from powderdsl.schedule.types import (
 
 
 def narrow(schedule: Schedule) -> Schedule:
-    """Loops over cells get a region, what they give outside it, and a guard that asks for the region.
+    """Loops over cells get a region, and what they give outside it.
 
     `v' = settle(m ? a : v)`, where v was settled → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
     """
     found = {var.name for _, var in schedule.finds}
+
+    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        return tuple(
+            _narrowed(statement, schedule.graph, found)
+            if isinstance(statement, Compute) and statement.over in ("cells", "choices")
+            else statement
+            for statement in block
+        )
+
+    return replace(schedule, body=map_blocks(schedule.body, change))
+
+
+def ask_regions(schedule: Schedule) -> Schedule:
+    """Loops over regions stand in guards that ask whether the region holds anywhere.
+
+    `loop over m: x = …, else 0` → `if any m: loop over m: x = …, else x = 0`.
+    """
     namer, graph = Namer(schedule), schedule.graph
 
     def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
         result: list[Statement] = []
-        for statement in block:
-            if not isinstance(statement, Compute) or statement.over != "cells":
-                result.append(statement)
-                continue
-            loop = _narrowed(statement, graph, found)
-            if loop.region is None:
+        for loop in block:
+            if not isinstance(loop, Compute) or loop.region is None:
                 result.append(loop)
                 continue
             question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (_anywhere(loop.region, graph),)))

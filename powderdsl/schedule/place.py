@@ -6,18 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from powderdsl.ir.ops import REAL
-from powderdsl.schedule.types import (
-    BLOCK,
-    Compute,
-    Guard,
-    Out,
-    Release,
-    Schedule,
-    Statement,
-    defined_by,
-    loaded,
-    values_of,
-)
+from powderdsl.schedule.release import live_before, made_in, reads
+from powderdsl.schedule.types import BLOCK, Compute, Guard, Out, Release, Schedule, Statement, loaded
 
 _OVER = {
     "add": (0, 1), "mul": (0, 1), "sub": (0,), "settle": (0,),
@@ -69,7 +59,7 @@ class _Placing:
         live = set(live_end)
         for statement in reversed(body):
             lives.append(live)
-            live = _live_before(statement, live)
+            live = live_before(statement, live)
         result: list[Statement] = []
         for statement, after in zip(body, reversed(lives), strict=True):
             match statement:
@@ -80,7 +70,7 @@ class _Placing:
                 case Guard():
                     guard, taken = self.guard(statement, after)
                     result.append(guard)
-                    gone = _reads(statement) - after - taken - _defined_in(statement.body)
+                    gone = reads(statement) - after - taken - made_in(statement.body)
                     gone |= {var.name for var, _ in statement.keeps} - after
                 case _:
                     raise AssertionError("only single operations have places")
@@ -92,7 +82,7 @@ class _Placing:
         """A guard, and the variables from outside whose arrays its body takes over."""
         before = set(self.own)
         kept = {var.name for var, _ in guard.keeps}
-        outside = _reads(guard) - _defined_in(guard.body)
+        outside = reads(guard) - made_in(guard.body)
         # What dies in the body is released after the guard, so that both ways leave the same behind.
         body = self.block(guard.body, after | kept)
         body = tuple(_without(statement, outside) for statement in body)
@@ -144,28 +134,6 @@ class _Placing:
         """Whether an array may be overwritten by an operation on it."""
         seen = self.views.get(name, set()) & (after | set(args))
         return name in self.own and name not in after and not seen
-
-
-def _live_before(statement: Statement, after: set[str]) -> set[str]:
-    live = after - {var.name for var in defined_by(statement)}
-    return live | (_reads(statement) - _defined_in([statement]))
-
-
-def _reads(statement: Statement) -> set[str]:
-    """Variables that a statement reads, with what is in it."""
-    found = set(loaded(values_of(statement)))
-    if isinstance(statement, Guard):
-        for inner in statement.body:
-            found |= _reads(inner)
-    return found
-
-
-def _defined_in(body: Sequence[Statement]) -> set[str]:
-    found = {var.name for statement in body for var in defined_by(statement)}
-    for statement in body:
-        if isinstance(statement, Guard):
-            found |= _defined_in(statement.body)
-    return found
 
 
 def _without(statement: Statement, names: set[str]) -> Statement:

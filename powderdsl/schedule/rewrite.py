@@ -49,7 +49,8 @@ def with_values(statement: Statement, graph: Graph, rule: Rule) -> Statement:
                 for out in outs
             )
             region = None if statement.region is None else new[id(statement.region)]
-            return replace(statement, outs=tuple(changed), region=region)
+            when = None if statement.when is None else new[id(statement.when)]
+            return replace(statement, outs=tuple(changed), region=region, when=when)
         case Move(_, _, movers, planes):
             moved = (replace(p, old=new[id(p.old)], leaves=new[id(p.leaves)]) for p in planes)
             return replace(statement, movers=new[id(movers)], planes=tuple(moved))

@@ -10,13 +10,18 @@ from powderdsl.schedule.blocks import blocks
 from powderdsl.schedule.calm import calm_pass
 from powderdsl.schedule.choices import choices
 from powderdsl.schedule.cut import Costs, cut
+from powderdsl.schedule.cut_rows import cut_rows
 from powderdsl.schedule.draws import cheap_questions, conditions, thresholds
+from powderdsl.schedule.empty import empty
 from powderdsl.schedule.flatten import flatten
 from powderdsl.schedule.floats import late, led
+from powderdsl.schedule.join import join
 from powderdsl.schedule.lower import lower
 from powderdsl.schedule.moves import moves
-from powderdsl.schedule.narrow import narrow
+from powderdsl.schedule.narrow import ask_regions, narrow
 from powderdsl.schedule.place import place
+from powderdsl.schedule.presence import presence
+from powderdsl.schedule.release import release
 from powderdsl.schedule.rewrite import without_unread
 from powderdsl.schedule.share import share
 from powderdsl.schedule.types import Schedule
@@ -58,8 +63,25 @@ CUDA = (
     Stage("cut", cut(Costs(gates=24, floats=2)), "loops; a barrier costs about as much as 24 gates"),
     Stage("unread", without_unread, "floats that were stored for neighbors who then did not ask"),
     Stage("narrow", narrow, "loops over cells where something happens"),
+    Stage("regions", ask_regions, "not even looked for where it happens nowhere"),
 )
 """For blocks of threads that share some worlds."""
+
+
+CPP = (
+    Stage("thresholds", thresholds, "draws below a parameter"),
+    Stage("late", late, "floats where they are asked for"),
+    Stage("led", led, "comparisons under others"),
+    Stage("conditions", conditions, "where each draw matters"),
+    Stage("presence", presence, "which elements are asked for; before `cut`, which takes masks apart"),
+    Stage("cut", cut_rows(Costs(gates=6, floats=2)), "loops over rows, and movements in place"),
+    Stage("unread", without_unread, "floats that were stored for neighbors who then did not ask"),
+    Stage("empty", empty, "loops over words that find nothing"),
+    Stage("narrow", narrow, "loops over cells where something happens"),
+    Stage("join", join, "loops over cells that follow each other; they must know what they read"),
+    Stage("release", release, "what is not needed any more, after everything that reads it has its place"),
+)
+"""For a thread that works on eight worlds side by side, plane by plane."""
 
 
 def plan(pass_: PassGraph, stages: tuple[Stage, ...]) -> Schedule:

@@ -48,14 +48,16 @@ class Out:
 class Compute:
     """Values of cells, all from what stood in variables before. `place` is the rule: ``rules/acme.yaml:12``.
 
-    `over` says how it loops, once `cut` has decided: over words of flags, or over cells for floats. Where `region`
-    holds nowhere in a word, nothing is computed there.
+    `over` says how it loops, once `cut` has decided: over words of flags, over cells for floats, or over choices that
+    are laid over floats one after the other. Where `region` holds nowhere in a word or row, nothing is computed there.
     """
 
     outs: tuple[Out, ...]
     place: str = ""
-    over: Literal["", "words", "cells"] = ""
+    over: Literal["", "words", "cells", "choices"] = ""
     region: Node | None = None
+    when: Node | None = None
+    """An answer: if it is no, all variables are their `otherwise` (constants) everywhere."""
     held: bool = False
     """Whether all is computed before anything is stored: it writes what it reads at neighbors (set by `buffers`)."""
 
@@ -70,6 +72,8 @@ class Carried:
     new: Var
     old: Node
     leaves: Node
+    into: bool = False
+    """Whether the old plane is not needed any more, so that the new one takes its place (set by `release`)."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +110,29 @@ class Release:
 
 
 @dataclass(frozen=True)
+class Sweeps:
+    """Loops over cells that follow each other as one loop over worlds: what one world needs stays near.
+
+    `parts` says which may go together row by row: a loop that reads other rows of an earlier one is in a later part.
+    `passing` are fields that only these loops read: they need room for one world.
+    """
+
+    loops: tuple[Compute, ...]
+    parts: tuple[int, ...]
+    passing: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Forget:
+    """From here on any element may be there, whatever was known (`presence`)."""
+
+
+@dataclass(frozen=True)
 class Sync:
     """All threads have done what stands before this."""
 
 
-Statement = Compute | Move | Guard | Release | Sync
+Statement = Compute | Move | Guard | Release | Sweeps | Forget | Sync
 
 
 @dataclass(frozen=True)
@@ -123,6 +145,8 @@ class Schedule:
     leaves: tuple[tuple[str, Node], ...]
     graph: Graph = field(compare=False, repr=False)
     """Interns the values, so that equal ones are one object in all stages."""
+    when: Node | None = None
+    """An answer: if it is no, the pass changes nothing."""
     buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
     """For each variable the kind and number of its buffer, where buffers are numbered."""
     calm: Schedule | None = None
@@ -180,8 +204,10 @@ def values_of(statement: Statement) -> Iterator[Node]:
         case Compute(outs):
             yield from (out.value for out in outs)
             yield from (out.otherwise for out in outs if out.otherwise is not None)
-            if statement.region is not None:
-                yield statement.region
+            yield from (node for node in (statement.region, statement.when) if node is not None)
+        case Sweeps(loops):
+            for loop in loops:
+                yield from values_of(loop)
         case Move(_, _, movers, planes):
             yield movers
             for plane in planes:
@@ -196,6 +222,9 @@ def defined_by(statement: Statement) -> Iterator[Var]:
     match statement:
         case Compute(outs):
             yield from (out.var for out in outs)
+        case Sweeps(loops):
+            for loop in loops:
+                yield from defined_by(loop)
         case Move(_, _, _, planes):
             yield from (plane.new for plane in planes)
         case Guard(_, _, keeps):
@@ -246,6 +275,6 @@ class Namer:
 
 __all__ = [
     "ANSWER", "BLOCK", "CELLS", "FLAG", "PLACES", "REAL",
-    "Carried", "Compute", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sync", "Var",
+    "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
     "defined_by", "flat", "load", "loaded", "map_blocks", "ordered", "rewritten", "values_of", "variables",
 ]  # fmt: skip

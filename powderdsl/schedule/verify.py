@@ -17,6 +17,7 @@ from powderdsl.schedule.types import (
     Release,
     Schedule,
     Statement,
+    Sweeps,
     Var,
     defined_by,
     ordered,
@@ -50,8 +51,9 @@ class _Checker:
         """The variables that are there after a block."""
         live = set(live)
         for statement in body:
-            for node in values_of(statement):
-                self.value(node, live)
+            if not isinstance(statement, Sweeps):
+                for node in values_of(statement):
+                    self.value(node, live)
             match statement:
                 case Guard(when, inner, keeps, _, otherwise):
                     _demand(
@@ -74,7 +76,11 @@ class _Checker:
                         if out.into is not None:
                             _demand(out.into in live, f"{out.into} is overwritten, but not there")
                             live.discard(out.into)
+                case Sweeps(loops):
+                    live = self.block(loops, live)
+                    continue
                 case Move(op, _, movers, planes):
+                    live -= {plane.old.attr for plane in planes if plane.into}
                     _demand(op in ("swap", "arrive"), f"a movement by {op}")
                     _demand(all(n.type == FLAG for p in planes for n in (p.old, p.leaves)), "only flags move")
                     _demand(movers.type == FLAG, "movers are flags")
@@ -101,7 +107,7 @@ class _Checker:
 
 SCHEDULE_OPS = frozenset({
     "stack", "member", "swap_onto", "leave", "cells", "choose", "places", "moved", "update", "carry", "copy",
-    "below_param", "any", "when", "led", "live",
+    "below_param", "any", "when", "led", "live", "present",
 })  # fmt: skip
 """Operations that only schedules have: `stack` planes → block; `member` (block) → a plane; `swap` (block, movers) and
 `leave` (block, movers) → block; `arrive` and `swap_onto` (block, movers, rest) → block; `cells` (flag) → bool cells;

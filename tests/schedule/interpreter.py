@@ -14,6 +14,7 @@ import numpy as np
 
 from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph
 from powderdsl.schedule.types import (
+    ANSWER,
     Compute,
     Guard,
     Move,
@@ -21,6 +22,7 @@ from powderdsl.schedule.types import (
     Release,
     Schedule,
     Statement,
+    Sweeps,
     Var,
     defined_by,
     ordered,
@@ -87,6 +89,8 @@ class _State:
                         moved = np.where(targets, _shift(old, -dy, -dx, True), leaves)
                         if op == "swap":
                             moved = np.where(m, _shift(old, dy, dx, True), moved)
+                        if plane.into:
+                            del self.held[plane.old.attr]
                         self.set(plane.new, moved)
                 case Guard(when, inner, keeps, _, otherwise):
                     before = dict(self.held)
@@ -117,6 +121,8 @@ class _State:
                     self.held = {name: value for name, value in before.items() if name not in gone}
                     for var, _ in keeps:
                         self.set(var, kept[var.name])
+                case Sweeps(loops):
+                    self.block(loops)
                 case Release(names):
                     for name in names:
                         del self.held[name]
@@ -127,6 +133,13 @@ class _State:
 
     def inside(self, statement: Compute, out: Out, value: Array) -> Array:
         """What a variable gets: outside the region something else, which must be the same."""
+        if statement.when is not None and not bool(self.values([statement.when])[0]):
+            (value,) = (
+                self.values([out.otherwise])
+                if out.otherwise is not None
+                else (np.zeros(self.world.shape, bool),)
+            )
+            return value
         if statement.region is None or out.otherwise is None:
             return value
         region, rest = self.values([statement.region, out.otherwise])
@@ -238,6 +251,11 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             dy, reach = attr
             near = [_shift(args[0] != 0, dy, dx, True) for dx in range(-reach, reach + 1)]
             return np.logical_or.reduce(near)
+        case "present":
+            ids = sum(array.astype(np.int64) << i for i, array in _elements(world))
+            return any(attr >> int(number) & 1 for number in np.unique(ids))
+        case "and" | "or" if node.type == ANSWER:
+            return (args[0] and args[1]) if node.op == "and" else (args[0] or args[1])
         case "any":
             return bool(np.any(args[0]))
         case "swap" | "arrive" | "swap_onto" | "leave" | "stack" | "member":
@@ -257,6 +275,11 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
                 target, _CHANGES[change](no, _shift(np.broadcast_to(other, no.shape), dy, dx, True)), no
             )
     return _SIMPLE[node.op](*args)
+
+
+def _elements(world: World) -> list[tuple[int, Array]]:
+    slots = ((name.partition(":"), array) for name, array in world.slots.items())
+    return [(int(bit), array) for (name, _, bit), array in slots if name == "element"]
 
 
 def _block(node: Node, args: list[Array]) -> Array:

@@ -14,7 +14,7 @@ from powderdsl.ir.ops import PassGraph, Program
 from powderdsl.ir.segments import segments
 from powderdsl.schedule.barriers import Pending, barriers
 from powderdsl.schedule.buffers import Pool, buffers
-from powderdsl.schedule.stages import ARRAYS, CUDA, Stage, steps
+from powderdsl.schedule.stages import ARRAYS, CPP, CUDA, Stage, steps
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.verify import verify
 from tests.schedule.interpreter import World, run_graph, run_schedule
@@ -72,7 +72,7 @@ RULES = (
 )
 
 
-@pytest.mark.parametrize("stages", [ARRAYS, CUDA], ids=["arrays", "cuda"])
+@pytest.mark.parametrize("stages", [ARRAYS, CUDA, CPP], ids=["arrays", "cuda", "cpp"])
 @pytest.mark.parametrize("rules", RULES)
 def test_every_stage(rules: str, stages: tuple[Stage, ...]) -> None:
     for program, pass_ in packed_passes(rules):

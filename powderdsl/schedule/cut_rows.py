@@ -1,0 +1,409 @@
+"""Loops for targets that run over whole planes, row by row, and keep whether a plane is empty: questions cost nothing.
+
+Movements are operations on whole planes, in place where a substep only carries planes along. Long chains of choices
+are laid over a field one after the other.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from powderdsl.ir.ops import FLAG, REAL, Node, walk
+from powderdsl.schedule.cut import UNIFORM, Costs, Cutter, Have, is_constant, stored_parts
+from powderdsl.schedule.draws import DRAWS, all_of
+from powderdsl.schedule.floats import is_comparison, of_floats
+from powderdsl.schedule.moves import is_movement
+from powderdsl.schedule.types import (
+    Carried,
+    Compute,
+    Forget,
+    Guard,
+    Move,
+    Out,
+    Schedule,
+    Statement,
+    Var,
+    load,
+)
+
+FEWEST = 3
+"""Choices from which a field of their own pays."""
+
+
+def cut_rows(costs: Costs) -> Callable[[Schedule], Schedule]:
+    """The stage for a target, see `cut`."""
+
+    def stage(schedule: Schedule) -> Schedule:
+        cutter = _RowCutter(schedule, costs)
+        body = cutter.block(schedule.body, top=True)
+        leaves = tuple((slot, cutter.renamed(node)) for slot, node in schedule.leaves)
+        return replace(schedule, body=tuple(body), leaves=leaves)
+
+    return stage
+
+
+def gate_cost(node: Node, have: Have, limit: int = 1000) -> int:
+    """Gates that computing a flag in another row takes; `limit` if it cannot be done there."""
+    if have(node) or node.op in UNIFORM:
+        return (
+            0
+            if have(node) or is_constant(node) or node.op == "coordinate" and node.attr[0] == "step"
+            else limit
+        )
+    if is_movement(node) or of_floats(node) or node.op in DRAWS:
+        return limit
+    if node.op == "shift":
+        _, dx, wraps = node.attr
+        return gate_cost(node.args[0], have, limit) if wraps and not dx else limit
+    total = 2 if node.op == "select" else 1
+    for arg in node.args:
+        total += gate_cost(arg, have, limit)
+        if total >= limit:
+            return limit
+    return total
+
+
+def chain_of(node: Node, have: Have) -> list[Node]:
+    """A long chain of choices, the outermost first, whose values are computed from what is stored; else nothing."""
+    chain: list[Node] = []
+    while node.op == "select" and node.type == REAL and not have(node):
+        if node.args[0].op == "param":
+            return []
+        chain.append(node)
+        node = node.args[2]
+    if len(chain) < FEWEST or node.op in UNIFORM:  # what is the same everywhere stands in no field
+        return []
+    for (
+        choice
+    ) in chain:  # a choice may build on the one below it, which the row still holds, not on those before
+        seen = {id(choice.args[2])}
+        stack = [choice.args[1]]
+        while stack:
+            part = stack.pop()
+            if id(part) in seen or have(part):
+                continue
+            seen.add(id(part))
+            reads = any(inner is choice.args[2] for inner in walk(part))
+            if part.op in ("select", "draw") or (part.op == "shift" and reads):
+                return []
+            stack.extend(part.args)
+    return chain
+
+
+def _is_kept(node: Node, found: set[str]) -> bool:
+    """Whether a float is a clamped slot under choices."""
+    if node.op != "settle":
+        return False
+    node = node.args[0]
+    while node.op == "select" and node.args[0].op != "param":
+        node = node.args[2]
+    return node.op == "load" and node.attr in found
+
+
+class _RowCutter(Cutter):
+    def __init__(self, schedule: Schedule, costs: Costs):
+        super().__init__(schedule, costs)
+        self.found = {var.name for _, var in schedule.finds}
+        counts: Counter[int] = Counter()
+        for i, statement in enumerate(schedule.body[1:]):
+            masks = schedule.body[i]
+            if isinstance(statement, Guard) and isinstance(masks, Compute):
+                asked = {node.attr for node in statement.when}
+                roots = [out.value for out in masks.outs if out.var.name in asked]
+                counts.update({id(part) for root in roots for part in _conjunctions(root)})
+        self.shared = {key for key, count in counts.items() if count > 1}
+        """Parts of several masks: where such a plane is empty, all of them are."""
+
+    # Masks
+
+    def guarded(self, masks: Compute, guard: Guard) -> None:
+        place = masks.place
+        self.same |= {out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)}
+        outs = [out for out in masks.outs if out.var.name not in self.same]
+        self.ensure([part for out in outs for part in self.shared_parts(out.value)], place)
+        split = {id(out): self.split(out.value) for out in outs}
+        if any(rest for _, rest in split.values()) and all(cheap for cheap, _ in split.values()):
+            self.in_two(outs, split, masks, guard)
+        else:
+            named = {id(out.value): out.var for out in reversed(outs)}
+            self.ensure([out.value for out in outs], place, named, masks.when)
+        self.then(guard)
+
+    def in_two(
+        self,
+        outs: list[Out],
+        split: dict[int, tuple[list[Node], list[Node]]],
+        masks: Compute,
+        guard: Guard,
+    ) -> None:
+        """Candidates first; the rest, and what it needs, only where there are some."""
+        graph, place = self.graph, masks.place
+        candidates = []
+        for out in outs:
+            cheap, rest = split[id(out)]
+            var = self.namer.var(FLAG) if rest else out.var
+            candidates.append(Out(var, self.word(all_of(cheap, graph))))
+        self.statements.append(Compute(tuple(candidates), place, "words", when=masks.when))
+        asked = [load(graph, out.var) for out in candidates]
+        mine = {out.var.name for out in outs}
+        asked += [self.renamed(node) for node in guard.when if node.attr not in mine]
+        outer, self.statements = self.statements, []
+        known = dict(self.known)
+        lazy = []
+        for out, candidate in zip(outs, candidates, strict=True):
+            rest = split[id(out)][1]
+            if rest:
+                # Draws last: what they are asked for is then as little as can be.
+                parts = all_of(sorted(rest, key=lambda part: part.op in DRAWS), graph)
+                value = graph.node("when", FLAG, (load(graph, candidate.var), parts))
+                lazy.append(Out(out.var, value))
+        self.ensure([need for out in lazy for need in self.needs(out.value)], place)
+        words = tuple(replace(out, value=self.word(out.value)) for out in lazy)
+        self.statements.append(Compute(words, place, "words"))
+        inner, self.statements = self.statements, outer
+        self.known = known
+        nothing = graph.node("const", FLAG, (), False)
+        kept = tuple((out.var, nothing) for out in lazy)
+        self.statements.append(Guard(tuple(dict.fromkeys(asked)), tuple(inner), kept, guard.place))
+        self.known |= {id(out.value): out.var for out in outs}
+
+    def ask(self, masks: list[Out], guard: Guard) -> None:
+        self.then(guard)
+
+    def shared_parts(self, mask: Node) -> list[Node]:
+        """The largest parts of a mask that other masks have too, if one loop can compute them."""
+        if self.have(mask) or mask.op == "not":
+            return []
+        simple = id(mask) in self.shared and mask.op not in UNIFORM and not self.needs(mask)
+        if simple and not any(
+            node.op in DRAWS or is_movement(node) or is_comparison(node) for node in walk(mask)
+        ):
+            return [mask]
+        return [part for arg in mask.args for part in self.shared_parts(arg)] if mask.op == "and" else []
+
+    # Guards and movements
+
+    def then(self, guard: Guard) -> None:
+        """What a guard does: planes that are only carried along move in place; the rest stands in a guard."""
+        when = tuple(self.renamed(node) for node in guard.when)
+        forgets = [statement for statement in guard.body if isinstance(statement, Forget)]
+        outs = [out for one in guard.body if isinstance(one, Compute) for out in one.outs]
+        kept = {var.name: value for var, value in self.kept(guard)}
+        carried = self.carried(outs, kept)
+        moved = {id(out.value) for out in carried}
+        others = [out for out in outs if id(out.value) not in moved]
+        first = any(id(node) in moved for out in others for node in walk(out.value))
+        inner: list[Statement] = [*forgets]
+        if others:
+            inner.append(Compute(tuple(others), guard.place))
+        keeps = tuple((out.var, kept[out.var.name]) for out in others)
+        if first:
+            self.move(carried, kept, guard.place)
+        if inner:
+            body = self.block(inner, frozenset(var.name for var, _ in keeps))
+            self.statements.append(Guard(when, tuple(body), keeps, guard.place))
+        if not first:
+            self.move(carried, kept, guard.place)
+
+    def carried(self, outs: list[Out], kept: dict[str, Node]) -> list[Out]:
+        """Writes that move what their slot held, all with the same movers and offset."""
+        found: list[Out] = []
+        for out in outs:
+            node = out.value
+            if not is_movement(node) or node.args[0] is not kept[out.var.name]:
+                continue
+            if not self.have(node.args[1]) or not _leaves_simply(node):
+                continue
+            first = found[0].value if found else node
+            if (node.op, node.attr, node.args[1]) == (first.op, first.attr, first.args[1]):
+                found.append(out)
+        return found
+
+    def move(self, carried: list[Out], kept: dict[str, Node], place: str) -> None:
+        if not carried:
+            return
+        first = carried[0].value
+        movers = self.variable(first.args[1])
+        planes = []
+        for out in carried:
+            content, _, rest = out.value.args
+            old = self.renamed(kept[out.var.name])
+            leaves = old
+            if rest is not content:
+                gone = self.graph.node("not", FLAG, (movers,)) if rest.op == "and" else movers
+                leaves = self.graph.node(rest.op, FLAG, (old, gone))
+            planes.append(Carried(out.var, old, leaves))
+        self.statements.append(Move(first.op, first.attr, movers, tuple(planes), place))
+        self.known |= {id(out.value): out.var for out in carried}
+
+    # What must be stored
+
+    def needs(self, node: Node) -> list[Node]:
+        if self.have(node):
+            return []
+        if is_movement(node):
+            return [arg for arg in node.args if not self.have(arg)]
+        if chain := chain_of(node, self.have):
+            parts = [part for choice in chain for part in self.cell_needs(choice.args[1])]
+            masks = [choice.args[0] for choice in chain]
+            ids = set(map(id, chain))
+            found = [*masks, *parts, chain[-1].args[2]]
+            return [need for need in found if not self.have(need) and id(need) not in ids]
+        return super().needs(node)
+
+    def cell_needs(self, node: Node) -> list[Node]:
+        """Flags and floats that a loop over cells reads; long chains of choices are laid before it."""
+        found: dict[int, Node] = {}
+        apart = not _is_kept(node, self.found)
+        seen: set[int] = set()
+        stack = [node]
+        while stack:
+            top = stack.pop()
+            if id(top) in seen or self.have(top):
+                continue
+            seen.add(id(top))
+            if apart and top is not node and chain_of(top, self.have):
+                found[id(top)] = top
+            elif top.op == "led":
+                stack.extend(top.args)
+            elif top.type != REAL and top is not node and not is_comparison(top):
+                if top.op != "param":
+                    found[id(top)] = top
+            elif top.op == "shift":
+                source = top.args[0]
+                if self.have(source):
+                    continue
+                parts = stored_parts(source, self.have, self.costs.floats) if top.attr[2] else [source]
+                found |= {id(part): part for part in parts}
+                if not parts:
+                    stack.append(source)
+            else:
+                stack.extend(top.args)
+        flags = [need for need in found.values() if need.type != REAL]
+        return [*flags, *(need for need in found.values() if need.type == REAL)]
+
+    def word_needs(self, node: Node) -> list[Node]:
+        found: dict[int, Node] = {}
+        seen: set[int] = set()
+        stack = [node]
+        while stack:
+            top = stack.pop()
+            if id(top) in seen or self.have(top) or top.op in UNIFORM:
+                continue
+            seen.add(id(top))
+            if of_floats(top) or (is_movement(top) and top is not node):
+                found[id(top)] = top
+            elif top.op == "shift":
+                source = top.args[0]
+                _, dx, wraps = top.attr
+                if self.have(source) or (is_constant(source) and wraps):
+                    continue
+                if wraps and not dx and gate_cost(source, self.have) <= self.costs.gates:
+                    stack.append(source)
+                else:
+                    found[id(source)] = source
+            else:
+                stack.extend(top.args)
+        return list(found.values())
+
+    def ensure(
+        self,
+        nodes: Iterable[Node],
+        place: str,
+        named: dict[int, Var] | None = None,
+        when: Node | None = None,
+    ) -> None:
+        named = named or {}
+        wanted = [
+            node
+            for node in dict.fromkeys(nodes)
+            if not self.have(node) and not (node.op in UNIFORM and node.type == REAL)
+        ]
+        if not wanted:
+            return
+        before = [
+            need
+            for need in dict.fromkeys(n for node in wanted for n in self.needs(node))
+            if not self.have(need)
+        ]
+        if before:
+            self.ensure(before, place, named)
+            self.ensure(wanted, place, named, when)
+            return
+        floats = [node for node in wanted if of_floats(node)]
+        floats += [i for node in floats for i in walk(node) if id(i) in self.wanted and not self.have(i)]
+        floats = list(dict.fromkeys(floats))
+        laid = [node for node in floats if chain_of(node, self.have)]
+        moves = [node for node in wanted if is_movement(node)]
+        flags = [node for node in wanted if node not in floats and node not in moves]
+
+        def var(node: Node) -> Var:
+            return named.get(id(node)) or self.namer.var(node.type)
+
+        if laid:
+            self.lay([(var(node), node) for node in laid], place)
+        if floats := [node for node in floats if node not in laid]:
+            self.kept_cells([(var(node), node) for node in floats], place)
+        if flags:
+            self.words([(var(node), node) for node in flags], place)
+            if when is not None:
+                self.statements[-1] = replace(self.statements[-1], when=when)
+        for node in moves:
+            content, movers, rest = (self.variable(arg) for arg in node.args)
+            plane = Carried(var(node), content, rest)
+            self.statements.append(Move(node.op, node.attr, movers, (plane,), place))
+            self.known[id(node)] = plane.new
+
+    def lay(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
+        """Chains of choices; those that depend on the same masks together."""
+        groups: dict[tuple[int, ...], list[tuple[Var, Node]]] = {}
+        for var, node in pairs:
+            chain = chain_of(node, self.have)
+            groups.setdefault(tuple(id(choice.args[0]) for choice in chain), []).append((var, node))
+        for group in groups.values():
+            self.cells(group, place)
+            self.statements[-1] = replace(self.statements[-1], over="choices")
+
+    def kept_cells(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
+        """A loop over cells; what it computes of clamped slots stays as it was where no choice is made at all."""
+        whole = [pair for pair in pairs if _is_kept(pair[1], self.found)]
+        if len(whole) < len(pairs):
+            self.cells(pairs, place)
+            return
+        outer, self.statements = self.statements, []
+        self.cells(pairs, place)
+        inner, self.statements = self.statements, outer
+        keeps, masks = [], []
+        for var, node in pairs:
+            node = node.args[0]
+            while node.op == "select":
+                masks.append(self.variable(node.args[0]))
+                node = node.args[2]
+            keeps.append((var, self.renamed(node)))
+        when = tuple(dict.fromkeys(masks))
+        self.statements.append(Guard(when, tuple(inner), tuple(keeps), place))
+
+
+def _leaves_simply(node: Node) -> bool:
+    """Whether cells that movers left hold nothing, everything, or what was swapped; and arrivals go a row at most."""
+    content, movers, rest = node.args
+    if node.op == "arrive" and abs(node.attr[0]) > 1:
+        return False
+    if rest is content:
+        return True
+    if node.op == "swap" or rest.op not in ("and", "or"):
+        return False
+    other = next((arg for arg in rest.args if arg is not content), None)
+    if content not in rest.args or other is None:
+        return False
+    return other is movers if rest.op == "or" else other.op == "not" and other.args[0] is movers
+
+
+def _conjunctions(node: Node) -> Iterator[Node]:
+    """A mask and all parts of it that must hold."""
+    yield node
+    if node.op == "and":
+        for arg in node.args:
+            yield from _conjunctions(arg)

@@ -1,0 +1,121 @@
+"""Loops over words that find nothing: where the planes that all their values depend on are empty."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from powderdsl.ir.ops import FLAG, Graph, Node
+from powderdsl.schedule.types import ANSWER, Compute, Schedule, Statement, map_blocks, ordered
+
+
+def empty(schedule: Schedule) -> Schedule:
+    """Loops over words get the answer without which all their values are 0; operations on whole planes stand alone.
+
+    `m = a & (b | c[0,1])` → when `any a`; `n = a | b`, which sees at once that one of them is empty, needs no loop.
+    """
+    graph = schedule.graph
+
+    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        result: list[Statement] = []
+        for statement in block:
+            if isinstance(statement, Compute) and statement.over == "words":
+                whole = [out for out in statement.outs if is_whole(out.value)]
+                rest = tuple(out for out in statement.outs if not is_whole(out.value))
+                result += [replace(statement, outs=(out,), when=None) for out in whole]
+                if rest:
+                    result.append(_asked(replace(statement, outs=rest), graph))
+            else:
+                result.append(statement)
+        return tuple(result)
+
+    return replace(schedule, body=map_blocks(schedule.body, change))
+
+
+def is_whole(value: Node) -> bool:
+    """Whether a value is one operation on whole planes: `a`, `0`, `a[dy,dx]`, `a & ~b`, `a | b`."""
+    args = value.args
+    match value.op:
+        case "load":
+            return True
+        case "const":
+            return not value.attr
+        case "shift":
+            return args[0].op == "load" and value.attr[2]
+        case "or":
+            return all(arg.op == "load" for arg in args)
+        case "and":
+            gone = [arg for arg in args if arg.op == "not" and arg.args[0].op == "load"]
+            return len(gone) == 1 and any(arg.op == "load" for arg in args)
+    return False
+
+
+def _asked(loop: Compute, graph: Graph) -> Compute:
+    memo: dict[int, frozenset[str] | None] = {}
+    loads = {str(node.attr): node for node in ordered(out.value for out in loop.outs) if node.op == "load"}
+    ways: dict[int, Node] = {}
+    for out in loop.outs:
+        conditions = [_any(names, loads, graph) for names in _conditions(out.value, memo)]
+        if not conditions:
+            return loop
+        way = conditions[0]
+        for other in conditions[1:]:
+            way = graph.node("and", ANSWER, (way, other))
+        ways[id(way)] = way
+    first, *rest = ways.values()
+    for way in rest:
+        first = graph.node("or", ANSWER, (first, way))
+    if loop.when is not None:
+        first = graph.node("and", ANSWER, (loop.when, first))
+    return replace(loop, when=first)
+
+
+def _conditions(value: Node, memo: dict[int, frozenset[str] | None]) -> list[frozenset[str]]:
+    """Sets of planes, of each of which one must hold something for the value to do so."""
+    if value.op == "when":
+        candidates, rest = value.args
+        parts = [candidates]
+        stack = [rest]
+        while stack:
+            part = stack.pop()
+            if part.op == "and":
+                stack.extend(reversed(part.args))
+            else:
+                parts.append(part)
+    else:
+        parts = [value]
+    return list(dict.fromkeys(found for part in parts if (found := holders(part, memo)) is not None))
+
+
+def _any(names: Iterable[str], loads: dict[str, Node], graph: Graph) -> Node:
+    result: Node | None = None
+    for name in sorted(names, key=lambda name: int(name[1:])):
+        one = graph.node("any", ANSWER, (loads[name],))
+        result = one if result is None else graph.node("or", ANSWER, (result, one))
+    return result if result is not None else graph.node("const", ANSWER, (), False)
+
+
+def holders(node: Node, memo: dict[int, frozenset[str] | None]) -> frozenset[str] | None:
+    """Planes such that if all of them are empty, the flag holds nowhere; None if none are known."""
+    for inner in ordered([node]):
+        if id(inner) not in memo and inner.type == FLAG:
+            memo[id(inner)] = _holders(inner, memo)
+    return memo[id(node)]
+
+
+def _holders(node: Node, memo: dict[int, frozenset[str] | None]) -> frozenset[str] | None:
+    match node.op:
+        case "load":
+            return frozenset({str(node.attr)})
+        case "const":
+            return None if node.attr else frozenset()
+        case "shift":
+            return memo[id(node.args[0])]
+        case "and" | "when":
+            found = [names for arg in node.args if (names := memo[id(arg)]) is not None]
+            return min(found, key=lambda names: (len(names), sorted(names)), default=None)
+        case "or" | "xor" | "select":
+            parts = [memo[id(arg)] for arg in node.args[node.op == "select" :]]
+            known = [part for part in parts if part is not None]
+            return frozenset[str]().union(*known) if len(known) == len(parts) else None
+    return None

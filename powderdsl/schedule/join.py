@@ -1,0 +1,110 @@
+"""Loops over cells that follow each other become one: what they make of a world is read while it is near."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from powderdsl.ir.ops import REAL, Node
+from powderdsl.schedule.types import (
+    Compute,
+    Schedule,
+    Statement,
+    Sweeps,
+    flat,
+    loaded,
+    map_blocks,
+    ordered,
+    values_of,
+)
+
+Read = tuple[str, int, int]
+"""A field, and how many rows and columns away it is read."""
+
+
+def join(schedule: Schedule) -> Schedule:
+    """Runs of loops over cells, also of single ones.
+
+    `loop cells: a = …`, `loop cells: b = a[0,1] + …` → one loop over worlds, row by row.
+    """
+    everything = [node for _, node in schedule.leaves]
+    everything += [node for statement in flat(schedule.body) for node in values_of(statement)]
+    reads: dict[str, int] = {}
+    for name in loaded(everything):
+        reads[name] = reads.get(name, 0) + 1
+
+    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        result: list[Statement] = []
+        run: list[Compute] = []
+        for statement in (*block, None):
+            if isinstance(statement, Compute) and statement.over in ("cells", "choices"):
+                run.append(statement)
+                continue
+            if run:
+                result.append(_joined(run, reads))
+                run = []
+            if statement is not None:
+                result.append(statement)
+        return tuple(result)
+
+    return replace(schedule, body=map_blocks(schedule.body, change))
+
+
+def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
+    written = [out.var.name for loop in run for out in loop.outs if out.var.type == REAL]
+    inside = {name: 0 for name in written}
+    for name in loaded(node for loop in run for node in values_of(loop)):
+        if name in inside:
+            inside[name] += 1
+    passing = {name for name in written if reads.get(name, 0) == inside[name]}
+    over = _written_over(run, passing)
+    loops = tuple(
+        replace(loop, outs=tuple(replace(out, into=over.get(out.var.name)) for out in loop.outs))
+        for loop in run
+    )
+    return Sweeps(loops, tuple(_parts(run)), tuple(name for name in written if name in passing))
+
+
+def field_reads(loop: Compute) -> list[Read]:
+    """The fields that a loop reads, and where; also those that its region asks for."""
+    found: dict[Read, None] = {}
+    nodes: list[Node] = ordered(values_of(loop))
+    for node in nodes:
+        if node.op == "load" and node.type == REAL:
+            found[str(node.attr), 0, 0] = None
+        elif node.op in ("shift", "live") and node.args[0].op == "load":
+            dy, dx = node.attr[:2]
+            if node.args[0].type == REAL:
+                found[str(node.args[0].attr), dy, dx if node.op == "shift" else 0] = None
+    return list(found)
+
+
+def _parts(run: Sequence[Compute]) -> list[int]:
+    """Which loops may go together, row by row: those that read other rows of an earlier one come in a later part."""
+    parts: list[int] = []
+    made: dict[str, int] = {}
+    for loop in run:
+        far = [made[name] + 1 for name, dy, _ in field_reads(loop) if dy and name in made]
+        parts.append(max([*far, *parts[-1:]], default=0))
+        made |= {out.var.name: parts[-1] for out in loop.outs if out.var.type == REAL}
+    return parts
+
+
+def _written_over(run: Sequence[Compute], passing: set[str]) -> dict[str, str]:
+    """Fields that take the place of one which only the run needs, and which is read for the last time: it by it."""
+    over: dict[str, str] = {}
+    earlier: set[str] = set()
+    reads = [field_reads(loop) for loop in run]
+    for number, loop in enumerate(run):
+        others = [read for i, one in enumerate(reads) if i != number for read in one]
+        later = {name for one in reads[number + 1 :] for name, _, _ in one}
+        far = {name for name, dy, _ in others if dy} | {name for name, dy, dx in reads[number] if dy or dx}
+        free = sorted(
+            {name for name, _, _ in reads[number]} & earlier & passing - later - far,
+            key=lambda name: int(name[1:]),
+        )
+        fields = [out.var.name for out in loop.outs if out.var.type == REAL]
+        if loop.over == "cells":
+            over |= dict(zip(fields, free, strict=False))
+        earlier |= set(fields)
+    return over

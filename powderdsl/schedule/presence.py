@@ -1,0 +1,245 @@
+"""Which elements a pass asks for: where none of them is in any world of a group, it need not look at cells at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import or_
+
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.schedule.narrow import unchanged
+from powderdsl.schedule.types import (
+    ANSWER,
+    Compute,
+    Forget,
+    Guard,
+    Schedule,
+    Statement,
+    flat,
+    ordered,
+    values_of,
+)
+
+MAX_PLANES = 6
+"""A set of ids is a word of 64 bits."""
+
+MAX_SETS = 4
+"""More are not worth asking."""
+
+_ELEMENT = "element:"
+
+Sets = frozenset[int]
+"""Sets of ids (bits of a word): one of each must be there."""
+
+
+def presence(schedule: Schedule) -> Schedule:
+    """Masks and the whole pass ask which elements there are; what changes elements forgets what was known.
+
+    `m = is_ice & any neighbor is_water` → the loop of `m` runs only when `present({ice}) & present({water})`. Comes
+    before `cut`, which takes masks apart.
+    """
+    bits = _element_bits(schedule)
+    if not bits:
+        return schedule
+    body: list[Statement] = []
+    for i, statement in enumerate(schedule.body):
+        after = schedule.body[i + 1] if i + 1 < len(schedule.body) else None
+        match statement:
+            case Compute(outs) if isinstance(after, Guard):
+                asked = {node.attr for node in after.when if node.op == "load"}
+                if asked == {out.var.name for out in outs}:
+                    when = _asked([out.value for out in outs], bits, schedule.graph)
+                    statement = replace(statement, when=when)
+                body.append(statement)
+            case Guard(_, inner, keeps):
+                changed = [(var, old) for var, old in keeps if var.name in bits]
+                if changed and not _only_swaps(statement, {var.name: old for var, old in changed}):
+                    statement = replace(statement, body=(Forget(), *inner))
+                body.append(statement)
+            case Compute(outs) if any(out.var.name in bits for out in outs):
+                body += [statement, Forget()]
+            case _:
+                body.append(statement)
+    return replace(schedule, body=tuple(body), when=_pass_asks(schedule, bits))
+
+
+def _element_bits(schedule: Schedule) -> dict[str, int]:
+    """The bit of the element that each variable holds; nothing if there are too many to count ids."""
+    bits: dict[str, int] = {}
+    for slot, var in schedule.finds:
+        if slot.startswith(_ELEMENT):
+            bits[var.name] = int(slot.removeprefix(_ELEMENT))
+    for slot, node in schedule.leaves:
+        if slot.startswith(_ELEMENT) and node.op == "load":
+            bits[node.attr] = int(slot.removeprefix(_ELEMENT))
+    pairs = [
+        (var.name, str(value.attr))
+        for statement in flat(schedule.body)
+        if isinstance(statement, Guard)
+        for var, value in statement.keeps
+        if value.op == "load"
+    ]
+    for new, old in (*pairs, *reversed(pairs)):  # forwards from what is found, backwards from what is left
+        for known, other in ((old, new), (new, old)):
+            if known in bits:
+                bits.setdefault(other, bits[known])
+    return bits if max(bits.values(), default=MAX_PLANES) < MAX_PLANES else {}
+
+
+def _only_swaps(guard: Guard, olds: dict[str, Node]) -> bool:
+    """Whether a guard leaves each element as often as it was: it swaps cells, or writes no elements."""
+    values = {out.var.name: out.value for one in guard.body if isinstance(one, Compute) for out in one.outs}
+    for name, old in olds.items():
+        value = values[name]
+        if value.op != "swap" or value.args[0] is not old or value.args[2] is not old:
+            return False
+    return True
+
+
+def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
+    """What must be there for the pass to change anything; None if nothing can be said.
+
+    As long as nothing has been changed, slots hold what they held when the pass began. So every mask is asked as if it
+    came first.
+    """
+    masks: dict[str, Node] = {}
+    chains: dict[str, Guard] = {}
+    for statement in schedule.body:
+        if isinstance(statement, Compute):
+            masks |= {out.var.name: out.value for out in statement.outs}
+        elif isinstance(statement, Guard):
+            chains |= {var.name: statement for var, _ in statement.keeps}
+    found = {var.name: slot for slot, var in schedule.finds}
+    asked: list[Node] = []
+    for slot, node in schedule.leaves:
+        if node.op != "load":
+            return None
+        name = str(node.attr)
+        if node.type == REAL:
+            kept = unchanged(masks[name], set(found)) if name in masks else None
+            if kept is None or found[str(kept[0].attr)] != slot:
+                return None
+            asked += [masks.get(str(mask.attr), mask) for mask in kept[1]]
+            continue
+        while name in chains:
+            guard = chains[name]
+            asked += [masks.get(str(mask.attr), mask) for mask in guard.when]
+            old = next(value for var, value in guard.keeps if var.name == name)
+            name = str(old.attr)
+        if found.get(name) != slot:
+            return None
+    return _asked(asked, bits, schedule.graph)
+
+
+def _asked(masks: list[Node], bits: dict[str, int], graph: Graph) -> Node | None:
+    """An answer without which none of some masks holds anywhere; None if nothing can be said."""
+    needs = _Needs(1 + max(bits.values()), bits)
+    ways = dict.fromkeys(needs.of(mask) for mask in masks)
+    if not ways or frozenset() in ways:
+        return None
+    answer: Node | None = None
+    for sets in sorted(ways, key=sorted):
+        way: Node | None = None
+        for ids in sorted(sets):
+            one = graph.node("present", ANSWER, (), ids)
+            way = one if way is None else graph.node("and", ANSWER, (way, one))
+        assert way is not None
+        answer = way if answer is None else graph.node("or", ANSWER, (answer, way))
+    return answer
+
+
+def asked_ids(schedule: Schedule) -> int:
+    """All ids that a schedule asks for."""
+    roots = [] if schedule.when is None else [schedule.when]
+    roots += [node for statement in flat(schedule.body) for node in values_of(statement)]
+    return reduce(or_, (node.attr for node in ordered(roots) if node.op == "present"), 0)
+
+
+@dataclass
+class _Needs:
+    """Of each flag: the ids it holds for, if it depends on the cell's element alone; ids that the cell has where it
+    holds; and sets of ids of which one each must be somewhere."""
+
+    planes: int
+    bits: dict[str, int]
+    exact: dict[int, int | None] = field(default_factory=dict)
+    cell: dict[int, int] = field(default_factory=dict)
+    sets: dict[int, Sets] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.everything = (1 << (1 << self.planes)) - 1
+        self.columns = [
+            sum(1 << code for code in range(1 << self.planes) if code >> bit & 1)
+            for bit in range(self.planes)
+        ]
+
+    def of(self, mask: Node) -> Sets:
+        """Sets of ids of which one each must be there for the mask to hold anywhere."""
+        for node in ordered([mask]):
+            if id(node) not in self.exact:
+                exact = self.exact[id(node)] = self._exact(node)
+                self.cell[id(node)] = self._cell(node) if exact is None else exact
+                self.sets[id(node)] = frozenset() if exact is not None else self._sets(node)
+        return self._all(mask)
+
+    def _all(self, node: Node) -> Sets:
+        cell = self.cell[id(node)]
+        return _least(self.sets[id(node)] | ({cell} if cell != self.everything else set()))
+
+    def _exact(self, node: Node) -> int | None:
+        if node.op == "load" and node.attr in self.bits:
+            return self.columns[self.bits[node.attr]]
+        if node.op == "const" and node.type == FLAG:
+            return self.everything if node.attr else 0
+        if node.op not in ("and", "or", "xor", "not", "select"):
+            return None
+        match node.op, [self.exact[id(arg)] for arg in node.args]:
+            case "and", [int(a), int(b)]:
+                return a & b
+            case "or", [int(a), int(b)]:
+                return a | b
+            case "xor", [int(a), int(b)]:
+                return a ^ b
+            case "not", [int(a)]:
+                return self.everything ^ a
+            case "select", [int(asked), int(yes), int(no)]:
+                return asked & yes | ~asked & no
+        return None
+
+    def _cell(self, node: Node) -> int:
+        cells = [self.cell[id(arg)] for arg in node.args]
+        match node.op:
+            case "and":
+                return cells[0] & cells[1]
+            case "or" | "xor":
+                return cells[0] | cells[1]
+            case "select":
+                return cells[0] & cells[1] | cells[2]
+        return self.everything
+
+    def _sets(self, node: Node) -> Sets:
+        match node.op:
+            case "and":
+                return _least(self._all(node.args[0]) | self._all(node.args[1]))
+            case "or" | "xor":
+                return _either(self._all(node.args[0]), self._all(node.args[1]))
+            case "shift":
+                return self._all(node.args[0])
+            case "select":
+                chosen = _least(self._all(node.args[0]) | self._all(node.args[1]))
+                return _either(chosen, self._all(node.args[2]))
+        return frozenset()
+
+
+def _either(a: Sets, b: Sets) -> Sets:
+    return _least(frozenset(one | other for one in a for other in b))
+
+
+def _least(sets: Iterable[int]) -> Sets:
+    """The smallest sets; those that contain another say nothing new, and a few are enough."""
+    kept: list[int] = []
+    for ids in sorted(sets, key=lambda ids: (ids.bit_count(), ids)):
+        if not any(one & ids == one for one in kept):
+            kept.append(ids)
+    return frozenset(kept[:MAX_SETS])

@@ -1,0 +1,98 @@
+"""Where variables end, for targets that count references: released after the last statement that reads them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+from powderdsl.schedule.types import (
+    ANSWER,
+    Guard,
+    Move,
+    Release,
+    Schedule,
+    Statement,
+    Sweeps,
+    defined_by,
+    loaded,
+    values_of,
+)
+
+
+def release(schedule: Schedule) -> Schedule:
+    """Every variable is released once, also what nobody reads; planes that move take the place of old ones that end.
+
+    `swap by m: b = a`, where `a` is not read again → `b = a into a`.
+    """
+    live = set(loaded(node for _, node in schedule.leaves))
+    body = _block(schedule.body, live)
+    return replace(schedule, body=body)
+
+
+def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ...]:
+    lives: list[set[str]] = []
+    live = set(live_end)
+    for statement in reversed(body):
+        lives.append(live)
+        live = live_before(statement, live)
+    result: list[Statement] = []
+    for given, after in zip(body, reversed(lives), strict=True):
+        statement = given
+        gone = (reads(statement) | _names(statement)) - after
+        if isinstance(statement, Guard):
+            outside = reads(statement) - made_in(statement.body)
+            kept = {var.name for var, _ in statement.keeps}
+            # What is from outside is released after the guard, whether its body runs or not.
+            inner = _block(statement.body, after | kept | outside)
+            statement = replace(statement, body=inner)
+            gone = (outside | kept) - after
+        elif isinstance(statement, Move):
+            statement = _in_place(statement, after)
+            gone -= {str(plane.old.attr) for plane in statement.planes if plane.into}
+        elif isinstance(statement, Sweeps):
+            gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
+        result.append(statement)
+        if gone:
+            result.append(Release(tuple(sorted(gone, key=lambda name: int(name[1:])))))
+    return tuple(result)
+
+
+def _in_place(move: Move, after: set[str]) -> Move:
+    olds = Counter(str(plane.old.attr) for plane in move.planes)
+    movers = str(move.movers.attr)
+    planes = (
+        replace(
+            plane, into=plane.old.attr not in after and olds[plane.old.attr] == 1 and plane.old.attr != movers
+        )
+        for plane in move.planes
+    )
+    return replace(move, planes=tuple(planes))
+
+
+def _names(statement: Statement) -> set[str]:
+    return {var.name for var in defined_by(statement) if var.type != ANSWER}
+
+
+def live_before(statement: Statement, after: set[str]) -> set[str]:
+    """The variables that are live before a statement, from those after it."""
+    live = after - {var.name for var in defined_by(statement)}
+    return live | (reads(statement) - made_in([statement]))
+
+
+def reads(statement: Statement) -> set[str]:
+    """Variables that a statement reads, with what is in it."""
+    found = set(loaded(values_of(statement)))
+    if isinstance(statement, Guard):
+        for inner in statement.body:
+            found |= reads(inner)
+    return found
+
+
+def made_in(body: Sequence[Statement]) -> set[str]:
+    """Variables that statements make, with what is in them."""
+    found = {var.name for statement in body for var in defined_by(statement)}
+    for statement in body:
+        if isinstance(statement, Guard):
+            found |= made_in(statement.body)
+    return found
