@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset, walk
-from powderdsl.schedule.draws import DRAWS, all_of
+from powderdsl.schedule.draws import DRAWS, all_of, asked_for
 from powderdsl.schedule.floats import conjuncts, is_comparison, of_floats
 from powderdsl.schedule.types import (
     ANSWER,
@@ -294,12 +294,19 @@ class Cutter:
         return cheap, rest
 
     def lazily(self, cheap: list[Node], rest: list[Node]) -> Node:
-        """The conjunction; the rest is computed only in words where the cheap parts hold somewhere, draws last."""
+        """The conjunction; the rest is computed only in words where the cheap parts hold somewhere."""
         if not rest or not cheap:
             return all_of([*cheap, *rest], self.graph)
-        rest = sorted(rest, key=lambda part: part.op in DRAWS)
-        first = all_of(cheap, self.graph)
-        return self.graph.node("when", FLAG, (first, all_of(rest, self.graph)))
+        return self.under(all_of(cheap, self.graph), rest)
+
+    def under(self, first: Node, rest: list[Node]) -> Node:
+        """What holds under a condition: draws last, each asked for where all before them holds."""
+        value = first
+        for part in sorted(rest, key=lambda part: part.op in DRAWS):
+            if part.op in DRAWS and not self.have(part):
+                part = asked_for(part, value, self.graph)
+            value = all_of([value, part], self.graph)
+        return self.graph.node("when", FLAG, (first, value))
 
     # What must be stored
 

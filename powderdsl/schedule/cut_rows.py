@@ -155,10 +155,7 @@ class _RowCutter(Cutter):
         for out, candidate in zip(outs, candidates, strict=True):
             rest = split[id(out)][1]
             if rest:
-                # Draws last: what they are asked for is then as little as can be.
-                parts = all_of(sorted(rest, key=lambda part: part.op in DRAWS), graph)
-                value = graph.node("when", FLAG, (load(graph, candidate.var), parts))
-                lazy.append(Out(out.var, value))
+                lazy.append(Out(out.var, self.under(load(graph, candidate.var), rest)))
         self.ensure([need for out in lazy for need in self.needs(out.value)], place)
         words = tuple(replace(out, value=self.word(out.value)) for out in lazy)
         self.statements.append(Compute(words, place, "words"))

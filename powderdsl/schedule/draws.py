@@ -129,6 +129,12 @@ def _with_conditions(statement: Compute, graph: Graph) -> Compute:
     return replace(statement, outs=tuple(replace(out, value=done[id(out.value)]) for out in statement.outs))
 
 
+def asked_for(draw: Node, where: Node, graph: Graph) -> Node:
+    """A draw with another condition."""
+    count = draw.attr[1] + 1 if draw.op == "below_planes" else 0
+    return graph.node(draw.op, FLAG, (*draw.args[:count], where), draw.attr, draw.places)
+
+
 def takes_bits(node: Node) -> bool:
     """Whether a node is a draw that takes more than a few random bits."""
     if node.op == "chance":

@@ -7,11 +7,12 @@ from importlib.resources import files
 from operator import or_
 
 from powderdsl.ir.ops import Program
-from powderdsl.targets.cpp.passes import PassWriter
-from powderdsl.targets.cpp.presence import look
+from powderdsl.schedule.presence import asked_ids
+from powderdsl.schedule.stages import CPP, plan
+from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
-GENERATOR_VERSION = 5
+GENERATOR_VERSION = 6
 """Part of every cache key: raise it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "fields")
@@ -25,9 +26,9 @@ SNAP = 2.0**-20
 def native_source(program: Program) -> tuple[str, Layout]:
     """The whole translation unit, and its layout."""
     layout = layout_of(program)
-    writers = [PassWriter(p, i, layout) for i, p in enumerate(program.passes)]
-    passes = [writer.source() for writer in writers]
-    asked = reduce(or_, (writer.asked for writer in writers), 0)
+    schedules = [plan(pass_, CPP) for pass_ in program.passes]
+    passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
+    asked = reduce(or_, map(asked_ids, schedules), 0)
     calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
     resets = [
         (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
@@ -79,3 +80,46 @@ def native_source(program: Program) -> tuple[str, Layout]:
     known = "  if (c.present == ~0ull) look(c);\n" if asked else ""
     step = f"{look(layout, asked)}\nstatic void run_passes(Context& c) {{\n  START;\n{known}{calls}\n}}"
     return "\n".join([head, before, tables, body, step, after]), layout
+
+
+ELEMENT = "element:"
+
+
+def _element_planes(layout: Layout) -> int:
+    """How many planes hold the elements."""
+    return sum(name.startswith(ELEMENT) for name in layout.planes)
+
+
+def look(layout: Layout, asked: int) -> str:
+    """The function that finds which of the ids asked for are there. A word is known by its low and high bits."""
+    count = _element_planes(layout)
+    ids = [code for code in range(1 << count) if asked >> code & 1]
+    if not ids:
+        return "static void look(Context&) {}"
+    low = count // 2
+    planes = [layout.planes[f"{ELEMENT}{bit}"] for bit in range(count)]
+
+    def products(name: str, bits: range) -> list[str]:
+        return [
+            f"const V {name}{code} = "
+            + (
+                " & ".join(f"{'' if code >> i & 1 else '~'}b{bit}" for i, bit in enumerate(bits))
+                or "~splat(0)"
+            )
+            + ";"
+            for code in range(1 << len(bits))
+        ]
+
+    return "\n".join([
+        "static void look(Context& c) {",
+        *(f"const V* e{bit} = c.slot[{plane}]->data;" for bit, plane in enumerate(planes)),
+        *(f"V id{code} = splat(0);" for code in ids),
+        "for (size_t i = 0; i < c.g.cells(); i++) {",
+        *(f"const V b{bit} = e{bit}[i];" for bit in range(count)),
+        *products("low", range(low)),
+        *products("high", range(low, count)),
+        *(f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};" for code in ids),
+        "}",
+        "c.present = " + " | ".join(f"(any(id{code}) ? 1ull << {code} : 0)" for code in ids) + ";",
+        "}",
+    ])  # fmt: skip

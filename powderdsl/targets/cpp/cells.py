@@ -1,0 +1,451 @@
+"""Loops over cells as C++: for each world row by row, sixteen floats at a time; rows where nothing happens are skipped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from powderdsl.ir.ops import REAL, Node
+from powderdsl.schedule.types import Compute, Out, Sweeps, ordered
+from powderdsl.targets.layout import Layout, literal, param_key
+
+_INFIX = {"add": "+", "sub": "-", "mul": "*"}
+
+
+def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, active: int) -> tuple[str, int]:
+    """One loop over lanes, which are worlds, and how many lists of active rows are taken then.
+
+    Lanes that are strips read each other: a loop that reads other rows of an earlier one follows it block by block, see
+    EACH_BLOCK in fields.hpp.
+    """
+    over = {out.var.name: out.into for loop in sweeps.loops for out in loop.outs if out.into is not None}
+    before, rows, after = [], [], []
+    used: set[str] = set()
+    for part, loop in zip(sweeps.parts, sweeps.loops, strict=True):
+        printed = _Loop(loop, layout, active)
+        active = printed.active
+        before.append(printed.before(over))
+        rows.append((f"if (!strips || part == {part}) " if sweeps.parts[-1] else "") + printed.rows())
+        after.append(printed.after())
+        used |= printed.fields
+    lasting = {_first(name, over) for name in used if name not in sweeps.passing}
+    places = " ".join(
+        f"const int l{name} = {'l' if _first(name, over) in lasting else 'l & strips'};"
+        for name in sorted(used, key=lambda name: int(name[1:]))
+    )
+    blocks = f"EACH_BLOCK({sweeps.parts[-1]})"
+    inner = "\n".join(rows)
+    loop_text = "\n".join(
+        [*before, f"{blocks} for (int l = 0; l < c.lanes; l++) {{ {places}", inner, "}", *after]
+    )
+    outs = [out for loop in sweeps.loops for out in loop.outs]
+    declares = " ".join(
+        f"{'Field' if out.var.type == REAL else 'Plane'}* {out.var.name};"
+        for out in outs
+        if out.var.name not in declared
+    )
+    written = {out.var.name for out in outs}
+    if any(loop.region is None or _keeps(loop) for loop in sweeps.loops):
+        return f"{declares}\n{{\n{loop_text}\n}}", active
+    asked = dict.fromkeys(
+        question for loop in sweeps.loops for name, question in _asked(loop) if name not in written
+    )
+    quiet = " ".join(f"{out.var.name} = {out.into or f'keep({_quiet(out)})'};" for out in outs)
+    return (
+        f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}",
+        active,
+    )
+
+
+def _first(name: str, over: dict[str, str]) -> str:
+    """Whose place a field has taken in the end."""
+    while name in over:
+        name = over[name]
+    return name
+
+
+def _keeps(loop: Compute) -> bool:
+    """Whether what is computed stays as it was outside the region."""
+    return any(out.otherwise is not None and out.otherwise.op == "load" for out in loop.outs)
+
+
+def _parts(region: Node) -> list[Node]:
+    """The flags of which one must hold."""
+    if region.op == "or":
+        return [part for arg in region.args for part in _parts(arg)]
+    return [] if region.op == "const" else [region]
+
+
+def _asked(loop: Compute) -> Iterator[tuple[str, str]]:
+    """Questions about fields and planes that are all to be answered with yes if nothing happens, by their names."""
+    assert loop.region is not None
+    for part in _parts(loop.region):
+        if part.op == "live":
+            yield part.args[0].attr, f"{part.args[0].attr}->still"
+        else:
+            yield part.attr, f"{part.attr}->zero"
+
+
+def _quiet(out: Out) -> str:
+    if out.var.type == REAL:
+        return "c.calm"
+    return "c.everything" if out.otherwise is not None and out.otherwise.attr else "c.nothing"
+
+
+class _Loop:
+    """One loop over the rows of a world."""
+
+    def __init__(self, loop: Compute, layout: Layout, active: int):
+        self.loop, self.layout, self.first = loop, layout, active
+        self.active = active
+        self.fields: set[str] = {out.var.name for out in loop.outs if out.var.type == REAL}
+        self.floats = [out for out in loop.outs if out.var.type == REAL]
+        self.flags = [out for out in loop.outs if out.var.type != REAL]
+        if loop.over == "choices":
+            self.text = "\n".join(self.laid())
+        else:
+            self.text = self.swept()
+
+    def before(self, over: dict[str, str]) -> str:
+        lines = []
+        for out in self.loop.outs:
+            name = out.var.name
+            if out.var.type == REAL:
+                lines.append(f"{name} = {over.get(name, 'take_field(c)')}; bool some{name} = false;")
+                lines.append(
+                    f"for (int l = c.lanes; l < LANES; l++) memset({name}->live + l * height, 0, height);"
+                )
+            else:
+                lines.append(f"{name} = take(c);")
+                lines.append(
+                    f"for (int l = c.lanes; l < LANES; l++) for (int i = 0; i < height * words; i++) "
+                    f"((u64*){name}->data)[i * LANES + l] = 0;"
+                )
+        if self.loop.over == "choices":
+            masks = self.masks()
+            lists = " ".join(f"active_rows(c, {mask}, {self.first + i});" for i, mask in enumerate(masks))
+            lines.append(f"{lists} active_together(c, {self.first}, {len(masks)});")
+        return "\n".join(lines)
+
+    def rows(self) -> str:
+        if self.loop.over == "choices":
+            return f"{{\n{self.text}\n}}"
+        return f"for (int y = first; y < last; y++) {{\n{self.text}\n}}"
+
+    def after(self) -> str:
+        ends = [f"{out.var.name}->still = !some{out.var.name};" for out in self.floats]
+        return " ".join([*ends, *(f"close_plane(c, {out.var.name});" for out in self.flags)])
+
+    # Values chunk by chunk
+
+    def swept(self) -> str:
+        """The body of a loop over rows."""
+        values = _Chunks(self.layout, self.loop.outs)
+        found = [(out, values.of(out.value)) for out in self.loop.outs]
+        values.close()
+        self.fields |= values.fields
+        starts, stores, ends = [], [], []
+        for out, value in found:
+            name = out.var.name
+            if out.var.type == REAL:
+                starts.append(
+                    f"float* o{name} = {name}->data + ((size_t)l{name} * height + y) * c.g.stride + HALO; I n{name} = {{}};"
+                )
+                stores.append(
+                    f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= (I)blend(inside, o, splatf(0)); }}"
+                )
+                ends.append(
+                    f"finish_row(c, o{name}); {{ const bool some = any((V)(n{name} + n{name})); "
+                    f"{name}->live[l{name} * height + y] = some; some{name} |= some; }}"
+                )
+            else:
+                starts.append(
+                    f"if (width & 63) ((u64*){name}->data)[(y * words + words - 1) * LANES + l] = 0;"
+                )
+                stores.append(
+                    f"{{ const u32 o = {value}; put_bits((u64*){name}->data + (y * words + w) * LANES + l, x, o); }}"
+                )
+        rows = [f"const float* {name} = {call};" for call, name in values.rows.items()]
+        words = [
+            f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];"
+            for plane, name in values.words.items()
+        ]
+        return "\n".join([
+            self.skipped(), " ".join([*rows, *starts]), f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
+            "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {",
+            "const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;",
+            *values.lines, *stores, "} }", " ".join(ends),
+        ])  # fmt: skip
+
+    def skipped(self) -> str:
+        """Rows outside the region."""
+        region = self.loop.region
+        if region is None:
+            return ""
+        parts = _parts(region)
+        planes = [str(part.attr) for part in parts if part.op == "load"]
+        quiet = []
+        if _keeps(self.loop):
+            scan = " | ".join(f"((const u64*){plane}->data)[(y * words + w) * LANES + l]" for plane in planes)
+            for out in self.loop.outs:
+                assert out.otherwise is not None
+                name, old = out.var.name, out.otherwise.attr
+                self.fields.add(str(old))
+                quiet.append(f"some{name} |= copy_row(c, {name}, {old}, l, y);")
+            return (
+                f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; "
+                f"if (!some) {{ {' '.join(quiet)} continue; }} }}"
+            )
+        for out in self.loop.outs:
+            name = out.var.name
+            if out.var.type == REAL:
+                quiet.append(f"{name}->live[l{name} * height + y] = 0;")
+            else:
+                rest = "c.valid(w)[l]" if out.otherwise is not None and out.otherwise.attr else "0"
+                word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q;"
+                quiet.append(f"for (int w = 0; w < words; w++) {{ const u64 q = {rest}; {word} }}")
+        busy = " || ".join(self.busy(part) for part in parts if part.op == "live") or "false"
+        scan = " ".join(f"some |= row_bits({plane}, y * words, words, l);" for plane in planes)
+        return (
+            f"{{ u64 some = ({busy}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet)} continue; }} }}"
+        )
+
+    def busy(self, live: Node) -> str:
+        """Whether a field has anything in a row."""
+        name, dy = str(live.args[0].attr), live.attr[0]
+        self.fields.add(name)
+        return f"{name}->live[{f'c.line(l{name}, y + {dy})' if dy else f'l{name} * height + y'}]"
+
+    # Choices laid over each other
+
+    def chains(self) -> list[list[Node]]:
+        chains = []
+        for out in self.loop.outs:
+            chain, node = [], out.value
+            while node.op == "select":
+                chain.append(node)
+                node = node.args[2]
+            chains.append(chain)
+        return chains
+
+    def masks(self) -> list[str]:
+        return [str(choice.args[0].attr) for choice in reversed(self.chains()[0])]
+
+    def laid(self) -> Iterator[str]:
+        """Loops over the active rows of each choice, a few rows at a time: these stay in the nearest cache."""
+        chains, masks, first = self.chains(), self.masks(), self.first
+        names = [out.var.name for out in self.loop.outs]
+        count = len(masks)
+        self.active = first + count + 1
+        self.layout.active = max(self.layout.active, self.active)
+        bases = [str(chain[-1].args[2].attr) for chain in chains]
+        self.fields |= set(bases)
+        copies = " ".join(
+            f"some{name} |= lay_row(c, {name}, l{name}, {base}, l{base}, y, any);"
+            for name, base in zip(names, bases, strict=True)
+        )
+        yield "for (int from = first; from < last; from += c.near_rows) {"
+        yield (
+            f"for (int y = from; y < from + c.near_rows && y < last; y++) {{ "
+            f"const bool any = is_active(c, {first + count}, l, y); {copies} }}"
+        )
+        for level in range(count):
+            at = count - 1 - level
+            values = _Chunks(self.layout, ())
+            olds = [values.temporary(f"*(const F*)(o{name} + x)") for name in names]
+            values.known |= {id(chain[at].args[2]): old for chain, old in zip(chains, olds, strict=True)}
+            found = [values.of(chain[at].args[1]) for chain in chains]
+            self.fields |= values.fields
+            stores = [
+                f"*(F*)(o{name} + x) = blend(bits, {value}, {old});"
+                for name, value, old in zip(names, found, olds, strict=True)
+            ]
+            rows = [f"float* o{name} = row_of(c, {name}, l{name}, y);" for name in names]
+            rows += [f"const float* {name} = {call};" for call, name in values.rows.items()]
+            yield f"EACH_ACTIVE({first + level}) {{ {' '.join(rows)}"
+            yield (
+                f"for (int w = 0; w < words; w++) if (const u64 m = ((const u64*){masks[level]}->data)"
+                "[(y * words + w) * LANES + l])"
+            )
+            yield (
+                "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) "
+                "{ const u32 bits = m >> (x & 63) & 0xffff;"
+            )
+            yield f"{' '.join([*values.lines, *stores])} }} }}"
+        finish = " ".join(f"finish_row(c, row_of(c, {name}, l{name}, y));" for name in names)
+        yield f"EACH_ACTIVE({first + count}) {{ {finish} }}\n}}"
+
+
+class _Chunks:
+    """Values of sixteen cells of one world."""
+
+    def __init__(self, layout: Layout, outs: tuple[Out, ...]):
+        self.layout = layout
+        self.lines: list[str] = []
+        self.known: dict[int, str] = {}
+        self.rows: dict[str, str] = {}
+        self.words: dict[str, str] = {}
+        self.fields: set[str] = set()
+        self.choices = [node for node in ordered(out.value for out in outs) if node.op == "select"]
+        self.led: dict[str, tuple[list[str], dict[int, str], list[str]]] = {}
+        """What is computed only where a comparison holds somewhere in the chunk, by its name."""
+        self.count = 0
+
+    def temporary(self, text: str, type: str = "F", prefix: str = "v") -> str:
+        self.count += 1
+        name = f"{prefix}{self.count}"
+        self.lines.append(f"const {type} {name} = {text};")
+        return name
+
+    def of(self, root: Node) -> str:
+        """The name of a value: floats, or sixteen bits."""
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            if node.op == "select":
+                self.choice(node)
+            elif node.op == "led":
+                self.under(node)
+            elif ready or not node.args or node.op == "shift":
+                self.known[id(node)] = self.node(node)
+            else:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(node.args))
+        return self.known[id(root)]
+
+    def row(self, field: str, dy: int, *, wraps: bool = True) -> str:
+        """The pointer to a field's row, set up once a row."""
+        self.fields.add(field)
+        self.layout.rows = max(self.layout.rows, abs(dy))
+        kind = "_wrapped" if wraps and dy else "" if wraps else "_or_nothing"
+        at = f"y + {dy}" if dy or not wraps else "y"
+        return self.rows.setdefault(f"real_row{kind}(c, {field}, l{field}, {at})", f"r{len(self.rows)}")
+
+    def word(self, node: Node) -> str:
+        """The word of a flag's plane, read once a row and word."""
+        if node.op == "param":
+            return f"c.param_bits[{self.layout.param_planes[param_key(node)]}][l]"
+        return self.words.setdefault(str(node.attr), f"m{len(self.words)}")
+
+    def mask(self, node: Node) -> str:
+        """Sixteen bits of a flag's plane."""
+        return f"(u32)({self.word(node)} >> (x & 63) & 0xffff)"
+
+    def node(self, node: Node) -> str:
+        attr = node.attr
+        match node.op:
+            case "const":
+                return f"splatf({literal(float(attr))})"
+            case "load" if node.type != REAL:
+                return self.temporary(self.mask(node), "u32", "b")
+            case "load":
+                return self.temporary(f"load({self.row(str(attr), 0)}, x + 0)")
+            case "param":
+                return self.temporary(f"splatf(c.param_real[{self.layout.param_reals[attr[0]]}][l])")
+            case "draw":
+                return self.draw(node)
+            case "shift":
+                dy, dx, wraps = attr
+                loaded = f"load({self.row(str(node.args[0].attr), dy, wraps=wraps)}, x + {dx})"
+                self.layout.reach = max(self.layout.reach, abs(dx))
+                return self.temporary(
+                    loaded if wraps or not dx else f"inside_columns({loaded}, x, {dx}, width)"
+                )
+        args = [self.known[id(arg)] for arg in node.args]
+        match node.op:
+            case "eq" | "lt" | "le":
+                return self.temporary(f"bits_{node.op}({args[0]}, {args[1]})", "u32", "b")
+            case "add" | "sub" | "mul":
+                return self.temporary(f"{args[0]} {_INFIX[node.op]} {args[1]}")
+            case "div" if node.args[1].op == "const" and node.args[1].attr:
+                return self.temporary(quotient(args[0], float(node.args[1].attr)))
+            case "div":
+                return self.temporary(f"divide({args[0]}, {args[1]})")
+            case "neg":
+                return self.temporary(f"-{args[0]}")
+            case "abs" | "min" | "max" | "sqrt":
+                call = {"abs": "magnitude", "min": "smaller", "max": "larger", "sqrt": "root"}[node.op]
+                return self.temporary(f"{call}({', '.join(args)})")
+            case "settle":
+                lo, hi = attr
+                return self.temporary(f"settle({args[0]}, {literal(lo)}, {literal(hi)}, SNAP)")
+        raise AssertionError(f"no C++ kernel for {node.op}")
+
+    def draw(self, node: Node) -> str:
+        stream, bits = node.attr
+        self.count += 1
+        name = f"d{self.count}"
+        cell = f"draw_cell(c, {self.layout.streams[stream]}, l, y, std::min(x + i, width - 1), {bits})"
+        self.lines.append(f"F {name}; for (int i = 0; i < CHUNK; i++) {name}[i] = {cell};")
+        return name
+
+    def under(self, node: Node) -> None:
+        """A comparison, computed only where the one that leads it holds in the chunk."""
+        leader, comparison = node.args
+        first = self.of(leader)
+        self.count += 1
+        name = f"b{self.count}"
+        self.lines.append(f"u32 {name} = 0;")
+        lines, known, ends = self.led.setdefault(first, ([], dict(self.known), []))
+        outer, before = self.lines, self.known
+        self.lines, self.known = lines, known
+        value = self.of(comparison)
+        self.lines, self.known = outer, before
+        ends.append(f"{name} = {value} & {first};")
+        self.known[id(node)] = name
+
+    def close(self) -> None:
+        """Write what depends on comparisons."""
+        for first, (lines, _, ends) in self.led.items():
+            self.lines.append(f"if ({first}) {{ {' '.join([*lines, *ends])} }}")
+
+    def chain(self, node: Node) -> list[Node]:
+        """A choice and those below it in its third argument, the outermost first."""
+        chain: list[Node] = []
+        while node.op == "select" and id(node) not in self.known:
+            chain.append(node)
+            node = node.args[2]
+        return chain
+
+    def choice(self, node: Node) -> None:
+        """Choices laid over each other. Where no cell of the chunk is chosen, nothing of a choice is computed."""
+        chain = self.chain(node)
+        masks = [choice.args[0] for choice in chain]
+        # Parts of a vector depend on the same masks: they are tested once for both.
+        alike = [
+            self.chain(other) for other in self.choices if other is not node and id(other) not in self.known
+        ]
+        chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
+        names = []
+        for one in chains:
+            base = self.of(one[-1].args[2])
+            self.count += 1
+            names.append(f"v{self.count}")
+            self.lines.append(f"F {names[-1]} = {base};")
+        for level in reversed(range(len(chain))):
+            self.count += 1
+            bits = f"b{self.count}"
+            outer, before = self.lines, self.known
+            running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
+            self.lines, self.known = [], before | running  # only here: the names' values change
+            chosen = [self.of(one[level].args[1]) for one in chains]
+            blends = [
+                f"{name} = blend({bits}, {value}, {name});" for name, value in zip(names, chosen, strict=True)
+            ]
+            inner, self.lines, self.known = self.lines, outer, before
+            self.lines.append(
+                f"if (const u32 {bits} = {self.mask(masks[level])}) {{ {' '.join([*inner, *blends])} }}"
+            )
+        for one, name in zip(chains, names, strict=True):
+            self.known[id(one[0])] = name
+
+
+def quotient(value: str, divisor: float) -> str:
+    """A division by a constant. By a product, if the divisor's fraction is not all ones (Markstein 1990, theorem 8)."""
+    short = np.float32(divisor)
+    if short.view(np.uint32) & 0x7FFFFF == 0x7FFFFF or not 2.0**-60 < abs(divisor) < 2.0**60:
+        return f"{value} / splatf({literal(divisor)})"
+    return f"divide_by({value}, {literal(divisor)}, {literal(float(np.float32(1) / short))})"

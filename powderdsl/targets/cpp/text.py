@@ -1,0 +1,361 @@
+"""Schedules -> C++: loops over rows and words of planes, movements, guards. Nothing is decided here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from powderdsl.ir.ops import FLAG, REAL, Node
+from powderdsl.schedule.empty import is_whole
+from powderdsl.schedule.types import Compute, Forget, Guard, Move, Release, Schedule, Statement, Sweeps, Var
+from powderdsl.targets.cpp.cells import sweeps_text
+from powderdsl.targets.layout import Layout, param_key
+
+_LOGIC = {"and": "&", "or": "|", "xor": "^"}
+LOOP = (
+    "for (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) "
+    "{ const V valid = c.valid(w); (void)valid;"
+)
+
+
+def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
+    """The function of a pass."""
+    printer = _Printer(layout)
+    changed = {slot for slot, _ in schedule.leaves}
+    lines = []
+    if schedule.when is not None:
+        lines.append(f"if (!{answer(schedule.when)}) return;")
+    lines.append(
+        "const int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0; "
+        "(void)words; (void)height; (void)width; (void)strips;"
+    )
+    for slot, var in schedule.finds:
+        place = printer.slot(slot, var)
+        if slot in changed:  # nobody else holds it while the pass runs, so it can be written over
+            lines.append(f"{kind(var)}* {var.name} = {place}; {place} = nullptr;")
+        else:
+            lines.append(f"{kind(var)}* {var.name} = keep({place});")
+    lines += printer.block(schedule.body, frozenset())
+    lines += printer.leave(schedule)
+    body = "\n".join(lines)
+    return f"// pass {number}\nOUTLINE void pass_{number}(Context& c) {{\n{body}\n}}"
+
+
+def kind(var: Var) -> str:
+    return "Field" if var.type == REAL else "Plane"
+
+
+def answer(node: Node) -> str:
+    """A condition in C++."""
+    match node.op:
+        case "any":
+            return f"!{node.args[0].attr}->zero"
+        case "present":
+            return f"(c.present & {node.attr:#x}ull)"
+        case "const":
+            return "true" if node.attr else "false"
+    sign = " && " if node.op == "and" else " || "
+    return f"({sign.join(map(answer, node.args))})"
+
+
+class _Printer:
+    def __init__(self, layout: Layout):
+        self.layout = layout
+        self.active = 0
+        """Lists of active rows that are taken."""
+
+    def slot(self, name: str, var: Var) -> str:
+        if var.type == REAL:
+            return f"c.real[{self.layout.reals[name]}]"
+        return f"c.slot[{self.layout.planes[name]}]"
+
+    def block(self, body: Sequence[Statement], declared: frozenset[str]) -> Iterator[str]:
+        """`declared`: variables that a guard around the block has declared."""
+        for statement in body:
+            match statement:
+                case Compute((out,), _, "words") if is_whole(out.value):
+                    type = "" if out.var.name in declared else "Plane* "
+                    yield f"{type}{out.var.name} = {whole(out.value, self.layout)};"
+                case Compute():
+                    yield from self.words(statement, declared)
+                case Sweeps():
+                    text, self.active = sweeps_text(statement, declared, self.layout, self.active)
+                    yield text
+                case Move():
+                    yield from self.move(statement, declared)
+                case Guard():
+                    yield from self.guard(statement, declared)
+                case Release(names):
+                    yield " ".join(f"give(c, {name});" for name in names)
+                case Forget():
+                    yield "c.present = ~0ull;"
+                case _:
+                    raise AssertionError("no such statement in C++")
+
+    def leave(self, schedule: Schedule) -> Iterator[str]:
+        """What the pass leaves in slots; everything is taken before anything is put."""
+        left = []
+        for number, (slot, node) in enumerate(schedule.leaves):
+            value = node.attr if node.op == "load" else "c.everything" if node.attr else "c.nothing"
+            yield f"{'Field' if node.type == REAL else 'Plane'}* s{number} = keep({value});"
+            left.append(self.slot(slot, Var(value, node.type)))
+        for number, place in enumerate(left):
+            yield f"if ({place}) give(c, {place}); {place} = s{number};"
+        names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
+        yield " ".join(f"give(c, {name});" for name in names)
+
+    def guard(self, guard: Guard, declared: frozenset[str]) -> Iterator[str]:
+        asked = " || ".join(f"!{node.attr}->zero" for node in guard.when) or "false"
+        kept = [var for var, _ in guard.keeps]
+        for var in kept:
+            if var.name not in declared:
+                yield f"{kind(var)}* {var.name};"
+        yield f"if ({asked}) {{"
+        yield from self.block(guard.body, frozenset(var.name for var in kept))
+        if kept:
+            yield "} else {"
+            for var, value in guard.keeps:
+                yield f"{var.name} = {_kept(value)};"
+        yield "}"
+
+    def move(self, move: Move, declared: frozenset[str]) -> Iterator[str]:
+        dy, dx = move.offset
+        self.layout.around = max(self.layout.around, abs(dy))
+        movers = str(move.movers.attr)
+        names = {plane.new.name: "" if plane.new.name in declared else "Plane* " for plane in move.planes}
+        if any(_leaves(plane.old, plane.leaves, movers) is None for plane in move.planes):
+            (plane,) = move.planes
+            old, rest = plane.old.attr, _held(plane.leaves)
+            target = f"shifted(c, {movers}, {-dy}, {-dx})"
+            call = (
+                f"swap_plane(c, {old}, {movers}, target, {rest}, {dy}, {dx})"
+                if move.op == "swap"
+                else f"arrive_plane(c, {old}, target, {rest}, {dy}, {dx})"
+            )
+            if names[plane.new.name]:
+                yield f"Plane* {plane.new.name};"
+            yield f"{{ Plane* target = {target}; {plane.new.name} = {call}; give(c, target); }}"
+            if plane.into:
+                yield f"give(c, {old});"
+            return
+        self.layout.moving = max(self.layout.moving, len(move.planes))
+        kinds: dict[str, list[str]] = {}
+        for plane in move.planes:
+            value = plane.old.attr if plane.into else f"keep({plane.old.attr})"
+            yield f"{names[plane.new.name]}{plane.new.name} = {value};"
+            leaves = _leaves(plane.old, plane.leaves, movers)
+            assert leaves is not None
+            kinds.setdefault(leaves, []).append(f"&{plane.new.name}")
+        for leaves, targets in kinds.items():
+            function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves}>"
+            call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(targets)});"
+            yield f"{{ Plane** const all[] = {{{', '.join(targets)}}}; {call} }}"
+
+    def words(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
+        names = [out.var.name for out in loop.outs]
+        values = _Words(self.layout)
+        stores = [
+            f"{{ const V o = {values.clean(out.value)}; {out.var.name}->data[i] = o; a{out.var.name} |= o; }}"
+            for out in loop.outs
+        ]
+        new = [name for name in names if name not in declared]
+        if new:
+            yield "Plane " + ", ".join(f"*{name}" for name in new) + ";"
+        if loop.when is not None:
+            without = " ".join(f"{name} = keep(c.nothing);" for name in names)
+            yield f"if (!{answer(loop.when)}) {{ {without} }} else {{"
+        else:
+            yield "{"
+        yield values.ready()
+        yield " ".join(f"{name} = take(c); V a{name} = splat(0);" for name in names)
+        yield "\n".join([LOOP, *values.lines, *stores, "}"])
+        yield " ".join(f"{name}->zero = !any(a{name});" for name in names) + " }"
+
+
+def _held(value: Node) -> str:
+    """The variable that holds a plane, or a plane of the context."""
+    return str(value.attr) if value.op == "load" else "c.everything" if value.attr else "c.nothing"
+
+
+def _kept(value: Node) -> str:
+    if value.op == "load" or value.type == FLAG:
+        return f"keep({_held(value)})"
+    return "keep(c.calm)"
+
+
+def _leaves(old: Node, rest: Node, movers: str) -> str | None:
+    """What movers leave behind, as planes.hpp calls it; None if it is not as simple."""
+    if rest is old:
+        return "SAME"
+    if rest.op not in ("and", "or") or old not in rest.args:
+        return None
+    (other,) = (arg for arg in rest.args if arg is not old)
+    if rest.op == "or":
+        return "EVERYTHING" if other.attr == movers else None
+    return "NOTHING" if other.op == "not" and other.args[0].attr == movers else None
+
+
+def whole(value: Node, layout: Layout) -> str:
+    """An operation on whole planes that sees at once when there is nothing to do, see `empty.is_whole`."""
+    args = value.args
+    match value.op:
+        case "load" | "const":
+            return f"keep({_held(value)})"
+        case "shift":
+            dy, dx, _ = value.attr
+            layout.around = max(layout.around, abs(dy))
+            return f"shifted(c, {args[0].attr}, {dy}, {dx})"
+        case "or":
+            return f"joined(c, {args[0].attr}, {args[1].attr})"
+    kept, gone = args if args[1].op == "not" else args[::-1]
+    return f"cleared(c, {kept.attr}, {gone.args[0].attr})"
+
+
+class _Words:
+    """Values of a word of 64 columns in eight worlds."""
+
+    def __init__(self, layout: Layout):
+        self.layout = layout
+        self.lines: list[str] = []
+        self.known: dict[int, str] = {}
+        self.edges: dict[tuple[str, str], int] = {}
+        """How many rows away planes are read, by the call that makes these ready and the plane."""
+        self.clear: dict[int, bool] = {}
+        self.count = 0
+
+    def ready(self) -> str:
+        """Statements before the loop: rows of other strips that it reads."""
+        return " ".join(f"{call}(c, {plane}, {rows});" for (call, plane), rows in self.edges.items())
+
+    def name(self, text: str) -> str:
+        self.count += 1
+        self.lines.append(f"const V t{self.count} = {text};")
+        return f"t{self.count}"
+
+    def of(self, root: Node) -> str:
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            if not ready:
+                stack.append((node, True))
+                below = node.args[:1] if node.op == "when" else () if node.op == "shift" else node.args
+                stack.extend((arg, False) for arg in reversed(below))
+                continue
+            text = self.lazy(node) if node.op == "when" else self.node(node)
+            self.known[id(node)] = text if text.isidentifier() else self.name(text)
+        return self.known[id(root)]
+
+    def lazy(self, node: Node) -> str:
+        """Both; the second only where the first holds in the word."""
+        self.count += 1
+        name = f"g{self.count}"
+        first = self.known[id(node.args[0])]
+        outer, self.lines = self.lines, []
+        known = dict(self.known)
+        value = self.clean(node.args[1])
+        inner, self.lines = self.lines, outer
+        self.known = known
+        self.lines.append(
+            f"V {name} = splat(0);\nif (any({first})) {{ {' '.join(inner)} {name} = {value}; }}"
+        )
+        return name
+
+    def clean(self, node: Node) -> str:
+        """The value with nothing beyond the grid's width."""
+        name = self.of(node)
+        return name if self.is_clean(node) else self.name(f"{name} & valid")
+
+    def is_clean(self, node: Node) -> bool:
+        """Whether bits beyond the width are surely zero."""
+        if id(node) not in self.clear:
+            match node.op:
+                case (
+                    "load" | "const" | "inside" | "chance" | "below_planes" | "below_param" | "when" | "shift"
+                ):
+                    found = True
+                case "coordinate":
+                    found = node.attr[0] != "step"
+                case "and":
+                    found = any(self.is_clean(arg) for arg in node.args)
+                case "or" | "xor":
+                    found = all(self.is_clean(arg) for arg in node.args)
+                case "select":
+                    found = all(self.is_clean(arg) for arg in node.args[1:])
+                case _:
+                    found = False
+            self.clear[id(node)] = found
+        return self.clear[id(node)]
+
+    def row(self, plane: str, dy: int) -> str:
+        if dy == 0:
+            return "y * words"
+        self.reads("edges", plane, dy)
+        self.layout.around = max(self.layout.around, abs(dy))
+        return f"c.row(y + {dy})"
+
+    def reads(self, call: str, plane: str, dy: int) -> None:
+        if dy:
+            self.edges[call, plane] = max(self.edges.get((call, plane), 0), abs(dy))
+
+    def node(self, node: Node) -> str:
+        attr = node.attr
+        if node.op == "and":
+            for value, draw in (node.args, node.args[::-1]):
+                if draw.op in ("chance", "below_param", "below_planes") and draw.args[-1:] == (value,):
+                    return self.known[id(draw)]  # it holds only where it is asked for
+        args = [self.known[id(arg)] for arg in node.args] if node.op != "shift" else []
+        if node.op in _LOGIC:
+            return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
+        match node.op:
+            case "load":
+                return f"{attr}->data[y * words + w]"
+            case "shift":
+                return self.shift(node)
+            case "const":
+                return self.name("valid" if attr else "splat(0)")
+            case "param":
+                return f"c.param_bits[{self.layout.param_planes[param_key(node)]}]"
+            case "coordinate":
+                axis, modulus, bit = attr
+                if axis == "step":
+                    return f"c.step_bits[{self.layout.step_planes[modulus, bit]}]"
+                return f"c.fixed[{self.layout.fixed[0 if axis == 'row' else 1, modulus, bit]}][y * words + w]"
+            case "inside":
+                return f"c.fixed[{self.layout.fixed[2, attr[0], attr[1]]}][y * words + w]"
+            case "chance":
+                stream, bits, limit = attr
+                wanted = self.clean(node.args[0]) if args else "valid"
+                return f"draw_below(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, {limit}ull)"
+            case "below_planes":
+                bits = attr[1]
+                return self.below(node, args[: bits + 1], node.args[bits + 1 :])
+            case "below_param":
+                _, bits, name, view = attr
+                numbers = [self.layout.param_planes[name, view, i] for i in range(bits, -1, -1)]
+                return self.below(node, [f"c.param_bits[{number}]" for number in numbers], node.args)
+            case "not":
+                return f"~{args[0]}"
+            case "select":
+                return f"mux({', '.join(args)})"
+        raise AssertionError(f"no C++ kernel for {node.op}")
+
+    def below(self, node: Node, limit: Sequence[str], where: Sequence[Node]) -> str:
+        """A draw below a limit, given plane by plane from the highest."""
+        stream, bits = node.attr[:2]
+        wanted = self.clean(where[0]) if where else "valid"
+        self.count += 1
+        name = f"limit{self.count}"
+        self.lines.append(f"const V {name}[] = {{{', '.join(limit)}}};")
+        return f"draw_below_planes(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, {name})"
+
+    def shift(self, node: Node) -> str:
+        dy, dx, wraps = node.attr
+        plane = str(node.args[0].attr)
+        if wraps:
+            if not dx:
+                return f"{plane}->data[{self.row(plane, dy)} + w]"
+            return f"columns(c, {plane}->data + {self.row(plane, dy)}, w, {dx})"
+        self.reads("bare_edges", plane, dy)
+        row = f"row_or_nothing(c, {plane}, y + {dy})"
+        return f"columns_zero(c, {row}, w, {dx})" if dx else f"{row}[w]"
