@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset, walk
 from powderdsl.schedule.draws import DRAWS, all_of, asked_for
@@ -399,17 +400,22 @@ class Cutter:
         if flags:
             self.words([(named.get(id(n)) or self.namer.var(FLAG), n) for n in flags], place)
 
-    def words(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
+    def words(self, pairs: Sequence[tuple[Var, Node]], place: str, when: Node | None = None) -> None:
         outs = tuple(Out(var, self.word(node)) for var, node in pairs)
-        self.statements.append(Compute(outs, place, "words"))
+        self.statements.append(Compute(outs, place, "words", when=when))
         self.known |= {id(node): var for var, node in pairs if not self.have(node)}
 
-    def cells(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
+    def cells(
+        self,
+        pairs: Sequence[tuple[Var, Node]],
+        place: str,
+        over: Literal["cells", "choices"] = "cells",
+    ) -> None:
         """A loop over cells: floats first, then comparisons, those that lead before those that they lead."""
         pairs = sorted(pairs, key=lambda pair: (pair[1].type != REAL, pair[1].op == "led"))
         cells = _Cells(self)
         outs = tuple(Out(var, cells.value(node)) for var, node in pairs)
-        self.statements.append(Compute(outs, place, "cells"))
+        self.statements.append(Compute(outs, place, over))
         self.known |= {id(node): var for var, node in pairs}
 
     # Values of a loop

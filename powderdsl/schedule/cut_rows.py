@@ -46,12 +46,10 @@ def cut_rows(costs: Costs) -> Callable[[Schedule], Schedule]:
 
 def gate_cost(node: Node, have: Have, limit: int = 1000) -> int:
     """Gates that computing a flag in another row takes; `limit` if it cannot be done there."""
-    if have(node) or node.op in UNIFORM:
-        return (
-            0
-            if have(node) or is_constant(node) or node.op == "coordinate" and node.attr[0] == "step"
-            else limit
-        )
+    if have(node) or is_constant(node):
+        return 0
+    if node.op in UNIFORM:
+        return limit
     if is_movement(node) or of_floats(node) or node.op in DRAWS:
         return limit
     if node.op == "shift":
@@ -344,9 +342,7 @@ class _RowCutter(Cutter):
         if floats := [node for node in floats if node not in laid]:
             self.kept_cells([(var(node), node) for node in floats], place)
         if flags:
-            self.words([(var(node), node) for node in flags], place)
-            if when is not None:
-                self.statements[-1] = replace(self.statements[-1], when=when)
+            self.words([(var(node), node) for node in flags], place, when)
         for node in moves:
             content, movers, rest = (self.variable(arg) for arg in node.args)
             plane = Carried(var(node), content, rest)
@@ -360,8 +356,7 @@ class _RowCutter(Cutter):
             chain = chain_of(node, self.have)
             groups.setdefault(tuple(id(choice.args[0]) for choice in chain), []).append((var, node))
         for group in groups.values():
-            self.cells(group, place)
-            self.statements[-1] = replace(self.statements[-1], over="choices")
+            self.cells(group, place, "choices")
 
     def kept_cells(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
         """A loop over cells; what it computes of clamped slots stays as it was where no choice is made at all."""

@@ -52,7 +52,7 @@ def join(schedule: Schedule) -> Schedule:
 
 def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
     written = [out.var.name for loop in run for out in loop.outs if out.var.type == REAL]
-    inside = {name: 0 for name in written}
+    inside = dict.fromkeys(written, 0)
     for name in loaded(node for loop in run for node in values_of(loop)):
         if name in inside:
             inside[name] += 1

@@ -43,6 +43,8 @@ class _Lowering:
         guarded = [node for node in dict.fromkeys(node for _, node in new) if id(node) in olds]
         if guarded:
             self.compute(guards, step.place)
+            guarded = [node for node in guarded if self.missing(node)]  # a write may be a mask
+        if guarded:
             outer, self.body = self.body, []
             when = tuple(self.value(guard) for guard in guards)
             self.compute(guarded, step.place)
