@@ -207,6 +207,20 @@ def stages() -> str:
     return table(("stage", "what it does"), [(f"`{stage.name}`", stage.about) for stage in PIPELINE])
 
 
+def planner() -> str:
+    from powderdsl.schedule.stages import ARRAYS, CPP, CUDA
+
+    targets = {"arrays": ARRAYS, "C++": CPP, "CUDA": CUDA}
+    names = dict.fromkeys(stage.name for stages in targets.values() for stage in stages)
+    rows = []
+    for name in names:
+        found = {
+            target: stage for target, stages in targets.items() for stage in stages if stage.name == name
+        }
+        rows.append((f"`{name}`", next(iter(found.values())).about, ", ".join(found)))
+    return table(("stage", "what it decides", "for"), rows)
+
+
 def commands() -> str:
     rows = [(f"`powderdsl {name}`", about) for name, (_, about) in COMMANDS.items()]
     return table(("command", "what it does"), rows)
@@ -279,6 +293,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "scene statements": scene_statements,
     "tasks": tasks,
     "stages": stages,
+    "planner": planner,
     "commands": commands,
     **{f"keys {context}": partial(keys, context) for context in ALL_KEYS},
 }

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 _FRONT = ("diagnostics", "system", "syntax", "model")
 _COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
-_TARGETS = ("targets", "targets.dense", "targets.planes", "targets.arrays", "targets.cpp", "targets.cuda")
+_TARGETS = ("targets", "targets.dense", "targets.arrays", "targets.cpp", "targets.cuda")
 _BACK = (*_COMPILER, "model.reference", *_TARGETS)
 _STEPS = (
     "simulation.draw",
@@ -53,7 +53,6 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "schedule": ("diagnostics", "ir"),
     "targets": ("diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.dense": ("diagnostics", "ir", "schedule", "targets"),
-    "targets.planes": ("diagnostics", "ir", "schedule", "targets", "targets.dense"),
     "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.dense", "targets.planes"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense", "targets.cpp"),

@@ -78,52 +78,36 @@ def find_device(name: str | torch.device) -> torch.device:
     return device
 
 
-PLANES_FROM = 1 << 16
-"""Cells of a batch from which packed words beat one tensor element a cell on a device. On the CPU they always do."""
-
-
 class TorchProgram:
-    """Torch in its two forms, which give the same worlds: cells for little work on a device, else packed planes."""
+    """What runs without a compiler: bit planes in NumPy's arrays on the CPU, tensors of cells on other devices."""
 
     running = "torch"
 
     def __init__(self, program: Program, device: torch.device):
         self.program = program
         self.device = device
-        self._cells: Runnable | None = None
-        self._planes: Runnable | None = None
+        self._made: Runnable | None = None
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
-        return self._fit_for(job).run(job)
+        return self.made().run(job)
 
     def profile(self, job: Job) -> Mapping[str, float]:
         """Seconds by pass over `job.steps`."""
-        return profile_of(self._fit_for(job), job)
+        return profile_of(self.made(), job)
 
-    def _fit_for(self, job: Job) -> Runnable:
-        if self.device.type == "cpu" or job.state["element"].numel() >= PLANES_FROM:
-            return self.planes()
-        if self._cells is None:
+    def made(self) -> Runnable:
+        """The program, made when first needed; passes that planes cannot carry run on cells."""
+        if self._made is None:
+            from powderdsl.targets.arrays.program import ArrayProgram
+            from powderdsl.targets.dense.mixed import packed_program
             from powderdsl.targets.dense.program import DenseProgram
 
-            self._cells = DenseProgram(self.program, self.device)
-        return self._cells
-
-    def planes(self) -> Runnable:
-        """The program on packed words, made when first needed; passes that planes cannot carry run on cells."""
-        from powderdsl.targets.arrays.program import ArrayProgram
-        from powderdsl.targets.dense.mixed import packed_program
-        from powderdsl.targets.planes.program import PlanesProgram
-
-        def packed(cells: Program, planes: Program) -> Runnable:
             if self.device.type == "cpu":
-                return ArrayProgram(cells, planes)
-            return PlanesProgram(cells, planes, self.device)
-
-        if self._planes is None:
-            self._planes = packed_program(self.program, self.device, packed)
-        return self._planes
+                self._made = packed_program(self.program, self.device, ArrayProgram)
+            else:
+                self._made = DenseProgram(self.program, self.device)
+        return self._made
 
 
 class CompiledProgram:
@@ -159,7 +143,7 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
     if backend == "dense":
         return DenseProgram(lowered(), device)
     if backend == "planes":
-        return torch_program().planes()
+        return torch_program().made()
     if backend == "native":
         return CompiledProgram(_native(ruleset, lowered, device, threads), torch_program)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):

@@ -5,11 +5,9 @@ from __future__ import annotations
 import pytest
 
 import powderdsl
-from powderdsl.compiler import lower, shipped_rules
+from powderdsl.compiler import shipped_rules
 from powderdsl.model.types import Ruleset
 from powderdsl.targets.arrays import draws, kernels, program
-from powderdsl.targets.dense.mixed import packed_program
-from powderdsl.targets.planes.program import PlanesProgram
 from tests.compilers import skip_without_compiler
 
 SIZES = [(1, 1), (1, 7), (5, 1), (2, 2), (3, 33), (7, 64), (4, 65), (9, 130)]
@@ -18,21 +16,11 @@ RULESETS = [name for name in shipped_rules() if name not in PACKS_ALONE]
 
 
 def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:
-    if backend == "tensors":  # what `planes` is on a device: here on the CPU, to be compared
-        return on_tensors(rules)
     skip_without_compiler(backend)
     return powderdsl.compile(rules, backend=backend)
 
 
-def on_tensors(rules: Ruleset) -> powderdsl.Simulator:
-    sim = powderdsl.compile(rules, backend="planes")
-    sim._program = packed_program(
-        lower(rules), sim.device, lambda cells, planes: PlanesProgram(cells, planes, sim.device)
-    )
-    return sim
-
-
-@pytest.mark.parametrize("backend", ["dense", "planes", "tensors", "native"])
+@pytest.mark.parametrize("backend", ["dense", "planes", "native"])
 @pytest.mark.parametrize("name", RULESETS)
 def test_same_worlds(name: str, backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     rules = powderdsl.load(name)
@@ -65,7 +53,7 @@ def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyp
     rates = torch.tensor([0.0, 0.3, 1.0], dtype=torch.float64)
     ids = torch.randint(14, (3, 8, 40), generator=torch.Generator().manual_seed(1))
     oracle = powderdsl.compile(rules, backend="reference")
-    for backend in ("dense", "planes", "tensors", "native"):
+    for backend in ("dense", "planes", "native"):
         sim = compiled(rules, backend)
         together = sim.step(sim.world(ids, seed=4), 3, params={"water.melt": rates, "fire.spread": rates})
         for i, rate in enumerate(rates.tolist()):

@@ -12,8 +12,8 @@ from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, whole
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.targets.arrays.program import ArrayProgram
 from powderdsl.targets.dense.mixed import MixedProgram, mixed_program
-from powderdsl.targets.planes.program import PlanesProgram
 from powderdsl.testing.fuzz.compare import assert_same, find_difference
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
@@ -127,9 +127,7 @@ def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simula
         return Carried(pass_, None, "refused here") if pass_.name in refused else found
 
     sim = powderdsl.compile(rules, backend="dense")
-    sim._program = mixed_program(
-        segments(program, choose), sim.device, lambda cells, planes: PlanesProgram(cells, planes, sim.device)
-    )
+    sim._program = mixed_program(segments(program, choose), sim.device, ArrayProgram)
     assert isinstance(sim._program, MixedProgram)
     return sim
 

@@ -19,7 +19,7 @@ from powderdsl.syntax.ast import Syntax
 if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
 
-STAGES = ("tree", "model", "ir", "kernels")
+STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 
 
 @click.command("compile")
@@ -29,21 +29,34 @@ STAGES = ("tree", "model", "ir", "kernels")
     "stage",
     type=click.Choice(STAGES),
     required=True,
-    help="tree: rules as parsed; model: checked, loops unrolled; ir: optimised; kernels: what runs.",
+    help="tree: rules as parsed; model: checked, loops unrolled; ir: optimized; planes: on bit planes; "
+    "schedule: loops, guards and buffers; kernels: what runs.",
 )
-@backend_option("auto", "Whose kernels are printed.")
+@backend_option("auto", "Whose schedule or kernels are printed.")
+@click.option(
+    "--after", metavar="STAGE", help="The schedule after this stage of the planner; default: the last."
+)
 @click.option("--pass", "pass_name", metavar="NAME", help="Only this pass of the rules.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), metavar="FILE", help="Where to write it.")
 @set_option
 def command(
-    rules: str, stage: str, backend: str, pass_name: str | None, out: Path | None, settings: dict[str, str]
+    rules: str,
+    stage: str,
+    backend: str,
+    after: str | None,
+    pass_name: str | None,
+    out: Path | None,
+    settings: dict[str, str],
 ) -> None:
     """Print what a stage of the compiler makes of rules."""
+    if after is not None and stage != "schedule":
+        raise BadInput("--after goes with --emit schedule")
     if out is not None:
         check_writable(out)
-    text = (
-        _tree(rules, pass_name) if stage == "tree" else _checked(rules, stage, backend, pass_name, settings)
-    )
+    if stage == "tree":
+        text = _tree(rules, pass_name)
+    else:
+        text = _checked(rules, stage, backend, after, pass_name, settings)
     if out is None:
         click.echo(text, nl=not text.endswith("\n"))
         return
@@ -53,7 +66,9 @@ def command(
         temporary.write_text(text if text.endswith("\n") else text + "\n", encoding="utf-8")
 
 
-def _checked(rules: str, stage: str, backend: str, pass_name: str | None, settings: dict[str, str]) -> str:
+def _checked(
+    rules: str, stage: str, backend: str, after: str | None, pass_name: str | None, settings: dict[str, str]
+) -> str:
     """The stages from the checked model on."""
     ruleset = load_rules(rules, settings)
     if pass_name is not None:
@@ -65,7 +80,46 @@ def _checked(rules: str, stage: str, backend: str, pass_name: str | None, settin
         from powderdsl.ir.text import print_program
 
         return print_program(program, pass_name)
+    if stage == "planes":
+        return _planes(program, pass_name)
+    if stage == "schedule":
+        return _schedules(program, backend, after, pass_name)
     return _kernels(program, backend, pass_name)
+
+
+def _planes(program: Program, pass_name: str | None) -> str:
+    """The program on bit planes, part by part; passes that planes cannot carry as they are."""
+    from powderdsl.ir.segments import segments
+    from powderdsl.ir.text import print_program
+
+    parts = [one.planes or one.program for one in segments(program)]
+    return "\n".join(
+        print_program(part, pass_name)
+        for part in parts
+        if pass_name in (None, *(p.name for p in part.passes))
+    )
+
+
+def _schedules(program: Program, backend: str, after: str | None, pass_name: str | None) -> str:
+    """The schedules of a backend's passes after a stage of the planner."""
+    from powderdsl.ir.segments import segments
+    from powderdsl.schedule.stages import ARRAYS, CPP, CUDA, steps
+    from powderdsl.schedule.text import print_schedule
+
+    planners = {"cuda": CUDA, "native": CPP}
+    if backend in ("reference", "dense"):
+        raise BadInput(f"the {backend} backend has no schedule: it computes pass by pass what the IR says")
+    stages = planners.get(backend, ARRAYS)
+    names = ["lower", *(stage.name for stage in stages)]
+    if after is not None and after not in names:
+        raise BadInput("; ".join([f"no stage `{after}`", *suggest(after, names, "stages")]))
+    texts = []
+    for part in segments(program):
+        for pass_ in part.planes.passes if part.planes else ():
+            if pass_name in (None, pass_.name):
+                schedules = dict(steps(pass_, stages))
+                texts.append(print_schedule(schedules[after or names[-1]]))
+    return "\n\n".join(texts) + "\n"
 
 
 SHOWN_SHARED = 227 << 10
@@ -75,8 +129,8 @@ SHOWN_SHARED = 227 << 10
 def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
     """The generated source of a backend: part by part, where planes cannot carry all passes."""
     from powderdsl.ir.segments import segments
+    from powderdsl.targets.arrays.source import kernel_source as array_source
     from powderdsl.targets.dense.program import kernel_source
-    from powderdsl.targets.planes.program import planes_kernel_source
 
     match backend:
         case "reference":
@@ -98,7 +152,7 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
 
             texts.append(cuda_source(part.planes, 64, 64, SHOWN_SHARED).text)
         else:
-            texts.append(planes_kernel_source(part.planes, pass_name))
+            texts.append(array_source(part.planes, pass_name))
     return "\n\n".join(text for text in texts if text)
 
 

@@ -1,14 +1,13 @@
 """Schedules -> Python: a function for each pass, one line an operation on packed words (flags) or cells (floats).
 
-The source is the same for all kinds of arrays; what it calls (`k`) is not: `targets.planes.program.PlaneKernels`,
-`targets.arrays.program.ArrayKernels`.
+What it calls (`k`) is `targets.arrays.kernels.ArrayKernels`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from powderdsl.ir.ops import REAL, Node, PassGraph
+from powderdsl.ir.ops import REAL, Node, PassGraph, Program
 from powderdsl.schedule.stages import ARRAYS, plan
 from powderdsl.schedule.types import Compute, Guard, Out, Release, Schedule, Statement
 from powderdsl.targets.dense.source import comment
@@ -44,6 +43,15 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, floa
         *(f"    {line}" for line in body),
     ]
     return "\n".join(lines) + "\n", name, constants
+
+
+def kernel_source(program: Program, only: str | None = None) -> str:
+    """The generated source of all passes (or one) of a program on planes."""
+    return "\n\n".join(
+        pass_source(pass_, i)[0]
+        for i, pass_ in enumerate(program.passes)
+        if only is None or pass_.name == only
+    )
 
 
 class _Printer:

@@ -1,0 +1,47 @@
+"""What the planner makes of all shipped rules, as golden text: a change of plan is read before it is merged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from powderdsl.cli.dispatch import main
+
+GOLDEN = Path(__file__).parent / "golden"
+RULES = (
+    *(
+        "powderworld",
+        "life",
+        "brians_brain",
+        "cyclic",
+        "margolus",
+        "wireworld",
+        "langtons_ant",
+        "forest_fire",
+    ),
+    *("core+docs/examples/beetle.yaml", "core+water+fire+lava+docs/examples/steam.yaml"),
+)
+EMITTED = {
+    "planes": ("--emit", "planes"),
+    "arrays": ("--emit", "schedule", "--backend", "planes", "--after", "choices"),
+    "native": ("--emit", "schedule", "--backend", "native"),
+    "cuda": ("--emit", "schedule", "--backend", "cuda"),
+}
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("kind", EMITTED)
+@pytest.mark.parametrize("rules", RULES)
+def test_golden(rules: str, kind: str, golden: Callable[[Path, str], None]) -> None:
+    result = CliRunner().invoke(main, ["compile", rules, *EMITTED[kind]])
+    assert result.exit_code == 0, result.output
+    name = rules.rpartition("/")[2].removesuffix(".yaml")
+    golden(GOLDEN / f"{name}.{kind}.txt", result.stdout)
+
+
+def test_every_shipped_ruleset_is_there() -> None:
+    shipped = {path.stem for path in Path("rules").glob("*.yaml") if "\nruleset:" in f"\n{path.read_text()}"}
+    assert shipped <= set(RULES)
