@@ -53,7 +53,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "schedule": ("diagnostics", "ir"),
     "targets": ("diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.dense": ("diagnostics", "ir", "schedule", "targets"),
-    "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.dense", "targets.planes"),
+    "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.dense"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense", "targets.cpp"),
     "compiler": _COMPILER[:-1],

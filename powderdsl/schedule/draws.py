@@ -49,7 +49,7 @@ def thresholds(schedule: Schedule) -> Schedule:
 def cheap_questions(schedule: Schedule) -> Schedule:
     """A guard asks first for the part of its mask that takes no draws; the draws are made in its body.
 
-    `p = ice & many & below(melt); if any p` → `q = ice & many; if any q: p = …`.
+    `p = a & b & below(limit); if any p` → `q = a & b; if any q: p = …`.
     """
     namer, graph = Namer(schedule), schedule.graph
 

@@ -36,7 +36,7 @@ Sets = frozenset[int]
 def presence(schedule: Schedule) -> Schedule:
     """Masks and the whole pass ask which elements there are; what changes elements forgets what was known.
 
-    `m = is_ice & any neighbor is_water` → the loop of `m` runs only when `present({ice}) & present({water})`. Comes
+    `m = is_a & b[0,1]`, where b is an element too → the loop of `m` runs only when `present(a) & present(b)`. Comes
     before `cut`, which takes masks apart.
     """
     bits = _element_bits(schedule)
