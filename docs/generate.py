@@ -148,7 +148,7 @@ def limits() -> str:
         ("depth of nesting in one rule", parse.MAX_DEPTH),
         ("characters in a name", MAX_NAME),
         ("elements of a ruleset", 256),
-        ("distance of a neighbour, in cells", MAX_OFFSET),
+        ("distance of a neighbor, in cells", MAX_OFFSET),
         ("radius of a kernel, in cells", MAX_RADIUS),
         ("rows of a kernel, and weights of a row", 2 * MAX_RADIUS + 1),
         ("size of a number", MAX_MAGNITUDE),

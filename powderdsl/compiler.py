@@ -1,6 +1,6 @@
 """The sequence: text → located tree → checked model → IR → passes → program. Each stage takes one value and gives one.
 
-`load` stops at the checked model, `lower` at optimised IR; neither needs torch. `simulation.simulator.compile` goes on from there.
+`load` stops at the checked model, `lower` at optimized IR; neither needs torch. `simulation.simulator.compile` goes on from there.
 """
 
 from __future__ import annotations
@@ -464,7 +464,7 @@ def param_value(param: Param, value: Any) -> Value:
 
 
 def lower(ruleset: Ruleset) -> Program:
-    """The checked model as optimised IR."""
+    """The checked model as optimized IR."""
     from powderdsl.ir.lower.rules import lower_ruleset
     from powderdsl.ir.stages import run_passes
 

@@ -15,7 +15,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax.ast import Syntax
 
 OF_COMPOSITIONS = ("PD315", "PD316")
-"""Warnings for whoever puts packs together: what is misspelt beside all known words, which of two values is lost."""
+"""Warnings for whoever puts packs together: what is misspelled beside all known words, which of two values is lost."""
 
 
 def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Diagnostic, ...]:

@@ -73,7 +73,7 @@ def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
             return NotProven(f"together the rules of a step might see {reach} cells far")
         case Never():
             if not satisfiable(facts_of(ruleset), [(claim.condition, (0, 0))]):
-                return Proven("no cell can fulfil the condition")
+                return Proven("no cell can fulfill the condition")
     return NotProven("no proof is known for statements of this kind")
 
 

@@ -51,8 +51,8 @@ def user_values() -> Iterator[None]:
         raise BadInput(" ".join(str(words).split())) from error
 
 
-def colour_wanted(stream: IO[Any]) -> bool:
-    """Colour only on a terminal that has it, and without NO_COLOR (https://no-color.org)."""
+def color_wanted(stream: IO[Any]) -> bool:
+    """Color only on a terminal that has it, and without NO_COLOR (https://no-color.org)."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
@@ -61,8 +61,8 @@ def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> Non
     from powderdsl.diagnostics.printable import write_styled
     from powderdsl.diagnostics.render import render_text
 
-    colour = colour_wanted(stream)
-    write_styled(stream, "\n\n".join(render_text(one, colour=colour) for one in diagnostics) + "\n")
+    color = color_wanted(stream)
+    write_styled(stream, "\n\n".join(render_text(one, color=color) for one in diagnostics) + "\n")
 
 
 def counted(number: int, thing: str) -> str:

@@ -118,7 +118,7 @@ def _data(task: Task) -> dict[str, Any]:
 
 
 def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
-    """Start worlds side by side, each region outlined in a colour of its own."""
+    """Start worlds side by side, each region outlined in a color of its own."""
     import torch
 
     from powderdsl.simulation.media import write_png

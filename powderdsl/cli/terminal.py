@@ -1,4 +1,4 @@
-"""Worlds in a terminal: two cells a character in 24-bit colour, or plain glyphs where there is no colour."""
+"""Worlds in a terminal: two cells a character in 24-bit color, or plain glyphs where there is no color."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from powderdsl.simulation.draw import palette, ramps, rgb, to_numpy
 from powderdsl.worlds.ascii import write_ascii
 
 UPPER_HALF = "▀"
-"""Its colour is the upper cell, its background the lower one."""
+"""Its color is the upper cell, its background the lower one."""
 
 _RESET = "\x1b[0m"
 _NO_BACKGROUND = "\x1b[49m"
@@ -24,9 +24,9 @@ _CLEAR_LINE, _CLEAR_BELOW = "\x1b[2K", "\x1b[J"
 
 
 def render_frame(image: Any) -> str:
-    """A picture uint8 [H, W, 3] as ⌈H/2⌉ lines of half blocks; each line resets its colours.
+    """A picture uint8 [H, W, 3] as ⌈H/2⌉ lines of half blocks; each line resets its colors.
 
-    A colour is written only where it changes, which keeps frames small enough for slow connections.
+    A color is written only where it changes, which keeps frames small enough for slow connections.
     """
     picture = to_numpy(image).tolist()
     lines = []
@@ -61,7 +61,7 @@ class LiveView:
         self.stream: TextIO = unguarded(sys.stdout if stream is None else stream)
         self.elements = elements
         self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
-        self.colour = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
+        self.color = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
         self._colors, self._ramps = palette(elements), ramps(elements)
         self._height = 0
 
@@ -73,7 +73,7 @@ class LiveView:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        # On Ctrl-C too: the frame stays on the screen, and the prompt comes below it in its usual colours.
+        # On Ctrl-C too: the frame stays on the screen, and the prompt comes below it in its usual colors.
         if self.in_place:
             self._write(_RESET + _SHOW_CURSOR)
 
@@ -92,7 +92,7 @@ class LiveView:
             ids = ids[::step, ::step]
             motion = None if motion is None else motion[:, ::step, ::step]
             shown = {name: value[::step, ::step] for name, value in shown.items()}
-        if self.colour:
+        if self.color:
             text = render_frame(rgb(ids, self._colors, motion, ramps=self._ramps, fields=shown))
         else:
             text = write_ascii(ids, self.elements).rstrip("\n")
@@ -110,7 +110,7 @@ class LiveView:
     def _thinning(self, height: int, width: int) -> int:
         """Every how many-th row and column is shown, so that the frame fits: no line may wrap."""
         columns, lines = shutil.get_terminal_size()
-        room = max((lines - 2) * (2 if self.colour else 1), 1)
+        room = max((lines - 2) * (2 if self.color else 1), 1)
         return max(-(-height // room), -(-width // max(columns, 1)), 1)
 
     def _write(self, text: str) -> None:

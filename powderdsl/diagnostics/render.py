@@ -14,7 +14,7 @@ from powderdsl.diagnostics.span import Span
 
 TAB_WIDTH = 4
 MAX_SHOWN = 160
-COLOURS = {Severity.ERROR: "31;1", Severity.WARNING: "33;1", Severity.NOTE: "36;1"}
+COLORS = {Severity.ERROR: "31;1", Severity.WARNING: "33;1", Severity.NOTE: "36;1"}
 
 
 def _cells(text: str) -> int:
@@ -73,16 +73,15 @@ def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
     return lines, gutter
 
 
-def render_text(diagnostic: Diagnostic, *, colour: bool = False) -> str:
+def render_text(diagnostic: Diagnostic, *, color: bool = False) -> str:
     """The full text with source lines and carets. Ends without a line break."""
 
     def paint(text: str, style: str) -> str:
-        return f"\x1b[{style}m{text}\x1b[0m" if colour else text
+        return f"\x1b[{style}m{text}\x1b[0m" if color else text
 
     severity = diagnostic.severity
     head = (
-        paint(f"{severity.value}[{diagnostic.code}]", COLOURS[severity])
-        + f": {printable(diagnostic.message)}"
+        paint(f"{severity.value}[{diagnostic.code}]", COLORS[severity]) + f": {printable(diagnostic.message)}"
     )
     places, gutter = source_lines([diagnostic.primary, *diagnostic.secondary])
     lines = [head, *places]

@@ -15,7 +15,7 @@ MAX_ERRORS = 200
 
 
 MAX_CANDIDATES = 500
-"""Names among which a misspelt one is looked for; if there are more, those with its first letter."""
+"""Names among which a misspelled one is looked for; if there are more, those with its first letter."""
 
 
 class CompileError(Exception):

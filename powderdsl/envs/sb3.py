@@ -1,4 +1,4 @@
-"""`TensorEnv` as a vectorised environment of Stable-Baselines3's."""
+"""`TensorEnv` as a vectorized environment of Stable-Baselines3's."""
 
 from __future__ import annotations
 

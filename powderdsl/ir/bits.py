@@ -181,7 +181,7 @@ class _PassBits:
         offset = node.attr
         if isinstance(content, Node):
             assert isinstance(rest, Node)
-            if content.type == REAL:  # cell by cell anyway: choices between what neighbours hold
+            if content.type == REAL:  # cell by cell anyway: choices between what neighbors hold
                 dy, dx = offset
                 targets = self.gates.shift(movers, (-dy, -dx), True)
                 moved = self.build.select(targets, self.build.shift(content, (-dy, -dx)), rest)
@@ -247,7 +247,7 @@ class _PassBits:
     def _compare(self, node: Node) -> Node:
         gates = self.gates
         left, right = node.args
-        near = self._any_neighbour(node)
+        near = self._any_neighbor(node)
         if near is not None:
             return near
         a, b = self._bits(left), self._bits(right)
@@ -265,8 +265,8 @@ class _PassBits:
             return gates.eq(a, b)
         return gates.lt(a, b) if node.op == "lt" else gates.not_(gates.lt(b, a))
 
-    def _any_neighbour(self, node: Node) -> Node | None:
-        """0 < count(x), 1 <= count(x), count(x) == 0: neighbours are joined, not counted."""
+    def _any_neighbor(self, node: Node) -> Node | None:
+        """0 < count(x), 1 <= count(x), count(x) == 0: neighbors are joined, not counted."""
         left, right = node.args
         counted = right if right.op == "count" else left
         if counted.op != "count" or any(weight < 0 for _, _, weight in counted.attr[0]):

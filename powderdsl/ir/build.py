@@ -113,7 +113,7 @@ class Builder:
             a = self.arithmetic("min", a, self.whole(hi))
         return a
 
-    # Neighbours, choices, movements
+    # Neighbors, choices, movements
 
     def shift(self, a: Node, offset: Offset, wraps: bool = True) -> Node:
         if offset == (0, 0):

@@ -22,7 +22,7 @@ out as native code needs them on worlds full of everything: most do to a factor 
 class PassCost:
     """One pass. Counts are for every cell and step.
 
-    `gates` are those of flags and whole numbers on planes, `shifts` the planes read at a neighbour, `moves` those
+    `gates` are those of flags and whole numbers on planes, `shifts` the planes read at a neighbor, `moves` those
     exchanged with one, `random_bits` what its draws take at most, `reals` operations on float32. A pass on cells has
     `dense` operations instead, with the reason and the rule (``file:line``) that is why. `share` is an estimate.
     """
@@ -36,7 +36,7 @@ class PassCost:
     random_bits: int
     reals: int
     dense: int
-    neighbours: int
+    neighbors: int
     form: str
     why: str
     place: str
@@ -44,7 +44,7 @@ class PassCost:
 
 
 def costs(program: Program) -> tuple[PassCost, ...]:
-    """What the passes of an optimised program cost, in their order. Shares add up to 1."""
+    """What the passes of an optimized program cost, in their order. Shares add up to 1."""
     counts = [_counted(carry(program, pass_)) for pass_ in program.passes]
     weights = [sum(WEIGHTS[kind] * number for kind, number in count.items()) for _, count in counts]
     whole = sum(weights) or 1.0
@@ -62,7 +62,7 @@ def costs(program: Program) -> tuple[PassCost, ...]:
                 random_bits=count["random"],
                 reals=count["real"],
                 dense=count["dense"],
-                neighbours=len(_neighbours(pass_)),
+                neighbors=len(_neighbors(pass_)),
                 form="planes" if carried.planes else "cells",
                 why=carried.why,
                 place=carried.place,
@@ -102,7 +102,7 @@ def _random_bits(nodes: Iterable[Node]) -> int:
     return needed.total()
 
 
-def _neighbours(pass_: PassGraph) -> set[Offset]:
+def _neighbors(pass_: PassGraph) -> set[Offset]:
     """Offsets at which other cells are read or written."""
     found: set[Offset] = set()
     for node in nodes_of(pass_, moments=False):

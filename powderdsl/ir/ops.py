@@ -57,7 +57,7 @@ OPS: dict[str, Op] = {
             "one number a world; view: `value`, or a chance as a threshold for draws",
         ),
         Op("coordinate", (), "?", "(row | column | step, modulus[, bit])"),
-        Op("inside", (), "flag", "offset", "whether that neighbour lies inside the grid"),
+        Op("inside", (), "flag", "offset", "whether that neighbor lies inside the grid"),
         Op(
             "below",
             ("int",),
@@ -81,20 +81,20 @@ OPS: dict[str, Op] = {
             "(stream, bits)",
             "`below`, the limit's planes given highest first",
         ),
-        # neighbours
+        # neighbors
         Op(
             "shift",
             ("?",),
             "=",
             "(rows, columns, wraps)",
-            "the value at a neighbour; zero outside unless it wraps",
+            "the value at a neighbor; zero outside unless it wraps",
         ),
         Op(
             "count",
             ("flag",),
             "int",
             "((rows, columns, weight)…, wraps)",
-            "weighted number of neighbours that hold",
+            "weighted number of neighbors that hold",
         ),
         # flags
         Op("not", ("flag",), "flag"),

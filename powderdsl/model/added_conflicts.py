@@ -147,7 +147,7 @@ def report_added(
         helps = [f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"]
     else:
         helps = [
-            f"give `{first.element}` other values, so that it does not fulfil the conditions of both rules"
+            f"give `{first.element}` other values, so that it does not fulfill the conditions of both rules"
         ]
     if settled:
         holds = (

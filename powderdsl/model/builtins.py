@@ -15,10 +15,10 @@ DIRECTIONS: dict[str, Offset] = {
     "left": (0, -1),
     "right": (0, 1),
 }
-"""Names of neighbours: (rows down, columns right). Paths add up: `above.left`."""
+"""Names of neighbors: (rows down, columns right). Paths add up: `above.left`."""
 
 OCTANTS: tuple[Offset, ...] = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
-"""The eight neighbours by octant: 0 right, 2 below, 4 left, 6 above, odd the diagonals between."""
+"""The eight neighbors by octant: 0 right, 2 below, 4 left, 6 above, odd the diagonals between."""
 
 DIRECTION_SETS: dict[str, tuple[Offset, ...]] = {
     "octants": OCTANTS,
@@ -41,12 +41,12 @@ KERNELS: dict[str, Kernel] = {
     "cross": grid_kernel("cross", ((0, 1, 0), (1, 1, 1), (0, 1, 0))),
     "plus": grid_kernel("plus", ((0, 1, 0), (1, 0, 1), (0, 1, 0))),
 }
-"""Neighbourhoods for `count` and `sum`. Cells outside the grid count as nothing."""
+"""Neighborhoods for `count` and `sum`. Cells outside the grid count as nothing."""
 
 
 @dataclass(frozen=True)
 class KernelShape:
-    """A neighbourhood of any radius: which of the cells (rows, columns) away belong to it."""
+    """A neighborhood of any radius: which of the cells (rows, columns) away belong to it."""
 
     name: str
     about: str
@@ -107,13 +107,13 @@ FUNCTIONS: dict[str, Function] = {
         Function(
             "count",
             "count(SET in KERNEL)",
-            "how many cells of the neighbourhood hold; `box` if none is named",
+            "how many cells of the neighborhood hold; `box` if none is named",
             (1, 16),
         ),
-        Function("sum", "sum(VALUE in KERNEL)", "the weighted sum of a value over the neighbourhood", (1, 1)),
-        Function("at", "at(ROWS, COLUMNS)", "the neighbour so many rows down and columns right", (2, 2)),
+        Function("sum", "sum(VALUE in KERNEL)", "the weighted sum of a value over the neighborhood", (1, 1)),
+        Function("at", "at(ROWS, COLUMNS)", "the neighbor so many rows down and columns right", (2, 2)),
         Function(
-            "inside", "inside(PLACE)", "whether that neighbour lies inside the grid, without wrapping", (1, 1)
+            "inside", "inside(PLACE)", "whether that neighbor lies inside the grid, without wrapping", (1, 1)
         ),
         Function("octant", "octant(VEC2)", "the direction a vector points to", (1, 1)),
         Function("length", "length(VEC2)", "the length of a vector", (1, 1)),
@@ -122,7 +122,7 @@ FUNCTIONS: dict[str, Function] = {
         Function("max", "max(A, B)", "the larger of two numbers", (2, 8)),
         Function("abs", "abs(A)", "a number without its sign", (1, 1)),
         Function("clamp", "clamp(A, LOW, HIGH)", "a number kept between two bounds", (3, 3)),
-        Function("opposite", "opposite(PLACE)", "the neighbour on the other side", (1, 1)),
+        Function("opposite", "opposite(PLACE)", "the neighbor on the other side", (1, 1)),
     )
 }
 
@@ -132,7 +132,7 @@ COORDINATES = ("row", "column", "step")
 KIND_WORDS: dict[str, str] = {
     "flag": "yes or no",
     "element": "the name of an element",
-    "direction": "one of the eight neighbours",
+    "direction": "one of the eight neighbors",
     "chance": "a probability, 0% to 100%",
     "real": "real(LOW..HIGH): a float32",
     "vec2": "vec2(LOW..HIGH): two float32, (rows, columns)",

@@ -12,7 +12,7 @@ from powderdsl.model.added_conflicts import AddedPacks
 from powderdsl.model.composition.compose import Composition, compose
 from powderdsl.model.composition.contested import given_values, report_contested
 from powderdsl.model.composition.layout import matrix_channels, state_order
-from powderdsl.model.composition.optional_names import report_misspelt
+from powderdsl.model.composition.optional_names import report_misspelled
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
@@ -110,7 +110,7 @@ def check(
     typer.unknown.report()
     reporter.raise_if_errors()
     report_contested(composition, reporter)
-    report_misspelt(packs, ruleset, elsewhere, reporter)
+    report_misspelled(packs, ruleset, elsewhere, reporter)
 
     elements = tuple(
         _tagged(element, composition, ramps.get(name)) for name, element in composition.elements.items()

@@ -323,25 +323,23 @@ class Elaborator:
     def _swap(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         subject, place = syntax.children[:2]
         subjects = [self.typer.condition(child, scope) for child in subject.children]
-        offset = self._neighbour(place, scope)
+        offset = self._neighbor(place, scope)
         mask = self._mask(subjects, syntax, scope)
         return [Swap(mask, offset, self._effects(syntax, scope), syntax.span)]
 
     def _move(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         who, place, leaving = syntax.children[:3]
-        offset = self._neighbour(place, scope)
+        offset = self._neighbor(place, scope)
         mask = self._mask([self.typer.condition(who, scope)], syntax, scope)
         left = self.typer.element(self.typer.evaluate(leaving, scope), leaving.span)
         if left.op != "const":
             raise self.typer.fail("PD405", "what is left behind must be one element", leaving.span, "name it")
         return [Move(mask, offset, left, self._effects(syntax, scope), syntax.span)]
 
-    def _neighbour(self, syntax: Syntax, scope: Scope) -> Offset:
+    def _neighbor(self, syntax: Syntax, scope: Scope) -> Offset:
         place = self.typer.place(self.typer.evaluate(syntax, scope), syntax.span)
         if place.offset == (0, 0):
-            raise self.typer.fail(
-                "PD401", "a cell cannot move to itself", syntax.span, "expected a neighbour"
-            )
+            raise self.typer.fail("PD401", "a cell cannot move to itself", syntax.span, "expected a neighbor")
         return self.typer.offset(place.offset, syntax.span)
 
     def _effects(self, syntax: Syntax, scope: Scope) -> tuple[Assign, ...]:
@@ -431,12 +429,12 @@ class Elaborator:
         return name, operand.kind, offset
 
     def _owner(self, syntax: Syntax, scope: Scope) -> Place:
-        """The neighbour before the dot of an assigned field."""
+        """The neighbor before the dot of an assigned field."""
         before = syntax.children[0]
         operand = self.typer.evaluate(before, scope)
         if isinstance(operand, SetOf):
             cure = f"write `{syntax.text} := … where {before.span.text}`"
-            raise self.typer.wrong(operand, "a neighbour before the dot", before.span, cure)
+            raise self.typer.wrong(operand, "a neighbor before the dot", before.span, cure)
         if isinstance(operand, Expr) and operand.kind.name == "vec2":
             cure = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
             raise self.typer.fail(

@@ -179,7 +179,7 @@ def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
         )
     for child in call.children:
         if child.kind == "in_" and isinstance(typer.evaluate(child.children[1], scope), Kernel):
-            raise typer.fail("PD406", "an invariant counts the whole world", call.span, "has a neighbourhood")
+            raise typer.fail("PD406", "an invariant counts the whole world", call.span, "has a neighborhood")
     operands = [typer.evaluate(child, scope) for child in call.children]
     if all(isinstance(operand, (SetOf, Absent)) for operand in operands):
         ids = {
@@ -214,8 +214,8 @@ def _never(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     condition = typer.condition(line.children[0], scope)
     if condition == TRUE:
         raise typer.fail(
-            "PD511", "this invariant cannot hold", line.children[0].span, "every cell fulfils this",
-            ("say what no cell may fulfil",),
+            "PD511", "this invariant cannot hold", line.children[0].span, "every cell fulfills this",
+            ("say what no cell may fulfill",),
         )  # fmt: skip
     return Never(_asked(typer, condition, line.children[0].span), steps)
 
@@ -226,7 +226,7 @@ def _asked(typer: Typer, condition: Expr, span: Span) -> Expr:
         raise Asleep(", ".join(sorted(typer.absent)))
     if condition in (TRUE, FALSE):
         _says_nothing(
-            typer, span, "every cell fulfils this" if condition == TRUE else "no cell can fulfil this"
+            typer, span, "every cell fulfills this" if condition == TRUE else "no cell can fulfill this"
         )
     return condition
 

@@ -19,7 +19,7 @@ def color_of(reader: Reader, entries: Entries, key: str) -> str | None:
         return color.text.upper() if color else None
     helps = [f'six hexadecimal digits in quotes: {key}: "#RRGGBB"']
     reader.reporter.error(
-        "PD110", f"`{color.text}` is not a colour", color.span, 'expected "#RRGGBB"', helps=helps
+        "PD110", f"`{color.text}` is not a color", color.span, 'expected "#RRGGBB"', helps=helps
     )
     return None
 

@@ -82,11 +82,11 @@ def draw(clock: Clock, stream: int, bits: int, height: int, width: int) -> Array
     return (value + 0.5) / 2.0**bits
 
 
-# Neighbours
+# Neighbors
 
 
 def look(value: Array, offset: Offset) -> Array:
-    """The array as seen from each cell at its neighbour `offset`; the grid wraps around."""
+    """The array as seen from each cell at its neighbor `offset`; the grid wraps around."""
     return np.roll(value, (-offset[0], -offset[1]), (-2, -1))
 
 
@@ -96,13 +96,13 @@ def look_or_nothing(value: Array, offset: Offset) -> Array:
 
 
 def inside(shape: tuple[int, ...], offset: Offset) -> Array:
-    """bool [H, W]: whether the neighbour lies inside the grid."""
+    """bool [H, W]: whether the neighbor lies inside the grid."""
     height, width = shape
     y, x = np.mgrid[:height, :width]
     return (y + offset[0] >= 0) & (y + offset[0] < height) & (x + offset[1] >= 0) & (x + offset[1] < width)
 
 
-def neighbourhood(value: Array, kernel: Kernel) -> Array:
+def neighborhood(value: Array, kernel: Kernel) -> Array:
     """The weighted sum over a kernel: each row from the left, then the rows from the top."""
     see = look if kernel.wrap else look_or_nothing
     rows: dict[int, Array] = {}
@@ -260,8 +260,8 @@ _OPS: dict[str, Any] = {
     "max": lambda e, at, a, b: np.maximum(a, b),
     "mod": lambda e, at, a: a % e.value,
     "to_real": lambda e, at, a: a.astype(np.float32),
-    "count": lambda e, at, a: neighbourhood(a.astype(np.int64), e.value),
-    "sum": lambda e, at, a: neighbourhood(a, e.value),
+    "count": lambda e, at, a: neighborhood(a.astype(np.int64), e.value),
+    "sum": lambda e, at, a: neighborhood(a, e.value),
     "choose": _choose,
     "octant": _octant,
     "length": _length,

@@ -45,7 +45,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "streams": Key("any", "sources of random numbers that rules share by name"),
         "params": Key("mapping", "numbers that users override without editing the file"),
         "side_multiple": Key("number", "rows and columns of all worlds are multiples of this number"),
-        "kernels": Key("mapping", "neighbourhoods for `count` and `sum`"),
+        "kernels": Key("mapping", "neighborhoods for `count` and `sum`"),
         "sets": Key("mapping", "names for sets of elements"),
         "elements": Key("mapping", "the pack's elements"),
         "also": Key("mapping", "tags and values for elements of other packs"),
@@ -94,7 +94,7 @@ KEYS: dict[str, dict[str, Key]] = {
     },
     "element": {
         "id": Key("number", "the number it asks for, 0 to 255; a free one otherwise"),
-        "color": Key("word", 'its colour, quoted: "#RRGGBB"', True),
+        "color": Key("word", 'its color, quoted: "#RRGGBB"', True),
         "color_by": Key("mapping", "how its color follows a field"),
         "glyph": Key("word", "one character for ASCII art; the first free letter of its name otherwise"),
         "about": Key("text", "what it is, in a sentence"),
@@ -210,7 +210,7 @@ class Reader:
         entries: dict[str, tuple[Scalar, Node]] = {}
         for key, value in node.entries:
             prefixed = key.text.startswith(PREFIXES.get(context, ())) and bool(PREFIXES.get(context))
-            misspelt = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
+            misspelled = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
             row = known.get(key.text)
             empty = isinstance(value, Scalar) and value.style == "plain" and not value.text
             if row and isinstance(value, Scalar) and empty and (row.required or row.shape in VALUES):
@@ -222,12 +222,12 @@ class Reader:
                     "PD113", f"`{key.text}` is empty", key.span, "nothing stands after it",
                     helps=[f"`{key.text}`: {row.about}", "remove it, or indent what belongs to it"],
                 )  # fmt: skip
-            elif row or prefixed or (context in OPEN and not misspelt):
+            elif row or prefixed or (context in OPEN and not misspelled):
                 entries[key.text] = (key, value)
                 if row:
                     self._check_shape(row, key, value)
             else:
-                missing -= set(misspelt)  # a key that is there under a wrong name is one mistake
+                missing -= set(misspelled)  # a key that is there under a wrong name is one mistake
                 self.reporter.error(
                     "PD108",
                     f"unknown key `{key.text}`",

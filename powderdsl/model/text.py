@@ -116,7 +116,7 @@ def _names(ruleset: Ruleset, ids: list[int]) -> str:
 
 
 def show_offset(offset: Offset) -> str:
-    """A neighbour's name, or `at(rows, columns)`."""
+    """A neighbor's name, or `at(rows, columns)`."""
     return _PLACES.get(offset, f"at({offset[0]}, {offset[1]})")
 
 

@@ -84,8 +84,8 @@ OPS: dict[str, str] = {
     "let": "value: the name of a value fixed earlier in the pass",
     "draw": "value: the stream's name; a number strictly between 0 and 1",
     "coordinate": "value: (row, column or step, modulus)",
-    "inside": "value: offset; whether that neighbour lies inside the grid",
-    "look": "value: offset; the argument as it is at that neighbour (the grid wraps around)",
+    "inside": "value: offset; whether that neighbor lies inside the grid",
+    "look": "value: offset; the argument as it is at that neighbor (the grid wraps around)",
     "member": "value: frozen set of ids; whether the argument is one of them",
     "not": "",
     "and": "",
@@ -104,7 +104,7 @@ OPS: dict[str, str] = {
     "max": "",
     "mod": "value: the modulus, a whole number above 0",
     "to_real": "an int, flag or chance as float32; a draw rounded to float32",
-    "count": "value: kernel; weighted number of neighbourhood cells where the argument holds",
+    "count": "value: kernel; weighted number of neighborhood cells where the argument holds",
     "sum": "value: kernel; weighted sum of the argument, within a row from the left, then the rows from the top",
     "choose": "condition, value if it holds, value otherwise",
     "octant": "the direction a vec2 points to",
@@ -250,7 +250,7 @@ class Transform:
 
 @dataclass(frozen=True)
 class Swap:
-    """Cells of the mask exchange what they hold with the neighbour `offset` away."""
+    """Cells of the mask exchange what they hold with the neighbor `offset` away."""
 
     mask: Expr
     offset: Offset
@@ -260,7 +260,7 @@ class Swap:
 
 @dataclass(frozen=True)
 class Move:
-    """Cells of the mask move what they hold to the neighbour `offset` away and leave a fresh element behind."""
+    """Cells of the mask move what they hold to the neighbor `offset` away and leave a fresh element behind."""
 
     mask: Expr
     offset: Offset

@@ -18,20 +18,20 @@ Array = Any
 """A NumPy array or a torch tensor. Torch is imported only once a tensor is given."""
 
 MOTION_COLOR = (200, 100, 100)
-"""What a cell is tinted towards where its motion is not 0."""
+"""What a cell is tinted toward where its motion is not 0."""
 
 MAX_TINT = 0.5
 """The tint at speed 1 and above; slower cells are tinted in proportion."""
 
 OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
-"""Colours of regions, in their order in the file; of more than four the first comes again."""
+"""Colors of regions, in their order in the file; of more than four the first comes again."""
 
 Colors = Sequence[str] | NDArray[np.uint8]
-"""Colours by element id: ``#RRGGBB`` each, or uint8 [n, 3]."""
+"""Colors by element id: ``#RRGGBB`` each, or uint8 [n, 3]."""
 
 
 def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The elements' colours by id, uint8 [highest id + 1, 3]; ids that no element has are black."""
+    """The elements' colors by id, uint8 [highest id + 1, 3]; ids that no element has are black."""
     table = np.zeros((max((element.id for element in elements), default=-1) + 1, 3), dtype=np.uint8)
     for element in elements:
         table[element.id] = _components(element.color)
@@ -113,8 +113,8 @@ def rgb(
     """Pictures uint8 [..., H, W, 3] of ids [..., H, W] (any integers), of the same kind, on the same device.
 
     With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name.
-    With `motion`, float [..., 2, H, W], cells are tinted towards MOTION_COLOR by clamp(|v|/2, 0, 0.5).
-    Raises ValueError for ids without a colour, fields that are missing and shapes that do not fit, TypeError for ids
+    With `motion`, float [..., 2, H, W], cells are tinted toward MOTION_COLOR by clamp(|v|/2, 0, 0.5).
+    Raises ValueError for ids without a color, fields that are missing and shapes that do not fit, TypeError for ids
     of another type.
     """
     table = _table(colors)
@@ -222,7 +222,7 @@ def _check(ids: Any, motion: Any, colors: int, tensor: bool) -> None:
         raise ValueError(f"ids must have shape [..., H, W], not {tuple(ids.shape)}")
     if math.prod(ids.shape) and not 0 <= int(ids.min()) <= int(ids.max()) < colors:
         raise ValueError(
-            f"ids reach from {int(ids.min())} to {int(ids.max())}, but there are {colors} colours"
+            f"ids reach from {int(ids.min())} to {int(ids.max())}, but there are {colors} colors"
         )
     if motion is None:
         return
@@ -244,13 +244,13 @@ def _values(ramp: Ramp, fields: Mapping[str, Array], ids: Any, tensor: bool) -> 
 def _table(colors: Colors) -> NDArray[np.uint8]:
     if isinstance(colors, np.ndarray):
         if colors.ndim != 2 or colors.shape[1] != 3 or colors.dtype != np.uint8:
-            raise ValueError(f"colours must be uint8 [n, 3], not {colors.dtype} {colors.shape}")
+            raise ValueError(f"colors must be uint8 [n, 3], not {colors.dtype} {colors.shape}")
         return colors
     return np.array([_components(color) for color in colors], dtype=np.uint8).reshape(-1, 3)
 
 
 def _components(color: str) -> tuple[int, int, int]:
     if not re.fullmatch(r"#[0-9A-Fa-f]{6}", color):
-        raise ValueError(f"{color!r} is not a colour: write '#RRGGBB'")
+        raise ValueError(f"{color!r} is not a color: write '#RRGGBB'")
     red, green, blue = bytes.fromhex(color[1:])
     return red, green, blue

@@ -31,7 +31,7 @@ def write_png(path: str | Path, image: Any) -> None:
 def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop: bool = True) -> None:
     """Write an animation as GIF, from an iterable that may be lazy. At most 50 frames a second.
 
-    Frames of up to 256 colours keep them exactly; others are reduced, without dithering.
+    Frames of up to 256 colors keep them exactly; others are reduced, without dithering.
     Raises ValueError for no frames, for frames of different sizes, and for a bad `fps`.
     """
     delay = max(round(100 / _checked_rate(fps)) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
@@ -88,7 +88,7 @@ _ENCODING = (
         "-movflags",
         "+faststart",
     ),
-    # Without these words players guess how to turn the colours back, and get them slightly wrong.
+    # Without these words players guess how to turn the colors back, and get them slightly wrong.
     *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709"),
     *("-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"),
 )
@@ -148,7 +148,7 @@ def _checked_rate(fps: float) -> float:
 
 
 def _indexed(frame: NDArray[np.uint8]) -> Image.Image:
-    """A frame with a palette of its own, exact where it has at most 256 colours."""
+    """A frame with a palette of its own, exact where it has at most 256 colors."""
     packed = frame.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     colors, index = np.unique(packed, return_inverse=True)
     if len(colors) > 256:
@@ -159,6 +159,6 @@ def _indexed(frame: NDArray[np.uint8]) -> Image.Image:
 
 
 def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """H.264 stores colour at half the size, so both sides must be even: the last row or column is doubled."""
+    """H.264 stores color at half the size, so both sides must be even: the last row or column is doubled."""
     height, width = frame.shape[:2]
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -221,7 +221,7 @@ class Simulator:
         return self.observer.matrix(world.state, out)
 
     def rgb(self, world: World, out: Tensor | None = None) -> Tensor:
-        """Pictures uint8 [B, H, W, 3] in the elements' colours, a pixel a cell."""
+        """Pictures uint8 [B, H, W, 3] in the elements' colors, a pixel a cell."""
         return self.observer.rgb(world.state, out)
 
     def planes(self, world: World, out: Tensor | None = None) -> Tensor:

@@ -55,7 +55,7 @@ def write_slot(state: State, name: str, out: Tensor) -> None:
 
 
 def write_rgb(state: State, palette: Tensor, out: Tensor) -> None:
-    """Colours uint8 [B, H, W, 3] of the elements. `palette` is uint8 [256, 4]: red, green, blue, nothing."""
+    """Colors uint8 [B, H, W, 3] of the elements. `palette` is uint8 [256, 4]: red, green, blue, nothing."""
     if isinstance(state, PackedState):
         slot, bits, _ = state.program.planes_of("element")
         state.program.library.pd_rgb(state.handle, slot, bits, address(palette), address(out), out.stride(0))

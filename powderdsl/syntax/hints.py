@@ -176,7 +176,7 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
     if meant:
         return meant
     if token in (":=", "+=", "-="):
-        return "only a field of this cell, or of a neighbour, can be assigned"
+        return "only a field of this cell, or of a neighbor, can be assigned"
     if "ELSE" in accepted and re.search(r"\bthen\b", before):
         return "a choice has two sides: `VALUE if CONDITION else VALUE`"
     if "ELSE" in accepted and assigns and not token:

@@ -149,7 +149,7 @@ def _indentation(place: Place, message: str, label: str) -> Problem:
         message,
         place.rest(place.at),
         label,
-        "indent it like its neighbours, or deeper than its own key",
+        "indent it like its neighbors, or deeper than its own key",
         other,
     )
 

@@ -234,7 +234,7 @@ class GoalChecker:
         if any(part.op == "draw" for part in found.walk()):
             raise self.typer.fail("PD406", "a reward draws no random numbers", syntax.span, "a draw")
         if found.op == "const" or (isinstance(operand, SetOf) and not operand.ids):
-            label = "every cell fulfils this" if found.value else "no cell can fulfil this"
+            label = "every cell fulfills this" if found.value else "no cell can fulfill this"
             self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
         return found
 

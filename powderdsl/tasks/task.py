@@ -125,7 +125,7 @@ class Split:
 class Agent:
     """What an agent may do, and for how long.
 
-    An action is (x, y, choice, vx, vy). The block of `brush` (rows, columns) cells around the centre of bin
+    An action is (x, y, choice, vx, vy). The block of `brush` (rows, columns) cells around the center of bin
     (y, x) of `bins` (rows, columns) is filled with the element ``choices[choice]``; where that is BLOW, its cells get
     the motion ``speed · (vy − 1, vx − 1)`` as (rows, columns) in the field `speed_field`; where it is
     NO_CHANGE, nothing happens.

@@ -16,7 +16,7 @@ from powderdsl.worldmodel.rulesets import VariedWorlds
 from powderdsl.worldmodel.training import Network
 
 RIGHT, WRONG = (235, 235, 235), (200, 30, 30)
-"""Colours of cells that were predicted as they came, and of others."""
+"""Colors of cells that were predicted as they came, and of others."""
 
 
 @dataclass(frozen=True)

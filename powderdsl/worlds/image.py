@@ -1,4 +1,4 @@
-"""Worlds from PNG pictures, one pixel a cell, by the elements' exact colours."""
+"""Worlds from PNG pictures, one pixel a cell, by the elements' exact colors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_REPORTED = 8
-"""Wrong colours that are named one by one. A smoothed picture has thousands."""
+"""Wrong colors that are named one by one. A smoothed picture has thousands."""
 
 MAX_COLORS = 1 << 16
 """Wrong colors that are counted. A picture with more has more of them below."""
@@ -29,7 +29,7 @@ CHUNK = 1 << 20
 """Pixels that are looked up at once: more would take memory."""
 
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
-"""Pixel formats of eight bits or fewer: those with more have colours that no element can have."""
+"""Pixel formats of eight bits or fewer: those with more have colors that no element can have."""
 
 
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
@@ -37,7 +37,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 
     Colors of a ramp mean its element; the values of its field are not read.
 
-    PD609 names every pixel colour that is no element's (and the nearest element), PD607 a picture of too many
+    PD609 names every pixel color that is no element's (and the nearest element), PD607 a picture of too many
     pixels, which is not decoded, PD602 a file that is no PNG, PD101 one that cannot be read.
     """
     path = Path(path)
@@ -143,12 +143,12 @@ def _wrong_color(
     where = f"the pixel at row {pixel[0]}, column {pixel[1]}"
     if color in owners:
         names = " and ".join(f"`{element.name}`" for element in owners[color])
-        message, helps = f"{where} is {name}, the colour of {names}", ("give one of them another colour",)
+        message, helps = f"{where} is {name}, the color of {names}", ("give one of them another color",)
     elif opacity < 255:
         message = f"{where} is {name} at {opacity * 100 // 255}% opacity"
         helps = ("save the picture without transparency",)
     else:
-        message = f"{where} is {name}, which is no element's colour"
+        message = f"{where} is {name}, which is no element's color"
         candidates = [element for owned in owners.values() for element in owned]
         nearest = min(candidates, key=lambda element: _distance(element.color, name))
         helps = (f"the nearest is `{nearest.name}`, {nearest.color}",)
@@ -158,10 +158,8 @@ def _wrong_color(
 
 def _many_colors(path: Path, count: int) -> Diagnostic:
     number = f"more than {MAX_COLORS:,}" if count > MAX_COLORS else f"{count:,}"
-    helps = (
-        "draw with a hard brush in the elements' colours, one pixel a cell, and scale without smoothing",
-    )
-    return Diagnostic("PD609", f"{number} colours in {path} are no element's", Label(None), helps=helps)
+    helps = ("draw with a hard brush in the elements' colors, one pixel a cell, and scale without smoothing",)
+    return Diagnostic("PD609", f"{number} colors in {path} are no element's", Label(None), helps=helps)
 
 
 def _distance(one: str, other: str) -> int:

@@ -67,7 +67,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Square:
-    """Rows and columns from `half` before the centre up to, and without, `half` behind it: a side of 2·half."""
+    """Rows and columns from `half` before the center up to, and without, `half` behind it: a side of 2·half."""
 
     center: Point
     half: int

@@ -153,16 +153,16 @@ class Terminal:
         self.isatty = lambda: terminal
 
 
-def test_colour_is_for_terminals_that_want_it(monkeypatch):
+def test_color_is_for_terminals_that_want_it(monkeypatch):
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
-    assert exits.colour_wanted(Terminal(True))
-    assert not exits.colour_wanted(Terminal(False))
+    assert exits.color_wanted(Terminal(True))
+    assert not exits.color_wanted(Terminal(False))
     monkeypatch.setenv("TERM", "dumb")
-    assert not exits.colour_wanted(Terminal(True))
+    assert not exits.color_wanted(Terminal(True))
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("NO_COLOR", "1")
-    assert not exits.colour_wanted(Terminal(True))
+    assert not exits.color_wanted(Terminal(True))
 
 
 def test_a_terminal_without_the_characters_gets_others():

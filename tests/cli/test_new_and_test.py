@@ -54,7 +54,7 @@ def test_a_new_pack_checks_runs_and_passes_its_test(folder, name):
     assert f"ok    {name}: " in tested.stdout
 
 
-def test_new_elements_have_free_ids_and_colours_of_their_own(folder):
+def test_new_elements_have_free_ids_and_colors_of_their_own(folder):
     for name in ("salt", "pepper", "chalk"):
         assert powderdsl("new", name).exit_code == 0
     everything = package.load("powderworld", "salt.yaml", "pepper.yaml", "chalk.yaml")

@@ -140,7 +140,7 @@ def test_no_progress_elsewhere(tmp_path):
     assert "\x1b" not in run.stderr
 
 
-def test_diagnostics_are_coloured_on_terminals_only():
+def test_diagnostics_are_colored_on_terminals_only():
     _, shown = on_terminal("check", "nonsense", **without_no_color())
     assert "\x1b[31;1m" in shown
     _, plain = on_terminal("check", "nonsense", NO_COLOR="1")

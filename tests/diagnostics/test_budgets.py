@@ -117,7 +117,7 @@ def test_one_hard_question_leaves_work_for_the_next() -> None:
 
 ONE, MORE = "(a + b * c) mod 61 == 5", "(a + b * c) mod 61 in (5, 6)"
 NEVER = f"{ONE} and (a + b * c) mod 61 == 6"
-"""No cell fulfils it, and every cell that fulfils ONE fulfils MORE, as only a long search would show."""
+"""No cell fulfills it, and every cell that fulfills ONE fulfills MORE, as only a long search would show."""
 
 
 def remarks(text: str) -> list[Diagnostic]:

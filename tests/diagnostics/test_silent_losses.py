@@ -45,14 +45,14 @@ RIGHT = {"tag": "fuel", "burns": "burns", "wood": "wood", "fire": "fire"}
 
 
 @pytest.mark.parametrize("word", ["fule", "fuell", "ful", "feul"])
-def test_misspelt_tags_are_found(word: str) -> None:
+def test_misspelled_tags_are_found(word: str) -> None:
     _, found = loaded("core+oil.yaml", oil=OIL.format(**{**RIGHT, "tag": word}))
     assert found == ([("PD315", f"{word}?")] if len(word) > 3 else [])
 
 
 @pytest.mark.parametrize(("what", "word"), [("burns", "burnz"), ("wood", "wodo"), ("fire", "fier")])
 @pytest.mark.parametrize("others", ["core", "powderworld"])
-def test_misspelt_names_are_found_wherever_they_stand(what: str, word: str, others: str) -> None:
+def test_misspelled_names_are_found_wherever_they_stand(what: str, word: str, others: str) -> None:
     _, found = loaded(f"{others}+oil.yaml", oil=OIL.format(**{**RIGHT, what: word}))
     assert found == [("PD315", f"{word}?")]
 

@@ -53,7 +53,7 @@ def noise(sim: Simulator, shape: tuple[int, ...], *, seed: int, p: list[float] |
 
 
 def around(cells: np.ndarray) -> np.ndarray:
-    """How many of the eight neighbours hold, on a torus: bool [..., H, W] -> int [..., H, W]."""
+    """How many of the eight neighbors hold, on a torus: bool [..., H, W] -> int [..., H, W]."""
     shifts = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
     return sum(np.roll(cells, shift, (-2, -1)).astype(int) for shift in shifts)  # type: ignore[return-value]
 
@@ -94,7 +94,7 @@ def life(sim: Simulator, pattern: list[str], height: int, width: int, at: tuple[
 
 
 def next_generation(cells: Cells) -> Cells:
-    """Life on an endless plane, by counting how often each cell is somebody's neighbour."""
+    """Life on an endless plane, by counting how often each cell is somebody's neighbor."""
     counts: dict[tuple[int, int], int] = {}
     for y, x in cells:
         for dy in (-1, 0, 1):
@@ -171,8 +171,8 @@ def test_random_life_agrees_with_a_direct_formula(backend: str, shape: tuple[int
     alive = noise(sim, shape, seed=1) == 1
     world = sim.world(alive.astype(np.uint8))
     for _ in range(8):
-        neighbours = around(alive)
-        alive = (neighbours == 3) | (alive & (neighbours == 2))
+        neighbors = around(alive)
+        alive = (neighbors == 3) | (alive & (neighbors == 2))
         world = sim.step(world)
         assert np.array_equal(world.ids.numpy() == 1, alive)
 
@@ -281,7 +281,7 @@ def forest(backend: str, growth: float, lightning: float) -> Simulator:
     return powderdsl.compile(powderdsl.load("forest_fire", params=params), backend=backend)
 
 
-def test_fire_spreads_to_the_four_neighbours_and_burns_out(backend: str) -> None:
+def test_fire_spreads_to_the_four_neighbors_and_burns_out(backend: str) -> None:
     sim = forest(backend, growth=0, lightning=0)
     ids = np.full((1, 15, 17), 1, np.uint8)
     ids[0, 7, 8] = 2
@@ -290,7 +290,7 @@ def test_fire_spreads_to_the_four_neighbours_and_burns_out(backend: str) -> None
     distance = abs(y - 7) + abs(x - 8)
     for step in range(1, 18):
         world = sim.step(world)
-        # Nothing crosses the edges: neighbours outside the grid count as nothing.
+        # Nothing crosses the edges: neighbors outside the grid count as nothing.
         expected = np.select([distance < step, distance == step], [0, 2], 1)
         assert np.array_equal(world.ids[0].numpy(), expected)
 

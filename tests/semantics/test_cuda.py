@@ -83,7 +83,7 @@ def test_random_rulesets(seed: int, folder: Path) -> None:
 
 
 def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Then nothing is held back in registers: planes that neighbours read are never written in place."""
+    """Then nothing is held back in registers: planes that neighbors read are never written in place."""
     monkeypatch.setattr("powderdsl.targets.cuda.source.HELD", 0)
     ruleset = load("core+sand+water")
     simulators = [compile_ruleset(ruleset, backend="reference"), emulated_simulator(ruleset, folder)]

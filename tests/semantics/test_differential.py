@@ -115,7 +115,7 @@ def test_random_rulesets(first: int) -> None:
     ],
 )
 def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path) -> None:
-    """Few, since each takes seconds to compile; the level of optimisation changes nothing."""
+    """Few, since each takes seconds to compile; the level of optimization changes nothing."""
     skip_without_compiler()
     plan = Plan(("native",), worlds=4, steps=3, building=Building(level, tmp_path))
     assert agreed(run_seed(seed, plan) for seed in seeds) >= 4

@@ -109,7 +109,7 @@ def test_worlds_may_lie_apart(backend: str, torch) -> None:  # type: ignore[no-u
 
 
 def test_meaning(torch) -> None:  # type: ignore[no-untyped-def]
-    """What the numbers are: palette colours, one-hot channels in the declared order, columns from the lowest bit."""
+    """What the numbers are: palette colors, one-hot channels in the declared order, columns from the lowest bit."""
     sim = simulator("kinds", "dense")
     world = random_start(sim.ruleset, Choices.seeded(5), (2, 3, 70)).world(sim)
     assert np.array_equal(world.rgb().numpy(), rgb(world.ids.numpy(), palette(sim.ruleset.elements)))

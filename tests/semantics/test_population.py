@@ -9,7 +9,7 @@ ruleset and engine have the same dynamics, the 32 runs of a world are exchangeab
 engine's is a label that could as well have been dealt at random. So we deal it 99,999 times, in each world on
 its own, and ask how often chance alone gives a statistic as large as the true labels do. Two statistics:
 
-* the largest standardised difference of means |z| over all worlds, steps and elements. It sees one count that
+* the largest standardized difference of means |z| over all worlds, steps and elements. It sees one count that
   is off. The scale of z is the standard deviation of all 32 runs, so it needs no floor: a count that never
   varies is left out, and |z| cannot pass 5.7 however little a count varies (16 runs all below the other 16);
 * the energy distance between the two groups of runs (twice the mean distance between groups, less that within

@@ -18,7 +18,7 @@ Planes = Any
 
 
 def test_draws_are_uniform_and_unrelated(torch) -> None:  # type: ignore[no-untyped-def]
-    """Bit planes of our randomness: fair, and uncorrelated with neighbours, steps, streams, seeds and worlds."""
+    """Bit planes of our randomness: fair, and uncorrelated with neighbors, steps, streams, seeds and worlds."""
     from powderdsl.targets import random
 
     idents = torch.tensor([0x05562E58, 0x116B05CF])

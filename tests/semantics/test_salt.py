@@ -56,9 +56,9 @@ def test_its_rules_are_ten_lines_of_yaml() -> None:
 def test_ice_melts_faster_beside_salt_than_in_warm_air(backend: str) -> None:
     sim = simulator(backend)
     left = {}
-    for neighbour in ("salt", "empty", "sand"):
-        world = sim.step(sim.world(boxes(sim, 8, neighbour, "ice")), 12)
-        left[neighbour] = amount(world.ids, sim, "ice") / (8 * 8)
+    for neighbor in ("salt", "empty", "sand"):
+        world = sim.step(sim.world(boxes(sim, 8, neighbor, "ice")), 12)
+        left[neighbor] = amount(world.ids, sim, "ice") / (8 * 8)
     assert left["salt"] < 0.25
     assert 0.6 < left["empty"] < 1, "2 % a step"
     assert left["sand"] == 1, "nothing melts it there"

@@ -144,7 +144,7 @@ def test_a_chance_that_failed_shows_the_draw_and_the_chance():
     assert part.span.text == "coin < luck"
 
 
-def test_a_count_names_the_neighbours_it_found():
+def test_a_count_names_the_neighbors_it_found():
     miss = only_miss(traced("do: rock -> moth if count(bomb) > 2", "b../.ob/...", 1, 1))
     (part,) = miss.failed
     (read,) = part.reads

@@ -168,7 +168,7 @@ EXPRESSIONS = {
     "count(sand and slot) + count(water and (moving or slot))": lambda v: v.count(v.ids == 2, "slot")
     + ((v.ids == 3) & (v.regions["moving"] | v.regions["slot"])).sum(),
     "count(wood and below is empty)": lambda v: ((v.ids == 5) & (np.roll(v.ids, -1, 0) == 0)).sum(),
-    "count((count(sand) >= 4) in two)": lambda v: v.count(neighbours(v.ids == 2) >= 4, "two"),
+    "count((count(sand) >= 4) in two)": lambda v: v.count(neighbors(v.ids == 2) >= 4, "two"),
     "highest(sand)": lambda v: highest(v.ids == 2),
     "highest(sand in slot)": lambda v: highest((v.ids == 2) & v.regions["slot"]),
     "match(wanted)": lambda v: (v.ids == v.target)[v.target != 255].mean(),
@@ -199,7 +199,7 @@ class View:
         return float((cells & self.regions[region]).sum() if region else cells.sum())
 
 
-def neighbours(cells: np.ndarray) -> np.ndarray:
+def neighbors(cells: np.ndarray) -> np.ndarray:
     """How many of the eight cells around, and the cell itself, hold; nothing lies outside the grid."""
     padded = np.pad(cells.astype(int), 1)
     return sum(padded[1 + y : 65 + y, 1 + x : 65 + x] for y in (-1, 0, 1) for x in (-1, 0, 1))

@@ -1,4 +1,4 @@
-"""Worlds as pictures: exact colours, the tint of motion, scaling, contact sheets."""
+"""Worlds as pictures: exact colors, the tint of motion, scaling, contact sheets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_the_palette_is_by_id():
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64])
-def test_every_cell_has_its_elements_colour(dtype):
+def test_every_cell_has_its_elements_color(dtype):
     ids = np.arange(14, dtype=dtype).reshape(2, 7)
     image = rgb(ids, COLORS)
     assert image.shape == (2, 7, 3)
@@ -91,7 +91,7 @@ def test_worlds_without_worlds():
 @pytest.mark.parametrize("make", [np.array, torch.tensor])
 def test_what_cannot_be_drawn(make):
     for ids in ([[14]], [[-1]]):
-        with pytest.raises(ValueError, match="14 colours"):
+        with pytest.raises(ValueError, match="14 colors"):
             rgb(make(ids), COLORS)
     for ids in ([[1.0]], [[True]], [[1j]]):
         with pytest.raises(TypeError, match="must be integers"):
@@ -102,8 +102,8 @@ def test_what_cannot_be_drawn(make):
         rgb(make([[1]]), COLORS, make([[1.0]]))
 
 
-def test_colours_that_are_none():
-    with pytest.raises(ValueError, match="'#12345' is not a colour"):
+def test_colors_that_are_none():
+    with pytest.raises(ValueError, match="'#12345' is not a color"):
         rgb(np.zeros((1, 1), dtype=int), ["#12345"])
     with pytest.raises(ValueError, match=r"uint8 \[n, 3\]"):
         rgb(np.zeros((1, 1), dtype=int), np.zeros((1, 4), dtype=np.uint8))

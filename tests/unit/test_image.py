@@ -44,11 +44,11 @@ def test_what_is_written_is_read_back(tmp_path):
         assert np.array_equal(found, IDS)
     with Image.open(path) as image:
         assert image.size == (7, 2)
-        assert image.getpixel((2, 0)) == (0xF3, 0xC2, 0x3A)  # sand, in the published colour
+        assert image.getpixel((2, 0)) == (0xF3, 0xC2, 0x3A)  # sand, in the published color
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "P"])
-def test_other_pixel_formats_of_the_same_colours(tmp_path, mode):
+def test_other_pixel_formats_of_the_same_colors(tmp_path, mode):
     path = tmp_path / "world.png"
     write_image(path, IDS, ELEMENTS)
     with Image.open(path) as image:
@@ -57,16 +57,16 @@ def test_other_pixel_formats_of_the_same_colours(tmp_path, mode):
     assert np.array_equal(read_image(path, ELEMENTS), IDS)
 
 
-def test_black_and_white_and_grey(tmp_path):
-    grey = (replace(ELEMENTS[0], color="#000000"), replace(ELEMENTS[1], color="#FFFFFF"))
+def test_black_and_white_and_gray(tmp_path):
+    gray = (replace(ELEMENTS[0], color="#000000"), replace(ELEMENTS[1], color="#FFFFFF"))
     pixels = np.array([[0, 255, 255], [255, 0, 0]], dtype=np.uint8)
     for mode in ("L", "1", "LA"):
         path = tmp_path / f"{mode}.png"
         Image.fromarray(pixels).convert(mode).save(path)
-        assert np.array_equal(read_image(path, grey), pixels // 255)
+        assert np.array_equal(read_image(path, gray), pixels // 255)
 
 
-def test_a_wrong_colour_names_the_pixel_the_colour_and_the_nearest_element(tmp_path):
+def test_a_wrong_color_names_the_pixel_the_color_and_the_nearest_element(tmp_path):
     path = tmp_path / "world.png"
     write_image(path, IDS, ELEMENTS)
     pixels = np.array(Image.open(path))
@@ -76,7 +76,7 @@ def test_a_wrong_colour_names_the_pixel_the_colour_and_the_nearest_element(tmp_p
     Image.fromarray(pixels).save(path)
     black, sand = refused(path)
     assert (black.code, sand.code) == ("PD609", "PD609")
-    assert sand.message == "the pixel at row 1, column 3 is #F4C23B, which is no element's colour"
+    assert sand.message == "the pixel at row 1, column 3 is #F4C23B, which is no element's color"
     assert sand.helps == ("the nearest is `sand`, #F3C23A",)
     assert sand.notes == (f"{path}: 2 such pixels, this is the first",)
     assert "row 0, column 6" in black.message
@@ -102,7 +102,7 @@ def test_transparent_pixels_are_not_guessed(tmp_path):
     assert found.message == "the pixel at row 1, column 0 is #ECF0F1 at 50% opacity"
 
 
-def test_a_colour_of_two_elements_is_refused_where_it_is_used(tmp_path):
+def test_a_color_of_two_elements_is_refused_where_it_is_used(tmp_path):
     twins = (*ELEMENTS[:13], replace(ELEMENTS[13], color=ELEMENTS[2].color))
     path = tmp_path / "world.png"
     write_image(path, np.array([[0, 1]]), ELEMENTS)

@@ -53,7 +53,7 @@ def test_png(tmp_path):
             assert np.array_equal(np.array(found), np.asarray(given))
 
 
-def test_gif_keeps_every_colour_of_worlds(tmp_path):
+def test_gif_keeps_every_color_of_worlds(tmp_path):
     frames = [world(seed) for seed in range(5)]
     write_gif(tmp_path / "x.gif", iter(frames), fps=20)
     found = gif_frames(tmp_path / "x.gif")
@@ -65,7 +65,7 @@ def test_gif_keeps_every_colour_of_worlds(tmp_path):
         assert image.info["loop"] == 0
 
 
-def test_gif_keeps_exactly_256_colours_and_comes_close_with_more(tmp_path):
+def test_gif_keeps_exactly_256_colors_and_comes_close_with_more(tmp_path):
     levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
     frame = np.stack([levels, 255 - levels, levels // 2], axis=-1)
     write_gif(tmp_path / "x.gif", [frame])
@@ -100,7 +100,7 @@ def test_mp4(tmp_path):
     found = mp4_frames(tmp_path / "x.mp4", 80, 64)
     assert len(found) == 12
     for expected, frame in zip(frames, found, strict=True):
-        # Lossy, but the middle of every cell has its colour, in its place.
+        # Lossy, but the middle of every cell has its color, in its place.
         assert np.abs(frame[4::8, 4::8].astype(int) - expected[4::8, 4::8]).max() < 24
     assert (tmp_path / "x.mp4").read_bytes()[4:8] == b"ftyp"
 

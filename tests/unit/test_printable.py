@@ -108,7 +108,7 @@ def test_diagnostics_escape_every_part():
     assert not RAW.search(render_text(one))
     assert not RAW.search(render_short(one))
     assert not RAW.search(str(CompileError([one])))
-    assert not RAW.search(re.sub(r"\x1b\[[0-9;]*m", "", render_text(one, colour=True)))
+    assert not RAW.search(re.sub(r"\x1b\[[0-9;]*m", "", render_text(one, color=True)))
     # A line break in a message cannot pretend to be a line of its own.
     assert len(render_text(one).splitlines()) == 10
 

@@ -35,7 +35,7 @@ class Screen(io.TextIOWrapper):
 
 
 def replay(written: str) -> tuple[list[str], list[list[tuple]], bool]:
-    """The characters and (ink, paper) colours that a terminal shows, and whether its cursor is visible."""
+    """The characters and (ink, paper) colors that a terminal shows, and whether its cursor is visible."""
     rows: list[list[str]] = [[]]
     inks: list[list[tuple]] = [[]]
     row, ink, paper, visible = 0, None, None, True
@@ -70,13 +70,13 @@ def replay(written: str) -> tuple[list[str], list[list[tuple]], bool]:
         else:
             assert code in ("?25l", "?25h"), code
             visible = code == "?25h"
-    assert (ink, paper) == (None, None), "colours are left on"
+    assert (ink, paper) == (None, None), "colors are left on"
     return ["".join(cells) for cells in rows], inks, visible
 
 
 @pytest.fixture(autouse=True)
 def surroundings(monkeypatch):
-    """A colour terminal of 80×24, whatever the tests run in."""
+    """A color terminal of 80×24, whatever the tests run in."""
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
     set_size(monkeypatch, 80, 24)
@@ -87,7 +87,7 @@ def set_size(monkeypatch, columns: int, lines: int) -> None:
 
 
 @pytest.mark.parametrize("height", [1, 2, 5, 6])
-def test_a_frame_shows_every_cell_in_its_colour(height):
+def test_a_frame_shows_every_cell_in_its_color(height):
     image = rgb(np.random.default_rng(height).integers(0, 14, (height, 7)), COLORS)
     lines, colors, _ = replay(render_frame(image))
     assert lines == ["▀" * 7] * ((height + 1) // 2)
@@ -99,7 +99,7 @@ def test_a_frame_shows_every_cell_in_its_colour(height):
     assert render_frame(torch.tensor(image)) == render_frame(image)
 
 
-def test_a_colour_is_written_only_where_it_changes():
+def test_a_color_is_written_only_where_it_changes():
     plain = rgb(np.zeros((2, 1000), dtype=np.uint8), COLORS)
     assert len(render_frame(plain)) < 1060
 
@@ -185,7 +185,7 @@ def test_no_color_means_glyphs_in_place(monkeypatch):
     assert visible
     assert "38;2" not in screen.written
     monkeypatch.setenv("NO_COLOR", "")
-    assert LiveView(ELEMENTS, screen).colour
+    assert LiveView(ELEMENTS, screen).color
 
 
 def test_an_encoding_without_half_blocks_gets_glyphs():

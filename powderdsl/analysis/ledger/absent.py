@@ -180,5 +180,5 @@ class Lacking:
 
 
 def _is_element_at(expr: Expr) -> bool:
-    """Whether an expression is the element of a neighbour, or what a field of a neighbour names."""
+    """Whether an expression is the element of a neighbor, or what a field of a neighbor names."""
     return expr.op == "look" and expr.args[0].op in ("element", "field")

@@ -105,7 +105,7 @@ def _rules(ledger: Ledger) -> Iterator[str]:
     for entry in ledger.rules:
         yield f"  {_place(entry.rule)}: {entry.rule.text}"
         if not entry.fires:
-            yield "    never happens: no cell of any world can fulfil it"
+            yield "    never happens: no cell of any world can fulfill it"
         elif entry.needs:
             yield f"    never happens without {', and without '.join(_one_of(names) for names in entry.needs)}"
 

@@ -21,7 +21,7 @@ from powderdsl.model.types import Ruleset
 
 @dataclass(frozen=True)
 class Proven:
-    """It holds in every world, at every step. `given` says what a world must fulfil once, at the start, if anything."""
+    """It holds in every world, at every step. `given` says what a world must fulfill once, at the start, if anything."""
 
     reason: str
     given: str = ""

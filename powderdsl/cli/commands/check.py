@@ -158,11 +158,11 @@ def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
         "moves",
         "random bits",
         "reals",
-        "neighbours",
+        "neighbors",
     ]
     rows = [heading]
     for one in passes:
-        numbers = (one.moments, one.gates, one.shifts, one.moves, one.random_bits, one.reals, one.neighbours)
+        numbers = (one.moments, one.gates, one.shifts, one.moves, one.random_bits, one.reals, one.neighbors)
         rows.append([one.name, one.form, f"{100 * one.share:.0f}", *map(str, numbers)])
     yield from table(rows)
     for one in passes:

@@ -6,7 +6,7 @@ import sys
 
 import click
 
-from powderdsl.cli.exits import BadInput, colour_wanted
+from powderdsl.cli.exits import BadInput, color_wanted
 from powderdsl.diagnostics.codes import CODES
 from powderdsl.diagnostics.explain import find_code, page, similar
 from powderdsl.diagnostics.printable import unguarded
@@ -31,7 +31,7 @@ def command(code: str | None) -> None:
         cure = f"did you mean {', '.join(close)}?" if close else "`powderdsl explain` lists all codes"
         raise BadInput(f"no code `{code}`; {cure}")
     text = page(found)
-    if not colour_wanted(sys.stdout):
+    if not color_wanted(sys.stdout):
         click.echo(text.rstrip("\n"))
         return
     from rich.console import Console

@@ -70,7 +70,7 @@ class BackendsType(click.ParamType):
     type=click.Choice(LEVELS),
     default="0",
     show_default=True,
-    help="Optimisation of native code. Users' is 2.",
+    help="Optimization of native code. Users' is 2.",
 )
 @click.option(
     "--save",

@@ -79,7 +79,7 @@ def _pack_text(name: str, taken: list[ElementDecl]) -> str:
 
 
 def _color(number: int, taken: set[str]) -> str:
-    """A colour that no other element has: the hue turns by the golden angle from id to id."""
+    """A color that no other element has: the hue turns by the golden angle from id to id."""
     while True:
         parts = colorsys.hsv_to_rgb(number * 0.381966 % 1, 0.55, 0.85)
         color = "#" + "".join(f"{round(part * 255):02X}" for part in parts)

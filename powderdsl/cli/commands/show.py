@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from powderdsl.analysis.reactions import reactions
-from powderdsl.cli.exits import BadInput, colour_wanted
+from powderdsl.cli.exits import BadInput, color_wanted
 from powderdsl.cli.options import WholeType, layout_options, load_rules, set_option
 from powderdsl.cli.plain_table import Painted, table
 from powderdsl.diagnostics import Span
@@ -60,7 +60,7 @@ def command(
     if layout == "json":
         click.echo(json.dumps(_data(ruleset), indent=2, ensure_ascii=False))
     else:
-        write_styled(sys.stdout, "\n".join(_text(ruleset, colour_wanted(sys.stdout))) + "\n")
+        write_styled(sys.stdout, "\n".join(_text(ruleset, color_wanted(sys.stdout))) + "\n")
 
 
 def rule_spans(pass_: Pass) -> tuple[Span, ...]:
@@ -71,11 +71,11 @@ def rule_spans(pass_: Pass) -> tuple[Span, ...]:
 # Tables
 
 
-def _text(ruleset: Ruleset, colour: bool) -> Iterator[str]:
+def _text(ruleset: Ruleset, styled: bool) -> Iterator[str]:
     yield printable(f"{ruleset.name}{': ' if ruleset.about else ''}{ruleset.about}")
     yield f"packs: {' '.join(ruleset.packs)}"
     for title, rows in (
-        (f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", _element_rows(ruleset, colour)),
+        (f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", _element_rows(ruleset, styled)),
         ("Reactions", _reaction_rows(ruleset)),
         ("Passes, in order", _pass_rows(ruleset)),
         ("Parameters (--set NAME=VALUE)", _param_rows(ruleset)),
@@ -85,28 +85,28 @@ def _text(ruleset: Ruleset, colour: bool) -> Iterator[str]:
         yield from table(rows)
 
 
-def _swatch(color: str, colour: bool) -> str:
-    if not colour:
+def _swatch(color: str, styled: bool) -> str:
+    if not styled:
         return color
     red, green, blue = bytes.fromhex(color[1:])
     return Painted(f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {color}")
 
 
-def _color(element: Element, colour: bool) -> str:
+def _color(element: Element, styled: bool) -> str:
     """Its color, and both ends of its ramp with what this follows."""
-    text, ramp = _swatch(element.color, colour), element.ramp
+    text, ramp = _swatch(element.color, styled), element.ramp
     if ramp is None:
         return text
-    start, end = _swatch(ramp.start, colour), _swatch(ramp.end, colour)
+    start, end = _swatch(ramp.start, styled), _swatch(ramp.end, styled)
     text = f"{text}; {start} -> {end} by {ramp.field} {ramp.lo}..{ramp.hi}"
-    return Painted(text) if colour else text
+    return Painted(text) if styled else text
 
 
-def _element_rows(ruleset: Ruleset, colour: bool) -> list[list[str]]:
-    rows = [["id", "element", "pack", "glyph", "colour", *(p.name for p in ruleset.properties), "tags"]]
+def _element_rows(ruleset: Ruleset, styled: bool) -> list[list[str]]:
+    rows = [["id", "element", "pack", "glyph", "color", *(p.name for p in ruleset.properties), "tags"]]
     for element in ruleset.elements:
         values = [_property_text(ruleset, prop, element) for prop in ruleset.properties]
-        shown = _color(element, colour)
+        shown = _color(element, styled)
         head = [str(element.id), element.name, element.pack, element.glyph, shown]
         rows.append([*head, *values, " ".join(sorted(element.tags))])
     return rows

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from powderdsl.cli.exits import BadInput, colour_wanted, user_values
+from powderdsl.cli.exits import BadInput, color_wanted, user_values
 from powderdsl.cli.options import SizeType, WholeType, backend_option, load_rules, rules_argument, set_option
 from powderdsl.diagnostics.printable import write_styled
 
@@ -83,5 +83,5 @@ def command(
     if as_json:
         click.echo(json.dumps(trace_data(found), indent=2, ensure_ascii=False))
     else:
-        text = trace_text(found, colour=colour_wanted(sys.stdout), every_rule=every_rule)
+        text = trace_text(found, color=color_wanted(sys.stdout), every_rule=every_rule)
         write_styled(sys.stdout, f"{text}\n")

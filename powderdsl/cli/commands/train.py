@@ -84,7 +84,7 @@ class CountType(click.ParamType):
 @click.option("--epochs", type=CountType(), help="How often an update goes over a rollout.")
 @click.option("--entropy", type=float, help="Weight of the entropy.")
 @click.option("--gamma", type=float, help="Discount of later rewards.")
-@click.option("--gae-lambda", type=float, help="Of generalised advantages.")
+@click.option("--gae-lambda", type=float, help="Of generalized advantages.")
 @click.option("--clip", type=float, help="How far an update may change chances.")
 @backend_option("auto")
 @click.option("--device", help="A torch device: cpu, cuda, cuda:1.  [default: cpu]")

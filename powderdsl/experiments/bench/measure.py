@@ -93,7 +93,7 @@ class _Run:
         torch.set_num_threads(self.threads)
         for _ in range(self.calls):
             self.sim.step(self.world, self.steps)
-        synchronise(self.sim)
+        synchronize(self.sim)
 
     def costs(self) -> tuple[tuple[str, float], ...]:
         """Seconds a world and step of each pass."""
@@ -113,7 +113,7 @@ class _Run:
         )
 
 
-def synchronise(sim: Simulator) -> None:
+def synchronize(sim: Simulator) -> None:
     """Wait for what a GPU still has to do."""
     import torch
 
@@ -141,7 +141,7 @@ def _make_ready(
     sim, compiling = simulators[key]
     start = start_worlds(sim, cell, plan.workload, plan.seed)
     state_bytes = sum(value.numel() * value.element_size() for value in start.state.values())
-    synchronise(sim)
+    synchronize(sim)
     timed = _FirstCalls(sim, start, plan.steps, plan.seconds / plan.rounds, clock)
     memory: Memory = peak_growth(timed.go, plan.device)
     run = _Run(sim, timed.after, cell.threads, timed.steps, timed.calls)
@@ -164,7 +164,7 @@ class _FirstCalls:
     def _seconds(self, steps: int, keep: bool = False) -> float:
         began = self._clock()
         after = self._sim.step(self.after, steps)
-        synchronise(self._sim)
+        synchronize(self._sim)
         if keep:
             self.after = after
         return max(self._clock() - began, 1e-9)

@@ -37,7 +37,7 @@ class Outcome:
     problem: str | None = None
 
 
-class Cancelled(Exception):
+class Canceled(Exception):
     """Somebody asked to stop."""
 
 
@@ -150,7 +150,7 @@ class StudyRun:
                     raise ValueError(f"{key} is {found[key]}; the scale `log` needs numbers above 0")
             if found != known:
                 write_json(kept, found)
-        except (OSError, Cancelled, ValueError) as error:
+        except (OSError, Canceled, ValueError) as error:
             return Outcome(point, {}, str(error) or "stopped")
         return Outcome(point, values)
 
@@ -199,7 +199,7 @@ class StudyRun:
         with log.open("ab") as file:
             with self._starting:
                 if self._stopped.is_set():
-                    raise Cancelled("stopped")
+                    raise Canceled("stopped")
                 process = subprocess.Popen(
                     words,
                     stdin=subprocess.PIPE,  # nothing is written: it closes when we are killed, which ends them

@@ -301,7 +301,7 @@ def _compare(expr: Expr, at: Planes) -> Node:
     return at.build.compare(expr.op, a, b)
 
 
-# Neighbourhoods and vectors
+# Neighborhoods and vectors
 
 
 def _count(expr: Expr, at: Planes) -> Node:
@@ -314,10 +314,10 @@ def _count(expr: Expr, at: Planes) -> Node:
 def _sum(expr: Expr, at: Planes) -> Node | Pair:
     kernel = expr.value
     assert isinstance(kernel, Kernel)
-    return _each(lambda a: _neighbourhood(a, kernel, at.build), lower_expression(expr.args[0], at))
+    return _each(lambda a: _neighborhood(a, kernel, at.build), lower_expression(expr.args[0], at))
 
 
-def _neighbourhood(value: Node, kernel: Kernel, build: Builder) -> Node:
+def _neighborhood(value: Node, kernel: Kernel, build: Builder) -> Node:
     """The weighted sum, each row from the left, then the rows from the top. Equal rows are summed once and shifted."""
     rows: dict[int, list[tuple[int, int]]] = {}
     for dy, dx, weight in kernel.weights:

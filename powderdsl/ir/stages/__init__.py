@@ -29,18 +29,18 @@ def _rewriting(*rules: Rewrite) -> Callable[[PassGraph], PassGraph]:
 
 PIPELINE: tuple[Stage, ...] = (
     Stage("fold", "constants, and flags that say the same", _rewriting(*FOLD)),
-    # Before sharing: what a neighbour's property decides becomes a question about its element.
+    # Before sharing: what a neighbor's property decides becomes a question about its element.
     Stage("specialise", "properties of a cell whose element is known", specialise),
     Stage("resolve", "questions about properties become sets of elements", _rewriting(*RESOLVE, *FOLD)),
-    # After resolving: only now is it clear which neighbours are read.
-    Stage("share", "one read a neighbour and value", _rewriting(*SHARE, *FOLD)),
+    # After resolving: only now is it clear which neighbors are read.
+    Stage("share", "one read a neighbor and value", _rewriting(*SHARE, *FOLD)),
     # Last: moments whose rules turned out never to fire write nothing any more.
     Stage("prune", "moments that change nothing", prune),
 )
 
 
 def run_passes(program: Program, until: str | None = None) -> Program:
-    """The optimised program; `until` names the last stage to run. The IR is verified after every stage."""
+    """The optimized program; `until` names the last stage to run. The IR is verified after every stage."""
     verify(program, "lower")
     for stage in PIPELINE:
         program = replace(program, passes=tuple(stage.run(graph) for graph in program.passes))

@@ -82,7 +82,7 @@ RESOLVE: tuple[Rewrite, ...] = (_shift_of_table, _table_of_constant, _table_comp
 
 
 _LOGIC = ("and", "or", "not", "eq", "lt", "le")
-"""What a specialised condition is looked through. Not shifts: what is known here says nothing of neighbours."""
+"""What a specialized condition is looked through. Not shifts: what is known here says nothing of neighbors."""
 
 
 def specialise(pass_: PassGraph) -> PassGraph:

@@ -1,4 +1,4 @@
-"""Shifts move outwards over what is computed cell by cell: one read a neighbour and value, shared by all rules."""
+"""Shifts move outwards over what is computed cell by cell: one read a neighbor and value, shared by all rules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names with a `?` that nothing defines, but that look like a known name: what is misspelt there is lost in silence."""
+"""Names with a `?` that nothing defines, but that look like a known name: what is misspelled there is lost in silence."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_PLACES = 4
 _OPTIONAL = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\?")
 
 
-def report_misspelt(
+def report_misspelled(
     packs: Sequence[PackDecl],
     ruleset: RulesetDecl | None,
     elsewhere: Callable[[], Mapping[str, str]],

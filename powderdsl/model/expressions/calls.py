@@ -99,7 +99,7 @@ def _sum(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     if isinstance(value, Expr) and value.kind.name == "flag":
         return _count(typer, syntax, scope)
     if isinstance(value, Expr) and value.kind.name == "int":
-        # A neighbour outside the grid counts as zero, so the range of each summand includes it.
+        # A neighbor outside the grid counts as zero, so the range of each summand includes it.
         lo, hi = min(value.kind.lo, 0), max(value.kind.hi, 0)
         ends = [sorted((w * lo, w * hi)) for _, _, w in kernel.weights]
         kind = integer(sum(e[0] for e in ends), sum(e[1] for e in ends))

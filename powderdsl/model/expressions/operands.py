@@ -36,7 +36,7 @@ class SetOf:
 
 @dataclass(frozen=True)
 class Place:
-    """This cell or a neighbour. As a value it is the element found there."""
+    """This cell or a neighbor. As a value it is the element found there."""
 
     offset: Offset
 
@@ -194,7 +194,7 @@ class Coercer:
             return operand
         if isinstance(operand, Absent):
             raise Asleep(operand.name)
-        raise self.wrong(operand, "a neighbour", span, "such as `below`, `above.left`, or `at(2, -1)`")
+        raise self.wrong(operand, "a neighbor", span, "such as `below`, `above.left`, or `at(2, -1)`")
 
     def element(self, operand: Operand, span: Span) -> Expr:
         match operand:
@@ -318,7 +318,7 @@ class Coercer:
         if isinstance(operand, Place):
             if operand.offset in OCTANTS:
                 return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
-            raise self.fail("PD401", "not a direction", span, "directions are the eight neighbours")
+            raise self.fail("PD401", "not a direction", span, "directions are the eight neighbors")
         if isinstance(operand, Expr) and operand.kind == DIRECTION:
             return operand
         if isinstance(operand, Absent):
@@ -328,7 +328,7 @@ class Coercer:
     def offset(self, offset: Offset, span: Span) -> Offset:
         if max(abs(offset[0]), abs(offset[1])) > MAX_OFFSET:
             raise self.fail(
-                "PD409", "a neighbour too far away", span, f"rules reach {MAX_OFFSET} cells a step"
+                "PD409", "a neighbor too far away", span, f"rules reach {MAX_OFFSET} cells a step"
             )
         return offset
 
@@ -373,7 +373,7 @@ def constant(number: Number, span: Span | None = None) -> Expr:
 
 
 def look(value: Expr, offset: Offset, span: Span | None = None) -> Expr:
-    """The value as it is at a neighbour; looks of looks add up, constants are the same everywhere."""
+    """The value as it is at a neighbor; looks of looks add up, constants are the same everywhere."""
     if value.op == "look":
         inner = value.value
         assert isinstance(inner, tuple)

@@ -58,7 +58,7 @@ class Symbols:
         return min(self.ids, key=self.composition.order.__getitem__)
 
     def names(self, *, after_dot: bool = False) -> list[str]:
-        """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbour."""
+        """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbor."""
         if after_dot:
             return [*self.properties, *self.fields, *self.streams, *DIRECTIONS]
         return [

@@ -242,7 +242,7 @@ class Typer(Coercer):
                 helps=("parts of a vector: `.row`, `.column`",),
             )
         if not isinstance(base, Place):
-            raise self.wrong(base, "a neighbour before the dot", base_syntax.span, "such as `below.FIELD`")
+            raise self.wrong(base, "a neighbor before the dot", base_syntax.span, "such as `below.FIELD`")
         value = self.lookup(syntax.text, word, scope, after_dot=True)
         match value:
             case Place():
@@ -259,7 +259,7 @@ class Typer(Coercer):
                     f"this is {'an element' if value.name else 'a set of elements'}",
                     helps=(f"write `{text}`",),
                 )
-        raise self.wrong(value, "a field, property or neighbour after the dot", word)
+        raise self.wrong(value, "a field, property or neighbor after the dot", word)
 
     # Literals and lists
 

@@ -55,7 +55,7 @@ def _written(symbols: Symbols, typer: Typer) -> Iterator[tuple[str, Written]]:
 
 
 def unknown_element_key(key: Scalar, context: str, what: str, symbols: Symbols, typer: Typer) -> None:
-    """Report a key that should be an element's name: it may also be a misspelt key of the table."""
+    """Report a key that should be an element's name: it may also be a misspelled key of the table."""
     close = get_close_matches(key.text.lower(), sorted(KEYS[context]), n=1, cutoff=0.75)
     if close:
         helps = [f"did you mean `{close[0]}`?"]

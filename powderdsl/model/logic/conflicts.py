@@ -140,7 +140,7 @@ def check_logic(
                 "PD503",
                 "this rule can never fire",
                 span,
-                "no cell can fulfil all of it",
+                "no cell can fulfill all of it",
                 helps=["look for conditions that exclude each other, or that no element's properties meet"],
             )
         elif not useful[span]:
@@ -360,7 +360,7 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
     if first is second or first.span == second.span:
         note = "the moves of one moment happen at once: no cell may take part in two of them"
         helps = (
-            "add a condition that a target cannot fulfil, such as a comparison of densities",
+            "add a condition that a target cannot fulfill, such as a comparison of densities",
             "or choose what happens then: `conflicts: drop_both`",
         )
         return Conflict(
@@ -402,7 +402,7 @@ def _undecided(conflict: Conflict) -> Conflict:
 def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
     """For each of these properties the ids whose cells may hold their own value: those that some rule assigns it to.
 
-    A value of its own may fulfil the condition of another such rule: this goes on until nothing is added.
+    A value of its own may fulfill the condition of another such rule: this goes on until nothing is added.
     """
     found: dict[str, frozenset[int]] = {name: frozenset() for name in names}
     while True:

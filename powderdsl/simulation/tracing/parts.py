@@ -17,7 +17,7 @@ from powderdsl.simulation.tracing.scenes import Cell, Scene, value_at
 
 HERE: Offset = (0, 0)
 _LEAVES = ("element", "property", "field", "let", "draw", "coordinate", "param", "inside", "count", "sum")
-MAX_NEIGHBOURS = 24
+MAX_NEIGHBORS = 24
 """Cells that a count names, at most."""
 
 
@@ -140,7 +140,7 @@ _ELEMENT = Expr("element", Kind("element"))
 
 
 def _counted(expr: Expr, at: reference.Context, place: Cell, scene: Scene) -> Iterator[Cell]:
-    """The neighbours that a count found: those with a weight where its argument holds."""
+    """The neighbors that a count found: those with a weight where its argument holds."""
     holds = reference.evaluate(expr.args[0], at)
     kernel = expr.value
     for dy, dx, weight in kernel.weights[: 1 << 10]:

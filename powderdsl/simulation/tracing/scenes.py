@@ -44,7 +44,7 @@ class Scene:
         return self.at.shape[1:]
 
     def near(self, cell: Cell, offset: Offset) -> Cell:
-        """The neighbour of a cell; the grid wraps around."""
+        """The neighbor of a cell; the grid wraps around."""
         height, width = self.shape
         return (cell[0] + offset[0]) % height, (cell[1] + offset[1]) % width
 

@@ -24,17 +24,17 @@ MAX_CELLS = 9
 """Cells that a count names in a text."""
 
 
-def trace_text(trace: Trace, *, colour: bool = False, every_rule: bool = False) -> str:
+def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -> str:
     """The whole trace. Ends without a line break."""
     blocks = [_head(trace)]
     for _, group in groupby(trace.causes, key=_event):
         causes = list(group)
         if any(one.write.changed for one in causes):
-            blocks.append(_cause(trace, causes, colour))
+            blocks.append(_cause(trace, causes, color))
     if again := list(_written_again(trace)):
         blocks.append("\n".join(["written again, as it was:", *again]))
     shown = trace.misses if every_rule else trace.misses[:MAX_MISSES]
-    blocks += [_miss(trace, one, colour) for one in shown]
+    blocks += [_miss(trace, one, color) for one in shown]
     if len(shown) < len(trace.misses):
         blocks.append(f"{len(trace.misses) - len(shown)} more rules nearly happened: --all")
     return "\n\n".join(blocks)
@@ -65,14 +65,14 @@ def _head(trace: Trace) -> str:
     return "\n".join(map(printable, lines))
 
 
-def _cause(trace: Trace, causes: list[Cause], colour: bool) -> str:
+def _cause(trace: Trace, causes: list[Cause], color: bool) -> str:
     lines = []
     for one in causes:
         write = one.write
         if write.changed:
             before, after = (_value(trace.ruleset, write.slot, held) for held in (write.before, write.after))
             moved = f", moved here from {at(write.source)}" if write.source else ""
-            lines.append(_painted(f"{write.slot.name}: {before} -> {after}", "32;1", colour) + moved)
+            lines.append(_painted(f"{write.slot.name}: {before} -> {after}", "32;1", color) + moved)
     first = causes[0]
     rule = first.write.rule
     if rule is None:
@@ -94,7 +94,7 @@ def _written_again(trace: Trace) -> Iterator[str]:
             yield printable(f"  {names}: {rule.place}, pass {rule.pass_name}")
 
 
-def _miss(trace: Trace, miss: Miss, colour: bool) -> str:
+def _miss(trace: Trace, miss: Miss, color: bool) -> str:
     notes = [_rule_note(miss.rule, miss.cell, trace.cell)]
     if not miss.failed:
         labels = [
@@ -108,7 +108,7 @@ def _miss(trace: Trace, miss: Miss, colour: bool) -> str:
             labels.append(Label(miss.rule.span, ""))
     notes += [_part_text(part, miss.cell) for part in miss.parts if part.holds]
     places, gutter = source_lines(labels)
-    head = _painted("almost" if len(miss.failed) <= 1 else "not", "33;1", colour)
+    head = _painted("almost" if len(miss.failed) <= 1 else "not", "33;1", color)
     but = " and ".join(f"`{part.text}`" for part in miss.failed) or f"`conflicts: {miss.policy}`"
     return "\n".join(
         [
@@ -155,5 +155,5 @@ def _value(ruleset: Ruleset, slot: Slot, value: object) -> str:
     return show_at_cell(ruleset, slot.kind, value)
 
 
-def _painted(text: str, style: str, colour: bool) -> str:
-    return f"\x1b[{style}m{printable(text)}\x1b[0m" if colour else printable(text)
+def _painted(text: str, style: str, color: bool) -> str:
+    return f"\x1b[{style}m{printable(text)}\x1b[0m" if color else printable(text)

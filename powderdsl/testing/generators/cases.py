@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
 
 SIDES = (1, 2, 3, 4, 5, 7, 9, 16, 31, 32, 33, 63, 64, 65, 97)
-"""Lengths of sides: tiny ones, where neighbours coincide, and the borders of words of 32 and 64 columns."""
+"""Lengths of sides: tiny ones, where neighbors coincide, and the borders of words of 32 and 64 columns."""
 
 CLOCKS = (0, 0, 0, 1, 6, 1 << 20, (1 << 32) - 1, 1 << 40)
 """Steps at which worlds start: the clock runs on beyond 32 bits."""
@@ -178,7 +178,7 @@ def _wholes(lo: int, hi: int, choices: Choices) -> list[int]:
 
 
 def _reals(lo: float, hi: float, choices: Choices) -> list[float]:
-    """Zeros, bounds, SNAP and its neighbours, numbers that do not add up exactly."""
+    """Zeros, bounds, SNAP and its neighbors, numbers that do not add up exactly."""
     wanted = [0.0, 1.0, -1.0, 0.1, -0.1, lo, hi, SNAP, -SNAP, 1.5 * SNAP, 0.3, 1 / 3, hi * 0.7, lo * 0.7]
     wanted += [lo + (hi - lo) * choices.below(1000) / 999 for _ in range(4)]
     return [value for value in wanted if lo <= value <= hi]

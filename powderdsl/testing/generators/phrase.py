@@ -23,7 +23,7 @@ SIDES = ("below", "left", "above", "right", "below.left", "above.right")
 """Places that are directions too."""
 
 PLACE, SIDE, ONE, NUMBER = Kind("place"), Kind("side"), Kind("one"), Kind("number", 0, 2)
-"""Kinds of loop variables: a neighbour, one of the eight next to a cell, an element's name, a number."""
+"""Kinds of loop variables: a neighbor, one of the eight next to a cell, an element's name, a number."""
 
 LIMIT = MAX_MAGNITUDE // 2
 

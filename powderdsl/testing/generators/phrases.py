@@ -65,7 +65,7 @@ class Phrases:
     # Names
 
     def place(self) -> str:
-        """A neighbour."""
+        """A neighbor."""
         loops = self.sides()
         if loops and self.choices.maybe(60):
             side = self.choices.pick(loops)
@@ -78,7 +78,7 @@ class Phrases:
         return [name for name, k in self.locals.items() if k.name in kinds]
 
     def sides(self) -> list[str]:
-        """Loop variables that are neighbours."""
+        """Loop variables that are neighbors."""
         return self._locals("place", "side")
 
     def ones(self) -> list[str]:
@@ -94,13 +94,13 @@ class Phrases:
         return self.choices.pick([*self._locals("number"), "1", "2", "4"])
 
     def _seen(self, name: str) -> str:
-        """A value, here or at a neighbour."""
+        """A value, here or at a neighbor."""
         if not self.choices.maybe(35):
             return name
         return f"{self.place()}.{name}" + ("?" if self.choices.maybe(10) else "")
 
     def _named(self, kind: str) -> str | None:
-        """A field, property, let or scratch field of a kind, here or at a neighbour."""
+        """A field, property, let or scratch field of a kind, here or at a neighbor."""
         names = [*self.words.of_kind(kind), *self._locals(kind)]
         return self._seen(self.choices.pick(names)) if names else None
 
@@ -233,7 +233,7 @@ class Phrases:
         )
 
     def draw(self, depth: int) -> Phrase:
-        """A random number, maybe a neighbour's, maybe with a whole number added; with bounds."""
+        """A random number, maybe a neighbor's, maybe with a whole number added; with bounds."""
         if not self.words.streams:
             return self.real(depth)
         name = self._seen(self.choices.pick(list(self.words.streams)))
@@ -303,7 +303,7 @@ class Phrases:
         )
 
     def _flag_there(self, depth: int) -> Phrase | None:
-        """`left is CONDITION`: the condition as it is at a neighbour."""
+        """`left is CONDITION`: the condition as it is at a neighbor."""
         lets = self.lets("flag")
         inner = (
             self.choices.pick(lets)

@@ -286,7 +286,7 @@ class PassMaker:
         return f"push {self.choices.pick(vectors)} by {amount} away from {phrases.flag(1, bare=True).text}{self._chance(phrases)}"
 
     def _update(self, phrases: Phrases, effect: bool) -> str | None:
-        """`field := value`, or `+=`, `-=`, here or at a neighbour."""
+        """`field := value`, or `+=`, `-=`, here or at a neighbor."""
         choices = self.choices
         taken = self.taken[effect] if self.proven else set()
         kinds = {**self.words.fields, **self.words.properties, **phrases.scratch}

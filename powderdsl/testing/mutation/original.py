@@ -149,7 +149,7 @@ def meaning(ruleset: Ruleset) -> str:
 
 
 def lowered(ruleset: Ruleset) -> str:
-    """The optimised program as text, with all that it reads: equal texts compute equal worlds."""
+    """The optimized program as text, with all that it reads: equal texts compute equal worlds."""
     from powderdsl.compiler import lower
     from powderdsl.ir.text import print_program
 

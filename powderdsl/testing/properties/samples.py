@@ -18,7 +18,7 @@ Array = np.ndarray[Any, Any]
 State = dict[str, Array]
 
 SHAPES = ((3, 3), (2, 3), (4, 4), (1, 5), (5, 4), (6, 6), (3, 8), (1, 1), (8, 8), (2, 2), (7, 5), (5, 1))
-"""Rows and columns of small worlds: tiny ones, where neighbours coincide, come often."""
+"""Rows and columns of small worlds: tiny ones, where neighbors coincide, come often."""
 
 LARGE = (16, 33)
 """Rows and columns of a few larger worlds, of odd width."""

@@ -269,7 +269,7 @@ def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Countere
 
 
 def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
-    """The declared invariants, then what every ruleset must fulfil."""
+    """The declared invariants, then what every ruleset must fulfill."""
     found = [
         Property(i.claim, one_line(i.span), i.pack, i.span, i.without, i.scope) for i in ruleset.invariants
     ]
