@@ -19,7 +19,7 @@ test test-all golden: export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all check lint types format golden wheel clean distclean mutation
+.PHONY: help setup demo test test-all check lint types format golden wheel clean distclean mutation fuzz
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
@@ -68,6 +68,9 @@ format: $(VENV)/.ready  ## lay the code out as `make lint` wants it
 
 mutation: $(VENV)/.ready  ## judge all mutants of the shipped packs, and write the table of docs/testing.md (minutes)
 	@$(BIN)/python docs/mutation_table.py --jobs $$(nproc)
+
+fuzz: $(VENV)/.ready  ## compare all backends on random rules and worlds (ARGS="--seconds 60"; ARGS=--help)
+	@$(BIN)/python -m tests.fuzz $(ARGS)
 
 golden: $(VENV)/.ready  ## write the golden files anew; read the diff before committing it
 	@$(BIN)/python -m pytest --quiet -m golden --update-golden $(ARGS)

@@ -25,7 +25,6 @@ MOVED = {
     "simulator": "simulation.simulator",
     "tasks.shipped_tasks": "tasks.shipped",
     "testing.cases": "testing.generators.cases",
-    "testing.differential": "testing.fuzz.differential",
     "tracing": "simulation.tracing",
     "tracing.trace_data": "simulation.tracing.data",
     "tracing.trace_text": "simulation.tracing.text",

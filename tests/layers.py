@@ -23,7 +23,6 @@ _TESTING = (
     "testing.generators",
     "testing.strategies",
     "testing.pack_tests",
-    "testing.fuzz",
     "testing.properties",
 )
 _LEARNING = (
@@ -80,7 +79,6 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "testing.strategies": (*_SCREEN, "testing.generators"),
     "testing": ("testing.strategies",),  # the public names
     "testing.pack_tests": _SCREEN,
-    "testing.fuzz": (*_SCREEN, "testing.generators"),
     "testing.properties": (*_SCREEN, *_TESTING[:-1]),
     "testing.mutation": (*_SCREEN, *_TESTING),
     "testing.pytest_plugin": (*_SCREEN, *_TESTING),
@@ -127,7 +125,6 @@ _TORCH = (
     "simulation.simulator",
     "simulation.provenance",
     "testing.generators",
-    "testing.fuzz",
     "testing.mutation",
     "tasks.tensors",
     "tasks.episodes",

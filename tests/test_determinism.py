@@ -33,8 +33,9 @@ ORDER_DOES_NOT_MATTER = {
 @pytest.fixture(scope="module")
 def faults() -> list[str]:
     sources = {
-        ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path.read_text(encoding="utf-8")
-        for path in sorted(PACKAGE.rglob("*.py"))
+        ".".join(path.relative_to(root).with_suffix("").parts): path.read_text(encoding="utf-8")
+        for root, folder in ((PACKAGE, PACKAGE), (ROOT, ROOT / "tests" / "fuzz"))
+        for path in sorted(folder.rglob("*.py"))
     }
     assert "model.logic.satisfy" in sources
     return list(all_faults(sources))

@@ -69,11 +69,18 @@ def test_wheel_holds_what_ships(wheel: Path) -> None:
     assert {name for name in inside if ".dist-info/" not in name} == data.keys() | package.keys()
     assert all(inside[name] == text for name, text in (data | package).items())
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in inside)
+    assert not [name for name in inside if "fuzz" in name or "emulation" in name], "tools of developers ship"
 
 
 def test_wheel_runs_elsewhere(scripts: Path, tmp_path: Path) -> None:
     where = succeed(scripts / "python", "-c", "import powderdsl; print(powderdsl.__file__)", cwd=tmp_path)
     assert Path(where.strip()).is_relative_to(scripts.parent), "the test found another powderdsl"
     succeed(scripts / "powderdsl", "check", "powderworld", cwd=tmp_path)
+    left = run(scripts / "powderdsl", "fuzz", "--seconds", "3", cwd=tmp_path)
+    assert (left.returncode, left.stdout) == (2, "")
+    assert left.stderr.count("\n") == 1
+    assert "python -m tests.fuzz" in left.stderr
+    missing = run(scripts / "python", "-c", "import tests.fuzz", cwd=tmp_path)
+    assert "No module named 'tests'" in missing.stderr
     refused = run(scripts / "powderdsl", "check", "no-such-rules", cwd=tmp_path)
     assert refused.returncode == 2, "the line above proves nothing if `check` never says no"

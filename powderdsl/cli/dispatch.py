@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import click
 
-from powderdsl.cli.exits import report_failure, version
+from powderdsl.cli.exits import BadInput, report_failure, version
 from powderdsl.diagnostics.printable import printable_streams
 from powderdsl.system.interrupts import LIFELINE, end_with_stdin, interruptible
 
@@ -22,7 +22,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show": ("show", "List elements, reactions, passes and parameters; or what a task is."),
     "test": ("test", "Run the tests of packs, and hold their invariants against the rules."),
     "trace": ("trace", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
-    "fuzz": ("fuzz", "Compare all backends on random rules and worlds."),
     "record": ("record", "Record episodes of a task: data for offline learning and world models."),
     "bench": ("bench", "Measure how fast rules run, on each backend, batch and size."),
     "train": ("train", "Train an agent on a task; go on where it was interrupted."),
@@ -37,30 +36,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-class CommandGroup(click.Group):
-    """Imports commands late, suggests one for an unknown name, and turns every failure into an exit code."""
+ELSEWHERE = {
+    "fuzz": "`powderdsl fuzz` is a developers' tool: run `python -m tests.fuzz` in a clone of the repository"
+}
+"""Commands that have left the package."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        command: click.Command = import_module(f"powderdsl.cli.commands.{COMMANDS[cmd_name][0]}").command
-        return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            from powderdsl.diagnostics import suggest
-
-            ctx.fail("; ".join([f"no command `{args[0]}`", *suggest(args[0], COMMANDS, "commands")]))
-        return super().resolve_command(ctx, args)
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+class GuardedCommand(click.Command):
+    """Turns every failure into an exit code."""
 
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **options: Any
@@ -76,11 +59,39 @@ class CommandGroup(click.Group):
         # Without arguments of a caller's, the command is all that this process does.
         with printable_streams(), interruptible(until_exit=args is None) as over:
             try:
-                status = super().main(args, prog_name or "powderdsl", *rest, **options)
+                status = super().main(args, prog_name or self.name, *rest, **options)
             except (Exception, KeyboardInterrupt) as error:
                 over()
                 status = report_failure(error)
         sys.exit(status or 0)
+
+
+class CommandGroup(GuardedCommand, click.Group):
+    """Imports commands late, and suggests one for an unknown name."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = import_module(f"powderdsl.cli.commands.{COMMANDS[cmd_name][0]}").command
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] in ELSEWHERE:
+            raise BadInput(ELSEWHERE[args[0]])
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            from powderdsl.diagnostics import suggest
+
+            ctx.fail("; ".join([f"no command `{args[0]}`", *suggest(args[0], COMMANDS, "commands")]))
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
 
 
 @click.group(

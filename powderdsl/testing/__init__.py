@@ -1,4 +1,4 @@
-"""For testing rules and backends: random rulesets and worlds, comparison of backends, reduction of failing cases.
+"""For testing rules: random rulesets and worlds, tests of packs, invariants, mutants.
 
 `worlds` and `rulesets` are strategies for Hypothesis, which nothing else here needs.
 """

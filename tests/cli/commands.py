@@ -10,6 +10,7 @@ from pathlib import Path
 from click.testing import CliRunner, Result
 
 from powderdsl.cli import main
+from tests.fuzz.command import command as fuzz
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,7 +31,8 @@ passes:
 
 def powderdsl(*arguments: object, **environment: str) -> Result:
     """Run in this process. `stdout`, `stderr` and `exit_code` say what came of it."""
-    result = CliRunner().invoke(main, [str(word) for word in arguments], env=environment)
+    command, words = (fuzz, arguments[1:]) if arguments[:1] == ("fuzz",) else (main, arguments)
+    result = CliRunner().invoke(command, [str(word) for word in words], env=environment)
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     assert "Traceback" not in result.output
     return result
@@ -49,7 +51,9 @@ def process(*arguments: object, **environment: str) -> subprocess.CompletedProce
 
 
 def command_line(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "powderdsl", *(str(word) for word in arguments)]
+    """`fuzz` is a module of the tests, as developers call it; all else is a command of powderdsl's."""
+    words = ["tests.fuzz", *arguments[1:]] if arguments[:1] == ("fuzz",) else ["powderdsl", *arguments]
+    return [sys.executable, "-m", *(str(word) for word in words)]
 
 
 def environment_with(**changes: str) -> dict[str, str]:

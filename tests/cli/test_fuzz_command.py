@@ -1,4 +1,4 @@
-"""`powderdsl fuzz`: what it says, saves and returns; a backend that is made wrong is found, reduced and replayed."""
+"""`python -m tests.fuzz`: what it says, saves and returns; a backend that is made wrong is found, reduced and replayed."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.build import Building
-from powderdsl.testing.fuzz import differential
-from powderdsl.testing.fuzz.case_files import read_case, write_case
-from powderdsl.testing.fuzz.reducer import reduce_case
 from tests.cli.commands import command_line, environment_with, powderdsl, process
+from tests.fuzz import differential
+from tests.fuzz.case_files import read_case, write_case
+from tests.fuzz.reducer import reduce_case
 from tests.processes import started, waited
 
 

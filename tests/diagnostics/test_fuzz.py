@@ -1,6 +1,6 @@
 """Random damage to rule files: loading raises nothing but CompileError, and what it raises can be printed.
 
-`powderdsl fuzz --front-end --seeds 0..20000` looks harder, and at time and memory; so do the campaign, which reduces
+`python -m tests.fuzz --front-end --seeds 0..20000` looks harder, and at time and memory; so do the campaign, which reduces
 what it finds, and ``FUZZ_EXAMPLES=20000 pytest --campaigns tests/diagnostics/test_fuzz.py``.
 """
 
@@ -13,8 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from powderdsl.model.declarations import PackDecl
-from powderdsl.testing.fuzz import damage
-from powderdsl.testing.fuzz.damage import (
+from powderdsl.testing.strategies import chosen
+from tests.fuzz import damage
+from tests.fuzz.damage import (
     KINDS,
     damaged_text,
     load_damaged,
@@ -23,7 +24,6 @@ from powderdsl.testing.fuzz.damage import (
     run_trial,
     whole,
 )
-from powderdsl.testing.strategies import chosen
 from tests.tiers import tiered
 
 SMOKE = 50
@@ -71,7 +71,7 @@ def test_any_text(examples: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", tiered((SEEDS, 20 * SEEDS), [SEEDS]))
 def test_seeded_damage(seeds: int) -> None:
-    """The first inputs of `powderdsl fuzz --front-end`: of every kind, and not all of them refused at once."""
+    """The first inputs of `python -m tests.fuzz --front-end`: of every kind, and not all of them refused at once."""
     trials = [run_trial(seed) for seed in range(seeds)]
     assert {trial.kind for trial in trials} == set(KINDS)
     assert sum(trial.accepted for trial in trials) >= seeds // 50

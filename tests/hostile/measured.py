@@ -28,7 +28,6 @@ MODULES = (
     "powderdsl.rl.evaluation",
     "powderdsl.experiments.studies.run",
     "powderdsl.tasks.shipped",
-    "powderdsl.testing.fuzz.case_files",
     "powderdsl.worldmodel.scores",
     "powderdsl.worlds.image",
     "powderdsl.worlds.scene",

@@ -1,4 +1,4 @@
-"""Cases that a backend once got wrong, as `powderdsl fuzz` saved them: all backends run them for ever."""
+"""Cases that a backend once got wrong, as `python -m tests.fuzz` saved them: all backends run them for ever."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from powderdsl.targets.cpp.build import Building
-from powderdsl.testing.fuzz.case_files import read_case
-from powderdsl.testing.fuzz.differential import check_case
 from tests.compilers import skip_without_compiler
+from tests.fuzz.case_files import read_case
+from tests.fuzz.differential import check_case
 
 FOLDER = Path(__file__).parent
 FILES = sorted(FOLDER.glob("*.yaml"))
@@ -28,7 +28,7 @@ def cases() -> list:
 def test_backends_agree(path: Path, backend: str, tmp_path: Path) -> None:
     skip_without_compiler(backend)
     found = check_case(replace(read_case(path), backend=backend), Building("-O0", tmp_path))
-    assert found is None, f"{found}\npowderdsl fuzz --replay {path.relative_to(FOLDER.parents[1])}"
+    assert found is None, f"{found}\npython -m tests.fuzz --replay {path.relative_to(FOLDER.parents[1])}"
 
 
 def test_there_are_some() -> None:

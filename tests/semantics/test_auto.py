@@ -29,11 +29,11 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.targets.cpp.compilers import NoCompiler
 from powderdsl.targets.job import Job
-from powderdsl.testing.fuzz.compare import find_difference
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import environment_with
 from tests.cli.commands import powderdsl as command
+from tests.fuzz.compare import find_difference
 from tests.processes import alive, waited
 
 RULES = """\

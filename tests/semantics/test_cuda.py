@@ -16,11 +16,11 @@ from powderdsl.ir.segments import segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
-from powderdsl.testing.fuzz.compare import assert_same
-from powderdsl.testing.fuzz.cuda_emulation import emulated_simulator
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz.compare import assert_same
+from tests.fuzz.cuda_emulation import emulated_simulator
 
 PACKS_ALONE = {"acid", "cloner", "core", "fire", "gas", "lava", "plant", "sand", "stone", "water", "wind"}
 LARGE = "powderworld"

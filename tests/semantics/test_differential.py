@@ -1,7 +1,7 @@
 """Every backend against the oracle, bit by bit: shipped rulesets, random rulesets, odd worlds.
 
 A pair is one ruleset with one world. The random pairs are the same in every run: they come from seeds. `make test`
-takes the first of them, `make test-all` all. `powderdsl fuzz` tries others and reduces what fails. Or:
+takes the first of them, `make test-all` all. `python -m tests.fuzz` tries others and reduces what fails. Or:
 
     POWDERDSL_SEEDS=1000..3000 pytest --campaigns tests/semantics/test_differential.py -k random
 """
@@ -23,14 +23,14 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building
-from powderdsl.testing.fuzz.compare import assert_same, find_difference
-from powderdsl.testing.fuzz.differential import Outcome, Plan, run_seed
-from powderdsl.testing.fuzz.exercised import constructs, missing, operations
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from powderdsl.testing.strategies import rulesets, worlds
 from tests.compilers import skip_without_compiler
+from tests.fuzz.compare import assert_same, find_difference
+from tests.fuzz.differential import Outcome, Plan, run_seed
+from tests.fuzz.exercised import constructs, missing, operations
 from tests.tiers import tiered
 
 BACKENDS = ("reference", "dense", "planes")
@@ -87,9 +87,7 @@ def agreed(outcomes: Iterable[Outcome]) -> int:
     worlds = 0
     for outcome in outcomes:
         for found in outcome.findings:
-            again = (
-                f"powderdsl fuzz --seeds {outcome.seed}..{outcome.seed + 1} --backends {found.case.backend}"
-            )
+            again = f"python -m tests.fuzz --seeds {outcome.seed}..{outcome.seed + 1} --backends {found.case.backend}"
             pytest.fail(
                 f"{found.case.backend} {found.problem}\n{again}\n{found.case.start}\n{found.case.text}"
             )

@@ -9,11 +9,11 @@ import pytest
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.testing.fuzz.compare import assert_same
-from powderdsl.testing.fuzz.cuda_emulation import emulated_simulator
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
+from tests.fuzz.compare import assert_same
+from tests.fuzz.cuda_emulation import emulated_simulator
 from tests.tiers import tiered
 
 DIVISION = """\

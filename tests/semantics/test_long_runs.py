@@ -15,10 +15,10 @@ from powderdsl.compiler import load, shipped_rules
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.testing.fuzz.compare import find_difference
 from powderdsl.testing.generators.cases import random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
+from tests.fuzz.compare import find_difference
 
 MOMENTS = (1, 2, 5, 10, 100, 1000)
 SHAPES = [(2, 9, 130), (3, 33, 17)]

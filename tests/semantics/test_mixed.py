@@ -14,10 +14,10 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.arrays.program import ArrayProgram
 from powderdsl.targets.dense.mixed import MixedProgram, mixed_program
-from powderdsl.testing.fuzz.compare import assert_same, find_difference
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
+from tests.fuzz.compare import assert_same, find_difference
 
 ROWS = "\n".join("      - " + " ".join(str(1 + (5 * i + 3 * j) % 7) for j in range(21)) for i in range(21))
 

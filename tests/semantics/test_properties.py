@@ -25,11 +25,11 @@ from powderdsl.model.state import SNAP, slots
 from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Ruleset, Swap, Transform
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.testing.fuzz.compare import find_difference
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from powderdsl.testing.generators.vocabulary import Manner
+from tests.fuzz.compare import find_difference
 
 ANYTHING = Manner()
 STEADY = Manner(draws=False, borders=False, symmetry=False)

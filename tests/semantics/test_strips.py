@@ -10,11 +10,11 @@ from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.testing.fuzz.compare import assert_same
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.compilers import skip_without_compiler
+from tests.fuzz.compare import assert_same
 
 STRIPS = [(1, 8, 8), (2, 16, 70), (1, 64, 64), (3, 128, 65), (1, 256, 256), (9, 520, 20), (2, 8, 1)]
 """Strips of one row, of more rows than one list of active rows has, of words that are not full; large and many."""

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.testing.fuzz.case_files import read_case, write_case
-from powderdsl.testing.fuzz.compare import find_difference
-from powderdsl.testing.fuzz.differential import seeded_starts
 from powderdsl.testing.generators.cases import Case, load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz.case_files import read_case, write_case
+from tests.fuzz.compare import find_difference
+from tests.fuzz.differential import seeded_starts
 
 
 @pytest.mark.parametrize("seed", [8, 40, 64])

@@ -7,9 +7,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar
 from powderdsl.testing.generators.vocabulary import Tree
 
 Array = NDArray[Any]
+
+
+def to_tree(node: Node) -> Tree:
+    """Located YAML as plain Python values."""
+    if isinstance(node, Scalar):
+        return node.text
+    if isinstance(node, Mapping):
+        return {key.text: to_tree(value) for key, value in node.entries}
+    return [to_tree(item) for item in node.items]
 
 
 def write_array(values: Array) -> Tree:

@@ -16,10 +16,9 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.writing import failure, replacing
-from powderdsl.testing.fuzz.reducer import to_tree
 from powderdsl.testing.generators.rulemaker import write_yaml
 from powderdsl.testing.generators.vocabulary import Tree
-from powderdsl.testing.generators.written_arrays import entries_of, line_of, read_array, write_array
+from powderdsl.testing.generators.written_arrays import entries_of, line_of, read_array, to_tree, write_array
 from powderdsl.testing.properties.outcomes import Counterexample, Property
 from powderdsl.testing.properties.samples import Sample
 

@@ -19,11 +19,11 @@ from powderdsl.system.crew import Done, Lost, Tell, work_through
 from powderdsl.system.reading import parse_json, read_bytes
 from powderdsl.system.scratch import scratch_folder
 from powderdsl.system.writing import failure, replacing
-from powderdsl.testing.fuzz.case_files import write_case
-from powderdsl.testing.fuzz.differential import Finding, Outcome, Plan, run_seed, seeded_starts, still_fails
-from powderdsl.testing.fuzz.reducer import reduce_case
 from powderdsl.testing.generators.cases import Case, load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz.case_files import write_case
+from tests.fuzz.differential import Finding, Outcome, Plan, run_seed, seeded_starts, still_fails
+from tests.fuzz.reducer import reduce_case
 
 SEED_LIMIT = 600.0
 """Seconds that a seed may take before it counts as one that hangs."""
@@ -89,7 +89,7 @@ def load_tally(folder: Path, plan: Plan) -> Tally:
     except OSError as error:
         raise failure("PD101", f"cannot read {path}", notes=(str(error.strerror),)) from None
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise failure("PD602", f"{path} is no state of `powderdsl fuzz`", notes=(str(error),)) from None
+        raise failure("PD602", f"{path} is no state of `python -m tests.fuzz`", notes=(str(error),)) from None
     if tally.plan != describe(plan):
         notes = (f"there: {tally.plan}", f"here: {describe(plan)}")
         helps = ("give the options that it began with, or another folder",)

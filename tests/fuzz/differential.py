@@ -16,11 +16,11 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.testing.fuzz.compare import find_difference
-from powderdsl.testing.fuzz.exercised import Used, constructs, operations
 from powderdsl.testing.generators.cases import Case, Start, fitted, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz.compare import find_difference
+from tests.fuzz.exercised import Used, constructs, operations
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator

@@ -11,10 +11,11 @@ import numpy as np
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_text
-from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
+from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.generators.cases import Case, Start
 from powderdsl.testing.generators.rulemaker import write_yaml
 from powderdsl.testing.generators.vocabulary import Tree
+from powderdsl.testing.generators.written_arrays import to_tree
 
 PLAIN = ("yes", "no", "0", "1", "here", "0.5")
 """What an expression may shrink to, besides its own parts."""
@@ -84,15 +85,6 @@ def reduce_start(start: Start, fails: Callable[[Start], bool]) -> Start:
                 break
         else:
             return start
-
-
-def to_tree(node: Node) -> Tree:
-    """Located YAML as plain Python values."""
-    if isinstance(node, Scalar):
-        return node.text
-    if isinstance(node, Mapping):
-        return {key.text: to_tree(value) for key, value in node.entries}
-    return [to_tree(item) for item in node.items]
 
 
 def _smaller_trees(tree: Tree) -> Iterator[Tree]:

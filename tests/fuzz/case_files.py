@@ -9,11 +9,10 @@ from powderdsl.model.state import slots
 from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.writing import failure, replacing
-from powderdsl.testing.fuzz.reducer import to_tree
 from powderdsl.testing.generators.cases import Case, Start, load_text
 from powderdsl.testing.generators.rulemaker import write_yaml
 from powderdsl.testing.generators.vocabulary import Tree
-from powderdsl.testing.generators.written_arrays import entries_of, line_of, read_array, write_array
+from powderdsl.testing.generators.written_arrays import entries_of, line_of, read_array, to_tree, write_array
 
 
 def write_case(path: Path, case: Case, problem: str = "") -> None:
@@ -23,7 +22,7 @@ def write_case(path: Path, case: Case, problem: str = "") -> None:
         CompileError: PD613, the file cannot be written.
     """
     start = case.start
-    head = [*problem.splitlines(), f"Again: powderdsl fuzz --replay {path.name}"]
+    head = [*problem.splitlines(), f"Again: python -m tests.fuzz --replay {path.name}"]
     tree: dict[str, Tree] = {
         "backend": case.backend,
         "steps": str(case.steps),
@@ -77,5 +76,7 @@ def read_case(path: Path) -> Case:
         note = (
             f"{type(error).__name__}: {' '.join(str(error).split())}" if str(error) else "a part is missing"
         )
-        helps = ("a case is written by `powderdsl fuzz`",)
-        raise failure("PD602", f"{path} is no case of `powderdsl fuzz`", notes=(note,), helps=helps) from None
+        helps = ("a case is written by `python -m tests.fuzz`",)
+        raise failure(
+            "PD602", f"{path} is no case of `python -m tests.fuzz`", notes=(note,), helps=helps
+        ) from None

@@ -7,7 +7,6 @@ import hashlib
 import os
 import subprocess
 import tempfile
-from importlib.resources import files
 from pathlib import Path
 
 from powderdsl.compiler import lower
@@ -24,7 +23,7 @@ FLAGS = ("-std=c++17", "-O0", "-ffp-contract=off", "-fno-strict-aliasing", "-sha
 
 def emulated_text(text: str) -> str:
     """A kernel's source between what stands in for a GPU."""
-    folder = files("powderdsl.testing.fuzz")
+    folder = Path(__file__).parent
     before = (folder / "cuda_emulation.hpp").read_text(encoding="utf-8")
     after = (folder / "cuda_fibers.hpp").read_text(encoding="utf-8")
     return "\n".join([before, text, after])

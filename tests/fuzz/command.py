@@ -1,4 +1,4 @@
-"""`powderdsl fuzz`: random rules on all backends against the reference, and random damage to rule files."""
+"""`python -m tests.fuzz`: random rules on all backends against the reference, and random damage to rule files."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from powderdsl.cli.dispatch import GuardedCommand
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
 from powderdsl.cli.options import WholeType
 from powderdsl.cli.progress import progress
 from powderdsl.system.interrupts import Terminated
 
 if TYPE_CHECKING:
-    from powderdsl.testing.fuzz.campaign import Tally
-    from powderdsl.testing.fuzz.differential import Plan
+    from tests.fuzz.campaign import Tally
+    from tests.fuzz.differential import Plan
 
 Item = TypeVar("Item")
 
@@ -53,7 +54,7 @@ class BackendsType(click.ParamType):
         return names
 
 
-@click.command("fuzz")
+@click.command("fuzz", cls=GuardedCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--seeds", type=SeedsType(), help="Which rulesets, or damaged files.  [default: 0..200]")
 @click.option("--seconds", type=WholeType(1, 10_000_000), help="Run so long, with as many seeds as it takes.")
 @click.option(
@@ -108,9 +109,9 @@ def command(
     `--resume` goes on. Exit code: 0 if all agree, 1 if something was found.
 
     \b
-        powderdsl fuzz --seconds 60
-        powderdsl fuzz --seeds 0..5000 --backends dense,planes,native
-        powderdsl fuzz --replay fuzz/seed7-native.yaml
+        python -m tests.fuzz --seconds 60
+        python -m tests.fuzz --seeds 0..5000 --backends dense,planes,native
+        python -m tests.fuzz --replay fuzz/seed7-native.yaml
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
     if seeds is not None and seconds is not None:
@@ -118,7 +119,7 @@ def command(
     if front_end:
         return _front_end(seeds, seconds, folder, jobs or os.cpu_count() or 1)
     from powderdsl.targets.cpp.build import Building
-    from powderdsl.testing.fuzz.differential import Plan
+    from tests.fuzz.differential import Plan
 
     building = Building(f"-O{level}")
     if replay is not None:
@@ -147,8 +148,8 @@ def _replay(path: Path, building: Any) -> int:
     from tempfile import gettempdir
 
     from powderdsl.system.scratch import scratch_folder
-    from powderdsl.testing.fuzz.case_files import read_case
-    from powderdsl.testing.fuzz.differential import check_case
+    from tests.fuzz.case_files import read_case
+    from tests.fuzz.differential import check_case
 
     case = read_case(path)
     if case.backend not in (*COMPARED, "reference"):
@@ -165,7 +166,7 @@ def _replay(path: Path, building: Any) -> int:
 def _campaign(
     plan: Plan, seeds: range | None, seconds: int | None, folder: Path, resume: bool, jobs: int
 ) -> int:
-    from powderdsl.testing.fuzz.campaign import Tally, describe, load_tally, run_campaign
+    from tests.fuzz.campaign import Tally, describe, load_tally, run_campaign
 
     wanted = seeds or (range(200) if seconds is None else range(MAX_SEED))
     tally = load_tally(folder, plan) if resume else Tally(describe(plan), wanted.start, wanted.start)
@@ -194,7 +195,7 @@ def _campaign(
 
 
 def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted: bool) -> None:
-    from powderdsl.testing.fuzz.exercised import ON_CELLS, coverage_table
+    from tests.fuzz.exercised import ON_CELLS, coverage_table
 
     names = " and ".join(plan.backends)
     if interrupted:
@@ -214,14 +215,14 @@ def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted:
             click.echo(f"  {'':<{widths[0]}}  {'':>{widths[1]}}  never: {lacking}")
     click.echo()
     for name in tally.files:
-        click.echo(f"powderdsl fuzz --replay {folder / name}")
+        click.echo(f"python -m tests.fuzz --replay {folder / name}")
     click.echo(f"{counted(len(tally.files), 'difference')} found")
 
 
 def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int) -> int:
     from collections import Counter
 
-    from powderdsl.testing.fuzz.damage import run_trials
+    from tests.fuzz.damage import run_trials
 
     wanted = seeds or (range(2000) if seconds is None else range(MAX_SEED))
     began = time.monotonic()
