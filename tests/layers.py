@@ -62,7 +62,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "simulation.native_start": _BACK,
     "simulation.auto": _BACK,
     "simulation.programs": (*_BACK, "simulation.native_start", "simulation.auto"),
-    "simulation.views": ("targets", "targets.cpp"),
+    "simulation.views": ("ir", "targets", "targets.cpp"),
     "simulation.observe": (*_BACK, "simulation.draw", "simulation.views"),
     "simulation.simulator": (*_BACK, "simulation.programs", "simulation.observe", "simulation.state_checks"),
     "simulation.provenance": (*_FRONT, "simulation.simulator"),
@@ -110,6 +110,7 @@ class Home:
 
 _TEXT = ("syntax", "worlds.scene")
 _TORCH = (
+    "targets.codec",
     "targets.job",
     "targets.laps",
     "targets.random",

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.gates import Bits, Gates, width
-from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Program, SlotType, Step, nodes_of
+from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Program, SlotType, Step, nodes_of, plane_name
 
 MAX_TABLE_BITS = 12
 
@@ -33,7 +33,8 @@ def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
         return (slot,)
     count, _ = width(slot.type.lo, slot.type.hi)
     return tuple(
-        SlotType(f"{slot.name}:{i}", FLAG, int(slot.default) >> i & 1, slot.resets) for i in range(count)
+        SlotType(plane_name(slot.name, i), FLAG, int(slot.default) >> i & 1, slot.resets)
+        for i in range(count)
     )
 
 
@@ -91,7 +92,7 @@ class _PassBits:
         if name in self.slots:
             type = self.slots[name].type
             value = self.gates.fit(value, type.lo, type.hi)
-        return [(f"{name}:{i}", plane) for i, plane in enumerate(value.planes)]
+        return [(plane_name(name, i), plane) for i, plane in enumerate(value.planes)]
 
     def _flag(self, node: Node) -> Node:
         value = self.values[id(node)]
@@ -160,7 +161,7 @@ class _PassBits:
             return self.build.input(str(node.attr), node.type)
         slot = self.slots[str(node.attr)]
         count, signed = width(slot.type.lo, slot.type.hi)
-        stored = Bits(tuple(self.build.input(f"{slot.name}:{i}", FLAG) for i in range(count)), signed)
+        stored = Bits(tuple(self.build.input(plane_name(slot.name, i), FLAG) for i in range(count)), signed)
         return self.gates.fit(stored, node.type.lo, node.type.hi)
 
     def _shift(self, node: Node) -> Node | Bits:

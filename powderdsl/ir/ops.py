@@ -33,6 +33,17 @@ def whole(lo: int, hi: int) -> Type:
 
 
 @dataclass(frozen=True)
+class Threshold:
+    """A chance as a number of draws of so many bits: those below it, or up to it if not `strict`."""
+
+    bits: int
+    strict: bool = True
+
+    def __str__(self) -> str:
+        return f"{'lt' if self.strict else 'le'}{self.bits}"
+
+
+@dataclass(frozen=True)
 class Op:
     """A row of the table: argument types (`?` any, `=` all alike, `*` any number of them), result, what `attr` is."""
 
@@ -53,8 +64,8 @@ OPS: dict[str, Op] = {
             "param",
             (),
             "?",
-            "(name, view[, bit])",
-            "one number a world; view: `value`, or a chance as a threshold for draws",
+            "(name, threshold or None[, bit])",
+            "one number a world: its value, or a chance as a threshold for draws",
         ),
         Op("coordinate", (), "?", "(row | column | step, modulus[, bit])"),
         Op("inside", (), "flag", "offset", "whether that neighbor lies inside the grid"),
@@ -126,8 +137,6 @@ OPS: dict[str, Op] = {
             "(low, high)",
             "not a number → 0, cut off at the bounds, smaller than SNAP → 0",
         ),
-        # variables of a schedule (`schedule/types.py`)
-        Op("load", (), "?", "name", "what a variable of the schedule holds"),
         # choices and movements
         Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),
         Op(
@@ -149,7 +158,7 @@ OPS: dict[str, Op] = {
 """Every operation of the IR."""
 
 COMMUTATIVE = frozenset({"and", "or", "xor", "eq", "add", "mul", "min", "max"})
-LEAVES = frozenset({"input", "const", "param", "coordinate", "inside", "draw", "load"})
+LEAVES = frozenset({"input", "const", "param", "coordinate", "inside", "draw"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,12 +227,35 @@ class PassGraph:
 
 @dataclass(frozen=True)
 class SlotType:
-    """A slot of the state: vectors are two slots, ``name.row`` and ``name.column``."""
+    """A slot of the state: vectors are two slots, ``name.row`` and ``name.column``.
+
+    `state` names the state's tensor, if that is not the slot's name, and `component` the part of a vector in it.
+    """
 
     name: str
     type: Type
     default: int | float
     resets: bool
+    state: str = ""
+    component: int | None = None
+
+
+def component_names(name: str) -> tuple[str, str]:
+    """The slots of a vector."""
+    return f"{name}.row", f"{name}.column"
+
+
+def component_of(slot: str) -> tuple[str, int | None]:
+    """The vector that a slot is a component of, and which; the slot itself and None for any other."""
+    for i, end in enumerate(component_names("")):
+        if slot.endswith(end):
+            return slot.removesuffix(end), i
+    return slot, None
+
+
+def plane_name(slot: str, bit: int) -> str:
+    """The slot of a bit of an integer slot."""
+    return f"{slot}:{bit}"
 
 
 @dataclass(frozen=True)

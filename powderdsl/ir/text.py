@@ -64,4 +64,6 @@ def attr_text(attr: object) -> str:
         return "(" + ", ".join(attr_text(part) for part in attr) + ")"
     if isinstance(attr, float):
         return f"{attr!r}"
+    if attr is None:
+        return "value"
     return str(attr)

@@ -106,10 +106,11 @@ class _Checker:
 
 
 SCHEDULE_OPS = frozenset({
+    "load",
     "stack", "member", "swap_onto", "leave", "cells", "choose", "places", "moved", "update", "carry", "copy",
     "below_param", "any", "when", "led", "live", "present",
 })  # fmt: skip
-"""Operations that only schedules have: `stack` planes → block; `member` (block) → a plane; `swap` (block, movers) and
+"""Operations that only schedules have: `load` → what a variable holds; `stack` planes → block; `member` (block) → a plane; `swap` (block, movers) and
 `leave` (block, movers) → block; `arrive` and `swap_onto` (block, movers, rest) → block; `cells` (flag) → bool cells;
 `choose` (cells, yes, no) → floats; `places` (flag) → where it holds, `moved` (places) → their neighbors; `update`
 (places, no, other) → `no`, and there `other` added to it, taken off or multiplied; `carry` (places, moved, no, other) →

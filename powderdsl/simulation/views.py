@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from powderdsl.ir.ops import component_of
 from powderdsl.targets import words
 from powderdsl.targets.cpp.program import PackedState, address
 
@@ -121,10 +122,8 @@ def write_channels(state: State, channels: Sequence[Channel], tables: Tensor, ou
 
 
 def _part(state: State, name: str) -> Tensor:
-    base, _, part = name.rpartition(".")
-    if part in ("row", "column") and base in state:
-        return state[base][:, ("row", "column").index(part)]
-    return state[name]
+    vector, component = component_of(name)
+    return state[name] if component is None else state[vector][:, component]
 
 
 def _native_channel(channel: Channel, state: PackedState) -> tuple[int, int, int, int]:

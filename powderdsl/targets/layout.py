@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from powderdsl.ir.ops import Node, Program, nodes_of, walk
+from powderdsl.ir.ops import Node, Program, Threshold, nodes_of, walk
 
 
 @dataclass
@@ -14,7 +14,7 @@ class Layout:
     planes: dict[str, int] = field(default_factory=dict)
     reals: dict[str, int] = field(default_factory=dict)
     streams: dict[str, int] = field(default_factory=dict)
-    param_planes: dict[tuple[str, str, int], int] = field(default_factory=dict)
+    param_planes: dict[tuple[str, Threshold | None, int], int] = field(default_factory=dict)
     param_reals: dict[str, int] = field(default_factory=dict)
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
@@ -78,10 +78,10 @@ def number(table: dict, key: object) -> int:
     return int(table.setdefault(key, len(table)))
 
 
-def param_key(node: Node) -> tuple[str, str, int]:
-    """Name, view and bit of a parameter's plane."""
-    name, view, *bit = node.attr
-    return name, view, bit[0] if bit else 0
+def param_key(node: Node) -> tuple[str, Threshold | None, int]:
+    """Name, threshold and bit of a parameter's plane."""
+    name, threshold, *bit = node.attr
+    return name, threshold, bit[0] if bit else 0
 
 
 def literal(value: float) -> str:

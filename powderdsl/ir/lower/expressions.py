@@ -8,7 +8,7 @@ from fractions import Fraction
 from math import ceil, floor
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import FLAG, REAL, Node, whole
+from powderdsl.ir.ops import FLAG, REAL, Node, Threshold, component_names, whole
 from powderdsl.model.state import Slot
 from powderdsl.model.types import Expr, Kernel, Property, Ruleset
 
@@ -33,11 +33,10 @@ class Planes:
         """A property of given elements; values that are parameters are chosen one by one."""
         build = self.build
         if any(isinstance(v, str) for v in prop.values):
-            view = "value"
             numbers: list[Node] = []
             for value in prop.values:
                 if isinstance(value, str):
-                    numbers.append(param_node(self, value, view))
+                    numbers.append(param_node(self, value))
                 elif prop.kind.name == "flag":
                     numbers.append(build.flag(bool(value)))
                 else:
@@ -77,12 +76,13 @@ def pair(expr: Expr, at: Planes) -> Pair:
     return lowered
 
 
-def param_node(at: Planes, name: str, view: str) -> Node:
+def param_node(at: Planes, name: str, threshold: Threshold | None = None) -> Node:
+    """A parameter's value, or as a chance the number of draws that lie below it."""
     param = next(p for p in at.ruleset.params if p.name == name)
-    if view.startswith(("lt", "le")):
-        return at.build.make("param", whole(0, 1 << int(view[2:])), attr=(name, view))
+    if threshold is not None:
+        return at.build.make("param", whole(0, 1 << threshold.bits), attr=(name, threshold))
     type = {"flag": FLAG, "int": whole(int(param.kind.lo), int(param.kind.hi))}.get(param.kind.name, REAL)
-    return at.build.make("param", type, attr=(name, view))
+    return at.build.make("param", type, attr=(name, None))
 
 
 def _const(expr: Expr, at: Planes) -> Node:
@@ -115,7 +115,8 @@ def _property(expr: Expr, at: Planes) -> Node:
 
 def _slot(name: str, at: Planes) -> Node | Pair:
     if at.slots[name].planes == 2:
-        return at.state[f"{name}.row"], at.state[f"{name}.column"]
+        row, column = component_names(name)
+        return at.state[row], at.state[column]
     return at.state[name]
 
 
@@ -177,7 +178,7 @@ def _chance_real(expr: Expr, at: Planes) -> Node:
         case "const":
             return build.real(_float32(expr.value))
         case "param":
-            return param_node(at, str(expr.value), "value")
+            return param_node(at, str(expr.value))
         case "look":
             return build.shift(_chance_real(expr.args[0], at), expr.value)
         case "choose":
@@ -190,9 +191,7 @@ def _chance_real(expr: Expr, at: Planes) -> Node:
             return value
     prop = at.ruleset.property(str(expr.value))
     assert prop is not None
-    values = [
-        param_node(at, v, "value") if isinstance(v, str) else build.real(_float32(v)) for v in prop.values
-    ]
+    values = [param_node(at, v) if isinstance(v, str) else build.real(_float32(v)) for v in prop.values]
     return at.by_element(at.state["element"], values)
 
 
@@ -223,30 +222,30 @@ def _split_draw(expr: Expr, at: Planes) -> tuple[Expr, tuple[int, int], Node | N
     return draw, offset, at.build.arithmetic("add", extra, other) if extra else other
 
 
-def threshold(chance: Fraction | float, bits: int, mode: str) -> int:
-    """How many of the 2^bits draws lie below a chance (`lt`), or not above it (`le`)."""
-    scaled = Fraction(float(chance)) * (1 << bits) - Fraction(1, 2)
-    count = ceil(scaled) if mode == "lt" else floor(scaled) + 1
-    return min(max(count, 0), 1 << bits)
+def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
+    """How many of the 2^bits draws lie below a chance, or not above it."""
+    scaled = Fraction(float(chance)) * (1 << threshold.bits) - Fraction(1, 2)
+    count = ceil(scaled) if threshold.strict else floor(scaled) + 1
+    return min(max(count, 0), 1 << threshold.bits)
 
 
-def _threshold_node(chance: Expr, bits: int, mode: str, at: Planes) -> Node:
+def _threshold_node(chance: Expr, threshold: Threshold, at: Planes) -> Node:
     build = at.build
     match chance.op:
         case "const":
-            return build.whole(threshold(chance.value, bits, mode))
+            return build.whole(draws_below(chance.value, threshold))
         case "param":
-            return param_node(at, str(chance.value), f"{mode}{bits}")
+            return param_node(at, str(chance.value), threshold)
         case "look":
-            return build.shift(_threshold_node(chance.args[0], bits, mode, at), chance.value)
+            return build.shift(_threshold_node(chance.args[0], threshold, at), chance.value)
         case "choose":
-            yes, no = (_threshold_node(arg, bits, mode, at) for arg in chance.args[1:])
+            yes, no = (_threshold_node(arg, threshold, at) for arg in chance.args[1:])
             return build.select(node(chance.args[0], at), yes, no)
     prop = at.ruleset.property(str(chance.value))
     assert prop is not None
     assert chance.op == "property"
     values = [
-        param_node(at, v, f"{mode}{bits}") if isinstance(v, str) else build.whole(threshold(v, bits, mode))  # type: ignore[arg-type]
+        param_node(at, v, threshold) if isinstance(v, str) else build.whole(draws_below(v, threshold))  # type: ignore[arg-type]
         for v in prop.values
     ]
     return at.by_element(at.state["element"], values)
@@ -259,7 +258,6 @@ def _lt(expr: Expr, at: Planes) -> Node:
     # draw + extra < other, or other < draw + extra, which is the opposite of draw + extra <= other
     build = at.build
     flipped = right.kind.name == "draw"
-    mode = "le" if flipped else "lt"
     draw, offset, extra = _split_draw(right if flipped else left, at)
     other = left if flipped else right
 
@@ -269,21 +267,21 @@ def _lt(expr: Expr, at: Planes) -> Node:
         )
         return build.shift(found, offset)
 
-    bits = _stream(draw, at)[1]
+    threshold = Threshold(_stream(draw, at)[1], strict=not flipped)
     if other.kind.name == "int":
         whole_part = node(other, at)
         extra = extra or build.whole(0)
         result = build.compare("lt", extra, whole_part)
     elif isinstance(other.value, (int, Fraction)) and other.op == "const":
         base = floor(other.value)
-        part = below(build.whole(threshold(Fraction(other.value) - base, bits, mode)))
+        part = below(build.whole(draws_below(Fraction(other.value) - base, threshold)))
         if extra is None:
             result = part if base == 0 else build.flag(base > 0)
         else:
             at_base = build.compare("eq", extra, build.whole(base))
             result = build.or_(build.compare("lt", extra, build.whole(base)), build.and_(at_base, part))
     else:
-        part = below(_threshold_node(other, bits, mode, at))
+        part = below(_threshold_node(other, threshold, at))
         if extra is None:
             result = part
         else:
@@ -373,7 +371,7 @@ def _choose(expr: Expr, at: Planes) -> Node | Pair:
 
 _LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
     "const": _const,
-    "param": lambda e, at: param_node(at, str(e.value), "value"),
+    "param": lambda e, at: param_node(at, str(e.value)),
     "element": lambda e, at: at.state["element"],
     "property": _property,
     "field": lambda e, at: _slot(str(e.value), at),

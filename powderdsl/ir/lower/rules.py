@@ -7,7 +7,19 @@ from dataclasses import dataclass, field
 from powderdsl.ir.build import Builder
 from powderdsl.ir.lower.expressions import Pair, Planes, lower_expression
 from powderdsl.ir.lower.live import live_passes
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, PassGraph, Program, SlotType, Step, Type, whole
+from powderdsl.ir.ops import (
+    FLAG,
+    REAL,
+    Graph,
+    Node,
+    PassGraph,
+    Program,
+    SlotType,
+    Step,
+    Type,
+    component_names,
+    whole,
+)
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Assign, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
 
@@ -16,7 +28,7 @@ Mover = Transform | Swap | Move
 
 def plane_names(slot: Slot) -> tuple[str, ...]:
     """The IR slots of a state slot."""
-    return (f"{slot.name}.row", f"{slot.name}.column") if slot.planes == 2 else (slot.name,)
+    return component_names(slot.name) if slot.planes == 2 else (slot.name,)
 
 
 def plane_type(kind: Kind, ids: int) -> Type:
@@ -39,8 +51,10 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
     slot_types = []
     for slot in table.values():
         defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
-        for name, default in zip(plane_names(slot), defaults, strict=True):
-            slot_types.append(SlotType(name, plane_type(slot.kind, ruleset.slots), default, slot.resets))
+        type, names = plane_type(slot.kind, ruleset.slots), plane_names(slot)
+        for i, (name, default) in enumerate(zip(names, defaults, strict=True)):
+            component = i if len(names) > 1 else None
+            slot_types.append(SlotType(name, type, default, slot.resets, slot.name, component))
     # What a slot that starts each step at its default can have become by the time a pass reads it.
     ranges = {
         s.name: whole(int(s.default), int(s.default)) for s in slot_types if s.resets and s.type.name == "int"
@@ -100,7 +114,7 @@ def lower_moment(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> di
 
 
 def _part_names(name: str, kind: Kind) -> tuple[str, ...]:
-    return (f"{name}.row", f"{name}.column") if kind.name == "vec2" else (name,)
+    return component_names(name) if kind.name == "vec2" else (name,)
 
 
 def _pass_lowering(ruleset: Ruleset, graph: Graph) -> _PassLowering:

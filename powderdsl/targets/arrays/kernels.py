@@ -191,41 +191,45 @@ class ArrayKernels:
 
     # The same everywhere
 
-    def below_param(self, stream: str, bits: int, name: str, view: str, where: Array | None = None) -> Array:
+    def below_param(
+        self, stream: str, bits: int, name: str, strict: bool, where: Array | None = None
+    ) -> Array:
         """Draw below a parameter, which mostly is the same for all worlds."""
-        limits = self._numbers(name, view)
+        limits = self._limits(name, bits, strict)
         limit = int(limits[0])
         if (limits != limit).any():
-            planes = tuple(self.param(name, view, i) for i in range(bits, -1, -1))
+            planes = tuple(self.limit(name, bits, strict, i) for i in range(bits, -1, -1))
             return self.below(stream, bits, planes)
         if limit <= 0:
             return self.zero
         return self.valid if limit >> bits else self.chance(stream, bits, limit, where)
 
-    def _numbers(self, name: str, view: str) -> Array:
-        """A parameter's values [B], or as chances the number of draws below (`lt16`) or up to (`le16`) them."""
-        key = (name, view)
+    def _limits(self, name: str, bits: int, strict: bool) -> Array:
+        """A parameter as a chance: how many draws of so many bits lie below it, or up to it. int64 [B]."""
+        key = (name, bits, strict)
         if key not in self._params:
-            value = self.params(name)
-            if view == "value":
-                real = self.kinds[name] in ("real", "chance")
-                self._params[key] = value.astype(np.float32 if real else np.int64)
-            else:
-                count = 1 << int(view[2:])
-                scaled = value * count - 0.5
-                limit = np.ceil(scaled) if view[:2] == "lt" else np.floor(scaled) + 1
-                self._params[key] = limit.clip(0, count).astype(np.int64)
+            count = 1 << bits
+            scaled = self.params(name) * count - 0.5
+            limit = np.ceil(scaled) if strict else np.floor(scaled) + 1
+            self._params[key] = limit.clip(0, count).astype(np.int64)
         return self._params[key]
 
-    def param(self, name: str, view: str, bit: int | None = None) -> Array:
-        """A parameter: float32 [B, 1], or as a flag or one of its bits words that are all ones or all zeros."""
-        key = (name, view, bit)
+    def limit(self, name: str, bits: int, strict: bool, bit: int) -> Array:
+        """A bit of a chance as a number of draws: words that are all ones or all zeros in a world."""
+        key = (name, bits, strict, bit)
         if key not in self._params:
-            numbers = self._numbers(name, view)
-            if numbers.dtype == np.float32 and bit is None:
-                self._params[key] = numbers[:, None]
+            self._params[key] = self._everywhere((self._limits(name, bits, strict) >> bit & 1)[:, None])
+        return self._params[key]
+
+    def param(self, name: str, bit: int | None = None) -> Array:
+        """A parameter: float32 [B, 1], or as a flag or one of its bits words that are all ones or all zeros."""
+        key = (name, bit)
+        if key not in self._params:
+            if self.kinds[name] in ("real", "chance") and bit is None:
+                self._params[key] = self.params(name).astype(np.float32)[:, None]
             else:
-                self._params[key] = self._everywhere(((numbers >> (bit or 0)) & 1)[:, None])
+                numbers = self.params(name).astype(np.int64)
+                self._params[key] = self._everywhere((numbers >> (bit or 0) & 1)[:, None])
         return self._params[key]
 
     def _everywhere(self, flags: Array) -> Array:

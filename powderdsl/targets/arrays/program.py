@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from powderdsl.ir.gates import width as planes_of
 from powderdsl.ir.ops import PassGraph, Program
 from powderdsl.targets.arrays.draws import Draws, base_keys
 from powderdsl.targets.arrays.kernels import ArrayKernels
 from powderdsl.targets.arrays.source import pass_source
 from powderdsl.targets.arrays.words import Array, pack, unpack
+from powderdsl.targets.codec import pieces
 from powderdsl.targets.dense.source import load_source
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import Laps, unwatched
@@ -42,7 +42,7 @@ class ArrayProgram:
     """
 
     def __init__(self, program: Program, planes: Program):
-        self._types = {slot.name: slot.type for slot in program.slots}
+        self._pieces = pieces(program)
         self._kinds = dict(program.params)
         self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
         self._idents = np.array([ident for _, ident, _ in program.streams], np.uint32)
@@ -104,39 +104,30 @@ class ArrayProgram:
     def _unpack(self, stored: Mapping[str, Tensor], some: slice) -> State:
         """Some worlds' state slots as planes."""
         planes = {}
-        for name, type in self._types.items():
-            base, _, part = name.rpartition(".")
-            if part in ("row", "column") and base in stored:
-                planes[name] = _rows_first(stored[base][some, ("row", "column").index(part)])
-            elif type.name == "real":
-                planes[name] = _rows_first(stored[name][some])
-            elif type.name == "flag":
-                planes[name] = pack(_rows_first(stored[name][some]))
+        for piece in (piece for parts in self._pieces.values() for piece in parts):
+            value = _rows_first(piece.of(stored[piece.state][some]))
+            if piece.is_real:
+                planes[piece.slot] = value
+            elif piece.type.name == "flag":
+                planes[piece.slot] = pack(value)
             else:
-                value = _rows_first(stored[name][some])
-                for i in range(planes_of(type.lo, type.hi)[0]):
-                    planes[f"{name}:{i}"] = pack(
-                        value & value.dtype.type(1 << i) if i < 7 else value >> i & 1
-                    )
+                for i, name in enumerate(piece.planes):
+                    planes[name] = pack(value & value.dtype.type(1 << i) if i < 7 else value >> i & 1)
         return planes
 
     def _pack(self, state: State, result: Mapping[str, Tensor], some: slice, kernels: ArrayKernels) -> None:
         """Planes as some worlds' state slots in storage dtypes."""
-        for name, tensor in result.items():
-            out = tensor.numpy()[some]
-            if out.ndim == 4:
-                for i, part in enumerate(("row", "column")):
-                    out[:, i] = state[f"{name}.{part}"].transpose(1, 0, 2)
-            elif self._types[name].name == "real":
-                out[...] = state[name].transpose(1, 0, 2)
-            elif self._types[name].name == "flag":
-                out[...] = unpack(state[name], kernels.width).transpose(1, 0, 2)
+        for piece in (piece for parts in self._pieces.values() for piece in parts):
+            out = piece.of(result[piece.state][some]).numpy()
+            if piece.is_real:
+                out[...] = state[piece.slot].transpose(1, 0, 2)
+            elif piece.type.name == "flag":
+                out[...] = unpack(state[piece.slot], kernels.width).transpose(1, 0, 2)
             else:
-                count, signed = planes_of(self._types[name].lo, self._types[name].hi)
                 value = np.zeros(kernels.shape, f"u{out.itemsize}")
-                for i in range(count):
-                    bit = unpack(state[f"{name}:{i}"], kernels.width).astype(value.dtype, copy=False)
-                    weight = -1 << i if signed and i == count - 1 else 1 << i
+                for i, name in enumerate(piece.planes):
+                    bit = unpack(state[name], kernels.width).astype(value.dtype, copy=False)
+                    weight = -1 << i if piece.signed and i == len(piece.planes) - 1 else 1 << i
                     value += bit * value.dtype.type(weight % (1 << 8 * out.itemsize))
                 out[...] = value.view(out.dtype).transpose(1, 0, 2)
 

@@ -16,8 +16,7 @@ _INFIX = {
     "and": "&", "or": "|", "xor": "^", "add": "+", "sub": "-", "mul": "*", "eq": "==", "lt": "<", "le": "<=",
 }  # fmt: skip
 _CALLS = {
-    "shift": "shift", "param": "param", "coordinate": "coordinate", "inside": "inside", "chance": "chance",
-    "below_param": "below_param", "draw": "draw_real", "cells": "cells", "places": "places", "moved": "moved",
+    "shift": "shift", "coordinate": "coordinate", "inside": "inside", "draw": "draw_real", "cells": "cells", "places": "places", "moved": "moved",
     "arrive": "arrive", "swap_onto": "swap_onto", "div": "div", "min": "min", "max": "max", "sqrt": "sqrt", "copy": "copy",
 }  # fmt: skip
 _OVER = {"swap", "leave", "settle", "choose", "update", "carry"}
@@ -143,8 +142,18 @@ class _Printer:
                 return _call(
                     "below", [repr(stream), str(bits), f"({', '.join(args[: bits + 1])},)", *where], ()
                 )
-            case "chance" | "below_param":
-                return _call(_CALLS[node.op], [*map(repr, attr), *args], ())
+            case "chance":
+                return _call("chance", [*map(repr, attr), *args], ())
+            case "below_param":
+                stream, bits, name, threshold = attr
+                return _call(
+                    "below_param", [repr(stream), str(bits), repr(name), str(threshold.strict), *args], ()
+                )
+            case "param":
+                name, threshold, *bit = attr
+                if threshold is None:
+                    return _call("param", [], (name, *bit))
+                return _call("limit", [], (name, threshold.bits, threshold.strict, *bit))
         given = attr if isinstance(attr, tuple) else () if attr is None else (attr,)
         if node.op in _OVER:
             return _call(node.op, [*args, str(over)], given)

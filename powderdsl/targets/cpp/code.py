@@ -9,8 +9,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from powderdsl.ir.ops import Program, Type
+from powderdsl.ir.ops import Program, Threshold, Type
 from powderdsl.targets import cache
+from powderdsl.targets.codec import Piece, pieces
 from powderdsl.targets.cpp.build import current, open_library
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.layout import Layout
@@ -18,12 +19,11 @@ from powderdsl.targets.layout import Layout
 
 @dataclass(frozen=True)
 class NativeCode:
-    """A library, where its slots and parameters lie, the type of each slot, the kind of each parameter, the passes."""
+    """A library, where its slots and parameters lie, the pieces of each state tensor, the passes."""
 
     library: Path
     layout: Layout
-    types: Mapping[str, Type]
-    kinds: Mapping[str, str]
+    pieces: Mapping[str, tuple[Piece, ...]]
     passes: tuple[str, ...]
 
 
@@ -40,8 +40,7 @@ def compile_program(program: Program, planes: Program, *, clocks: bool = False) 
     """
     source, layout = native_source(planes)
     library, _ = open_library(f"#define PROFILE\n{source}" if clocks else source, program.name)
-    types = {slot.name: slot.type for slot in program.slots}
-    return NativeCode(library, layout, types, dict(program.params), tuple(p.name for p in planes.passes))
+    return NativeCode(library, layout, pieces(program), tuple(p.name for p in planes.passes))
 
 
 def recall(key: str) -> NativeCode | None:
@@ -72,13 +71,17 @@ def _digest(kept: dict[str, Any]) -> str:
 
 
 def _encode(code: NativeCode) -> dict[str, Any]:
-    """As JSON. Tables are lists of pairs: their keys are tuples."""
+    """As JSON. Tables are lists of pairs: their keys are tuples, thresholds in them lists."""
     layout = {f.name: getattr(code.layout, f.name) for f in fields(Layout)}
+    tables = {k: list(v.items()) if isinstance(v, dict) else v for k, v in layout.items()}
+    tables["param_planes"] = [
+        ((name, threshold and [threshold.bits, threshold.strict], bit), number)
+        for (name, threshold, bit), number in code.layout.param_planes.items()
+    ]
     return {
         "library": code.library.parent.name,
-        "layout": {k: list(v.items()) if isinstance(v, dict) else v for k, v in layout.items()},
-        "types": {name: asdict(type) for name, type in code.types.items()},
-        "kinds": dict(code.kinds),
+        "layout": tables,
+        "pieces": [asdict(piece) for parts in code.pieces.values() for piece in parts],
         "passes": list(code.passes),
     }
 
@@ -88,9 +91,16 @@ def _decode(kept: dict[str, Any], library: Path) -> NativeCode:
         name: {_key(key): number for key, number in value} if isinstance(value, list) else value
         for name, value in kept["layout"].items()
     }
-    types = {name: Type(**value) for name, value in kept["types"].items()}
-    return NativeCode(library, Layout(**tables), types, kept["kinds"], tuple(kept["passes"]))
+    tables["param_planes"] = {
+        (name, threshold and Threshold(*threshold), bit): number
+        for (name, threshold, bit), number in kept["layout"]["param_planes"]
+    }
+    found: dict[str, tuple[Piece, ...]] = {}
+    for row in kept["pieces"]:
+        piece = Piece(**row | {"type": Type(**row["type"])})
+        found[piece.state] = (*found.get(piece.state, ()), piece)
+    return NativeCode(library, Layout(**tables), found, tuple(kept["passes"]))
 
 
 def _key(key: Any) -> Any:
-    return tuple(key) if isinstance(key, list) else key
+    return tuple(_key(part) for part in key) if isinstance(key, list) else key

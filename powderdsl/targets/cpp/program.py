@@ -9,10 +9,9 @@ from collections.abc import Callable, Iterator, Mapping
 import torch
 from torch import Tensor
 
-from powderdsl.ir.gates import width as planes_of
+from powderdsl.targets.codec import parameters
 from powderdsl.targets.cpp.build import load_library
 from powderdsl.targets.cpp.code import NativeCode
-from powderdsl.targets.dense.program import Kernels
 from powderdsl.targets.job import Job
 
 
@@ -56,22 +55,17 @@ class PackedState(Mapping[str, Tensor]):
     def write(self, name: str, out: Tensor) -> Tensor:
         """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
         program = self.program
-        if out.dtype == torch.float32:
-            for i, part in enumerate(self._parts(name)):
-                first = out[:, i] if out.ndim == 4 else out
-                program.library.pd_store_real(
-                    self.handle, program.layout.reals[part], address(first), out.stride(0)
+        for piece in program.pieces[name]:
+            place = address(piece.of(out))
+            if piece.is_real:
+                number = program.layout.reals[piece.slot]
+                program.library.pd_store_real(self.handle, number, place, out.stride(0))
+            else:
+                slot, bits, signed = program.planes_of(name)
+                program.library.pd_store(
+                    self.handle, slot, bits, signed, out.element_size(), place, out.stride(0)
                 )
-        else:
-            slot, bits, signed = program.planes_of(name)
-            program.library.pd_store(
-                self.handle, slot, bits, signed, out.element_size(), address(out), out.stride(0)
-            )
         return out
-
-    def _parts(self, name: str) -> tuple[str, ...]:
-        """The reals of a slot: two of a vector."""
-        return (f"{name}.row", f"{name}.column") if len(self.like[name][1]) == 4 else (name,)
 
     def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
         """The state with one box of cells in each world filled, without unpacking the rest.
@@ -87,16 +81,14 @@ class PackedState(Mapping[str, Tensor]):
         boxes = boxes.contiguous()
         for name, value in values.items():
             changed._tensors.pop(name, None)
-            if value.is_floating_point():
-                parts = (f"{name}.row", f"{name}.column") if value.ndim == 2 else (name,)
-                for part, numbers in zip(parts, value.T if value.ndim == 2 else value[None], strict=True):
-                    numbers = numbers.contiguous()
-                    slot = program.layout.reals[part]
+            for piece in program.pieces[name]:
+                numbers = piece.of(value).contiguous()
+                if piece.is_real:
+                    slot = program.layout.reals[piece.slot]
                     program.library.pd_fill_real(changed.handle, slot, address(boxes), address(numbers))
-            else:
-                value = value.contiguous()
-                slot, bits, _ = program.planes_of(name)
-                program.library.pd_fill(changed.handle, slot, bits, address(boxes), address(value))
+                else:
+                    slot, bits, _ = program.planes_of(name)
+                    program.library.pd_fill(changed.handle, slot, bits, address(boxes), address(numbers))
         return changed
 
     def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
@@ -109,21 +101,19 @@ class PackedState(Mapping[str, Tensor]):
         changed._tensors.clear()
         places, count = places.contiguous(), len(places)
         for name, value in state.items():
-            if value.dtype == torch.float32:
-                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
-                for i, part in enumerate(parts):
-                    plane = (value[:, i] if value.ndim == 4 else value).contiguous()
-                    number = program.layout.reals[part]
+            for piece in program.pieces[name]:
+                plane = piece.of(value).contiguous()
+                if piece.is_real:
+                    number = program.layout.reals[piece.slot]
                     program.library.pd_put_real(
                         changed.handle, number, count, address(places), address(plane)
                     )
-            else:
-                plane = value.contiguous()
-                slot, bits, _ = program.planes_of(name)
-                item = plane.element_size()
-                program.library.pd_put(
-                    changed.handle, slot, bits, item, count, address(places), address(plane)
-                )
+                else:
+                    slot, bits, _ = program.planes_of(name)
+                    item = plane.element_size()
+                    program.library.pd_put(
+                        changed.handle, slot, bits, item, count, address(places), address(plane)
+                    )
         return changed
 
     def __iter__(self) -> Iterator[str]:
@@ -143,7 +133,7 @@ class NativeProgram:
     def __init__(self, code: NativeCode, threads: int, with_clocks: Callable[[], NativeCode]):
         self.library = load_library(code.library)
         self.layout, self.threads = code.layout, threads
-        self._types, self._kinds, self._passes = code.types, code.kinds, code.passes
+        self.pieces, self._passes = code.pieces, code.passes
         self._clocks = with_clocks
         self._with_clocks: NativeProgram | None = None
         self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
@@ -197,18 +187,10 @@ class NativeProgram:
             and all(a is b for a, b in zip(key, last[0], strict=True))
         ):
             return last[1]
-        planes = torch.zeros(max(1, len(self.layout.param_planes)), batch, dtype=torch.uint8)
-        views: dict[tuple[str, str], Tensor] = {}
-        for (name, how, bit), number in self.layout.param_planes.items():
-            kind = self._kinds[name] if how == "value" else how
-            if (name, kind) not in views:
-                views[name, kind] = Kernels.param_view(params[name], kind).to(torch.int64)
-            planes[number] = (views[name, kind] >> bit) & 1
-        reals = torch.zeros(max(1, len(self.layout.param_reals)), batch, dtype=torch.float32)
-        for name, number in self.layout.param_reals.items():
-            reals[number] = params[name].to(torch.float32)
-        self._last = (key, (planes, reals))
-        return planes, reals
+        layout = self.layout
+        found = parameters(params, layout.param_planes, layout.param_reals, batch, torch.device("cpu"))
+        self._last = (key, found)
+        return found
 
     def _pack(
         self, state: Mapping[str, Tensor]
@@ -219,25 +201,19 @@ class NativeProgram:
         for name, value in state.items():
             value = value.contiguous()
             like[name] = (value.dtype, tuple(value.shape))
-            if value.dtype == torch.float32:
-                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
-                for i, part in enumerate(parts):
-                    first = value[:, i] if value.ndim == 4 else value
-                    self.library.pd_load_real(
-                        handle, self.layout.reals[part], address(first), value.stride(0)
-                    )
-            else:
-                slot, bits, _ = self.planes_of(name)
-                self.library.pd_load(handle, slot, bits, value.element_size(), address(value))
+            for piece in self.pieces[name]:
+                place = address(piece.of(value))
+                if piece.is_real:
+                    self.library.pd_load_real(handle, self.layout.reals[piece.slot], place, value.stride(0))
+                else:
+                    slot, bits, _ = self.planes_of(name)
+                    self.library.pd_load(handle, slot, bits, value.element_size(), place)
         return handle, like
 
     def planes_of(self, name: str) -> tuple[int, int, bool]:
-        """First plane of a slot, number of planes, and whether the last is a sign."""
-        type = self._types[name]
-        if type.name == "flag":
-            return self.layout.planes[name], 1, False
-        bits, signed = planes_of(type.lo, type.hi)
-        return self.layout.planes[f"{name}:0"], bits, signed
+        """First plane of a state tensor, number of planes, and whether the last is a sign."""
+        (piece,) = self.pieces[name]
+        return self.layout.planes[piece.planes[0]], len(piece.planes), piece.signed
 
 
 def address(tensor: Tensor) -> ctypes.c_void_p:

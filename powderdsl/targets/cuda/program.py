@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from powderdsl.diagnostics import CompileError, Reporter
-from powderdsl.ir.gates import width as planes_of
-from powderdsl.ir.ops import Program, SlotType
+from powderdsl.ir.ops import Program
 from powderdsl.targets import words as torch_words
+from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda import build
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
 from powderdsl.targets.dense.mixed import Part, packed_program
-from powderdsl.targets.dense.program import Kernels
 from powderdsl.targets.job import Job
 
 
@@ -148,8 +147,7 @@ class CudaProgram:
 
     def __init__(self, program: Program, planes: Program, compile: Compile, shared_limit: int):
         self._planes, self._compile, self._limit = planes, compile, shared_limit
-        self._slots: dict[str, SlotType] = {slot.name: slot for slot in program.slots}
-        self._kinds = dict(program.params)
+        self._pieces = pieces(program)
         self._kernels: dict[tuple[int, int], tuple[KernelSource, Launch]] = {}
 
     def kernel(self, height: int, width: int) -> tuple[KernelSource, Launch]:
@@ -177,7 +175,8 @@ class CudaProgram:
             else self._pack(state, source)
         )
         device = after.planes.device
-        flags, numbers = self._parameters(job.params, batch, source, device)
+        layout = source.layout
+        flags, numbers = parameters(job.params, layout.param_planes, layout.param_reals, batch, device)
         blocks = -(-batch // source.group)
         scratch = torch.empty(max(1, blocks * source.scratch // 4), dtype=torch.int32, device=device)
         seed, index, start = (part.contiguous() for part in job.clock)
@@ -190,23 +189,6 @@ class CudaProgram:
 
     def _copy(self, state: DeviceState) -> DeviceState:
         return DeviceState(self, state.planes.clone(), state.reals.clone(), state.like)
-
-    def _parameters(
-        self, params: Mapping[str, Tensor], batch: int, source: KernelSource, device: torch.device
-    ) -> tuple[Tensor, Tensor]:
-        """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
-        layout = source.layout
-        flags = torch.zeros(max(1, len(layout.param_planes)), batch, dtype=torch.uint8, device=device)
-        views: dict[tuple[str, str], Tensor] = {}
-        for (name, how, bit), number in layout.param_planes.items():
-            kind = self._kinds[name] if how == "value" else how
-            if (name, kind) not in views:
-                views[name, kind] = Kernels.param_view(params[name], kind).to(torch.int64)
-            flags[number] = (views[name, kind] >> bit) & 1
-        numbers = torch.zeros(max(1, len(layout.param_reals)), batch, dtype=torch.float32, device=device)
-        for name, number in layout.param_reals.items():
-            numbers[number] = params[name].to(torch.float32)
-        return flags, numbers
 
     def _pack(self, state: Mapping[str, Tensor], source: KernelSource) -> DeviceState:
         """State slots as packed planes and reals."""
@@ -222,15 +204,13 @@ class CudaProgram:
         like = {}
         for name, value in state.items():
             like[name] = (value.dtype, tuple(value.shape))
-            if value.dtype == torch.float32:
-                parts = (f"{name}.row", f"{name}.column") if value.ndim == 4 else (name,)
-                for i, part in enumerate(parts):
-                    reals[:, layout.reals[part]] = value[:, i] if value.ndim == 4 else value
-            else:
-                first, bits, _ = self._planes_of(name, source)
-                for i in range(bits):
+            for piece in self._pieces[name]:
+                if piece.is_real:
+                    reals[:, layout.reals[piece.slot]] = piece.of(value)
+                    continue
+                for i, plane in enumerate(piece.planes):
                     words = torch_words.pack((value >> i) & 1 != 0)
-                    planes[:, first + i] = words.view(torch.int32)[..., :row_words]
+                    planes[:, layout.planes[plane]] = words.view(torch.int32)[..., :row_words]
         return DeviceState(self, planes, reals, like)
 
     def unpack(self, state: DeviceState, name: str) -> Tensor:
@@ -238,12 +218,13 @@ class CudaProgram:
         dtype, shape = state.like[name]
         height, width = shape[-2:]
         source, _ = self.kernel(height, width)
-        if dtype == torch.float32:
-            parts = (f"{name}.row", f"{name}.column") if len(shape) == 4 else (name,)
-            found = [state.reals[:, source.layout.reals[part]] for part in parts]
-            return torch.stack(found, 1) if len(shape) == 4 else found[0].clone()
-        first, bits, signed = self._planes_of(name, source)
-        words = state.planes[:, first : first + bits]
+        parts, layout = self._pieces[name], source.layout
+        if parts[0].is_real:
+            found = [state.reals[:, layout.reals[piece.slot]] for piece in parts]
+            return torch.stack(found, 1) if len(found) > 1 else found[0].clone()
+        (piece,) = parts
+        bits, signed = len(piece.planes), piece.signed
+        words = state.planes[:, [layout.planes[plane] for plane in piece.planes]]
         octets = words.contiguous().view(torch.uint8)
         flags = (octets[..., None] >> torch.arange(8, dtype=torch.uint8, device=words.device)) & 1
         cells = flags.flatten(-2)[..., :width].to(torch.int32)
@@ -251,11 +232,3 @@ class CudaProgram:
         for i in range(bits):
             value += cells[:, i] * (-(1 << i) if signed and i == bits - 1 else 1 << i)
         return value.to(dtype)
-
-    def _planes_of(self, name: str, source: KernelSource) -> tuple[int, int, bool]:
-        """First plane of a slot, number of planes, and whether the last is a sign."""
-        type = self._slots[name].type
-        if type.name == "flag":
-            return source.layout.planes[name], 1, False
-        bits, signed = planes_of(type.lo, type.hi)
-        return source.layout.planes[f"{name}:0"], bits, signed

@@ -13,8 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.ir.ops import Program
+from powderdsl.ir.ops import Program, Threshold
 from powderdsl.targets import random
+from powderdsl.targets.codec import limits, pieces
 from powderdsl.targets.dense.source import load_source, pass_source
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import Laps, unwatched
@@ -121,24 +122,13 @@ class Kernels:
             value = torch.arange(width, device=self.device)[None]
         return (value % modulus).to(torch.int32)
 
-    def param(self, name: str, view: str) -> Tensor:
-        """A parameter [B, 1, 1]: its value, or as a chance the number of draws below (`lt16`) or up to it (`le16`)."""
-        return self.param_view(self.params[name], view)[:, None, None]
+    def param(self, name: str, kind: str) -> Tensor:
+        """A parameter's value [B, 1, 1]."""
+        return self.params[name][:, None, None].to(_DTYPES[kind])
 
-    @staticmethod
-    def param_view(value: Tensor, view: str) -> Tensor:
-        """Parameter values (float64 [B]) as generated code wants them."""
-        match view:
-            case "flag":
-                return value != 0
-            case "int":
-                return value.to(torch.int32)
-            case "real" | "chance":
-                return value.to(torch.float32)
-        count = 1 << int(view[2:])
-        scaled = value * count - 0.5
-        limit = scaled.ceil() if view[:2] == "lt" else scaled.floor() + 1
-        return limit.clamp(0, count).to(torch.int64)
+    def limit(self, name: str, bits: int, strict: bool) -> Tensor:
+        """A parameter as a chance [B, 1, 1]: how many draws of so many bits lie below it, or up to it."""
+        return limits(self.params[name], Threshold(bits, strict))[:, None, None]
 
     @staticmethod
     def swap(
@@ -181,6 +171,7 @@ class DenseProgram:
         self.program = program
         self.device = device
         self._slots = {slot.name: slot for slot in program.slots}
+        self._pieces = pieces(program)
         self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
         self._idents = torch.tensor(
             [ident for _, ident, _ in program.streams], dtype=torch.int64, device=device
@@ -223,28 +214,24 @@ class DenseProgram:
         return self._pack(planes, job.state, kernels)
 
     def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """State slots as planes in working dtypes: vectors split, whole numbers widened."""
-        planes = {}
-        for name, slot in self._slots.items():
-            base, _, part = name.rpartition(".")
-            if part in ("row", "column") and base in state:
-                planes[name] = state[base][:, ("row", "column").index(part)]
-            else:
-                planes[name] = state[name].to(_DTYPES[slot.type.name])
-        return planes
+        """State slots in working dtypes: vectors split, integers widened."""
+        return {
+            piece.slot: piece.of(state[piece.state]).to(_DTYPES[piece.type.name])
+            for parts in self._pieces.values()
+            for piece in parts
+        }
 
     def _pack(
-        self, planes: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: Kernels
+        self, slots: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: Kernels
     ) -> dict[str, Tensor]:
-        """Planes as state slots in storage dtypes."""
+        """State slots in storage dtypes."""
         packed = {}
         for name, old in like.items():
-            if old.ndim == 4:
-                packed[name] = torch.stack(
-                    [kernels.full(planes[f"{name}.{part}"]) for part in ("row", "column")], 1
-                )
+            parts = [kernels.full(slots[piece.slot]) for piece in self._pieces[name]]
+            if self._pieces[name][0].component is not None:
+                packed[name] = torch.stack(parts, 1)
             else:
-                new = kernels.full(planes[name]).to(old.dtype)
+                new = parts[0].to(old.dtype)
                 packed[name] = new.clone() if new is old else new.contiguous()
         return packed
 

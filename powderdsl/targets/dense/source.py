@@ -70,8 +70,10 @@ class _Writer:
             case "input":
                 return f"state[{attr!r}]"
             case "param":
-                name, view = attr
-                return f"k.param({name!r}, {(node.type.name if view == 'value' else view)!r})"
+                name, threshold = attr
+                if threshold is None:
+                    return f"k.param({name!r}, {node.type.name!r})"
+                return f"k.limit({name!r}, {threshold.bits}, {threshold.strict})"
             case "coordinate":
                 return f"k.coordinate({attr[0]!r}, {attr[1]})"
             case "inside":

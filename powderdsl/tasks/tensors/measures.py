@@ -11,7 +11,7 @@ from torch import Tensor
 from powderdsl.ir.build import Builder
 from powderdsl.ir.lower.expressions import Planes, lower_expression
 from powderdsl.ir.lower.rules import plane_names, plane_type
-from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType
+from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, component_of
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
@@ -174,9 +174,8 @@ class _Part:
         kernels = Kernels(shape, self.device, given.params, {}, {}, none, none, given.step)
         planes: dict[str, Tensor] = {}
         for name in self.slots:
-            base, _, part = name.rpartition(".")
-            vector = part in ("row", "column") and base in given.state
-            plane = given.state[base][:, ("row", "column").index(part)] if vector else given.state[name]
+            vector, component = component_of(name)
+            plane = given.state[name] if component is None else given.state[vector][:, component]
             planes[name] = _cut(plane, self.window).to(_WORKING[self.types[name].name])
         for name in self.regions:
             planes[name] = _cut(given.regions[name.removeprefix(REGION_LET)], self.window)
