@@ -43,7 +43,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "diagnostics": (),
     "system": ("diagnostics",),
     "syntax": ("diagnostics", "system"),
-    "model": ("diagnostics", "syntax"),
+    "model": ("diagnostics", "system", "syntax"),
     "model.reference": _FRONT,  # never ir: an oracle that shares the lowering cannot see a bug in it
     "analysis": _FRONT,  # decides from the model alone: no world is run
     "ir": ("diagnostics",),
@@ -51,7 +51,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir.lower": (*_FRONT, "analysis", "ir"),  # the one door from the model into the IR
     "schedule": ("diagnostics", "ir"),
     "targets": ("diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
-    "targets.dense": ("diagnostics", "ir", "schedule", "targets"),
+    "targets.dense": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.dense"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense", "targets.cpp"),
@@ -141,6 +141,7 @@ THIRD_PARTIES: dict[str, Home] = {
     "torch": Home(
         (
             *_TORCH,
+            "system.random",
             "worlds.store",
             "simulation.draw",
             "simulation.media",

@@ -18,8 +18,8 @@ from powderdsl.datasets.recipes import check_count, recipe_of
 from powderdsl.datasets.shards import Shard, open_shard
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.system.random import MASK, mix
 from powderdsl.system.writing import failure
-from powderdsl.targets.random import MASK, mix
 
 Array = NDArray[Any]
 

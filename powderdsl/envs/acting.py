@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from powderdsl.targets.random import MASK, mix
+from powderdsl.system.random import MASK, mix
 
 Policy = Callable[[Tensor, Tensor], Tensor]
 """From observations [B, …] and keys, int64 [B], to actions int64 [B, 5]. Keys are what random numbers hang on."""

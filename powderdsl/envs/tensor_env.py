@@ -14,7 +14,7 @@ from torch import Tensor
 
 from powderdsl.envs.observations import observation_of
 from powderdsl.simulation.simulator import MAX_CELLS
-from powderdsl.targets.random import MASK, mix
+from powderdsl.system.random import MASK, mix
 from powderdsl.tasks.episodes import Episodes, TaskProgram, check_actions, compile_task, load_task
 from powderdsl.tasks.task import Task
 

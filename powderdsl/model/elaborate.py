@@ -23,7 +23,7 @@ from powderdsl.model.expressions.operands import (
 )
 from powderdsl.model.expressions.qualified import certain, of_pack
 from powderdsl.model.expressions.scope import IDENTITY, Matrix, Scope, turned
-from powderdsl.model.expressions.symbols import default_of, read_kind, stream_ident
+from powderdsl.model.expressions.symbols import default_of, read_kind
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import (
     REAL,
@@ -43,6 +43,7 @@ from powderdsl.model.types import (
     Transform,
 )
 from powderdsl.syntax.ast import Syntax
+from powderdsl.system.random import name_number
 
 MAX_MOMENTS = 1000
 MAX_RULES = 5000
@@ -310,7 +311,7 @@ class Elaborator:
             # Named by where the rule stands, not by how many were unrolled before it: other packs shift nothing.
             label = f"[{self._label}]" if self._label else ""
             name = f"{self._pack}.{self._word}#{self._numbers[id(syntax)]}{label}"
-            self.result.streams[name] = Stream(name, stream_ident(name), 32)
+            self.result.streams[name] = Stream(name, name_number(name), 32)
             parts.append(self.typer.chance_draw(name, clause.children[0], scope))
         return conjunction(parts, syntax.span)
 

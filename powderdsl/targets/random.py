@@ -8,25 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-MASK = 0xFFFFFFFF
-START_0, START_1 = 0x243F6A88, 0x85A308D3
-
-
-def mix(x: Tensor) -> Tensor:
-    """A 32-bit finaliser. int64 below 2³² in and out."""
-    x = x ^ (x >> 16)
-    x = (x * 0x7FEB352D) & MASK
-    x = x ^ (x >> 15)
-    x = (x * 0x846CA68B) & MASK
-    return x ^ (x >> 16)
-
-
-def base_keys(seed: Tensor, index: Tensor) -> Tensor:
-    """The part of the keys that stays the same for a whole run: int64 [2, B]."""
-    keys = torch.tensor([[START_0], [START_1]], dtype=torch.int64, device=seed.device).expand(2, len(seed))
-    for part in (seed & MASK, (seed >> 32) & MASK, index & MASK):
-        keys = mix((keys + part) & MASK)
-    return keys
+from powderdsl.system.random import MASK, mix
 
 
 def step_keys(base: Tensor, step: Tensor, idents: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from powderdsl.targets.random import MASK, base_keys, mix
+from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.worldmodel.pairs import DataConfig, HasIds, Pairs, Worlds, pairs_of
 
 TOGETHER = 1 << 20

@@ -19,8 +19,8 @@ from powderdsl.model.declarations import PackDecl
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World
+from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.writing import failure
-from powderdsl.targets.random import MASK, base_keys, mix
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.task import Task
 from powderdsl.worldmodel.watched import Watched, watched

@@ -9,10 +9,11 @@ from powderdsl.model.state import slots
 from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.writing import failure, replacing
-from powderdsl.testing.generators.cases import Case, Start, load_text
+from powderdsl.testing.generators.cases import Start, load_text
 from powderdsl.testing.generators.rulemaker import write_yaml
 from powderdsl.testing.generators.vocabulary import Tree
 from powderdsl.testing.generators.written_arrays import entries_of, line_of, read_array, to_tree, write_array
+from tests.fuzz.cases import Case
 
 
 def write_case(path: Path, case: Case, problem: str = "") -> None:

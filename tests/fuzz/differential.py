@@ -16,9 +16,10 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.testing.generators.cases import Case, Start, fitted, load_text, random_start
+from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz.cases import Case, fitted
 from tests.fuzz.compare import find_difference
 from tests.fuzz.exercised import Used, constructs, operations
 

@@ -12,10 +12,11 @@ from powderdsl.diagnostics import Reporter, Source
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_text
 from powderdsl.syntax.yaml_tree import parse_yaml
-from powderdsl.testing.generators.cases import Case, Start
+from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.generators.rulemaker import write_yaml
 from powderdsl.testing.generators.vocabulary import Tree
 from powderdsl.testing.generators.written_arrays import to_tree
+from tests.fuzz.cases import Case
 
 PLAIN = ("yes", "no", "0", "1", "here", "0.5")
 """What an expression may shrink to, besides its own parts."""

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from powderdsl.model.expressions.symbols import stream_ident
 from powderdsl.model.reference import Clock, draw
 from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.system.random import name_number
 from powderdsl.testing.generators.cases import load_text
 
 Shape = tuple[int, int]
@@ -19,12 +19,13 @@ Planes = Any
 
 def test_draws_are_uniform_and_unrelated(torch) -> None:  # type: ignore[no-untyped-def]
     """Bit planes of our randomness: fair, and uncorrelated with neighbors, steps, streams, seeds and worlds."""
+    from powderdsl.system.random import base_keys
     from powderdsl.targets import random
 
     idents = torch.tensor([0x05562E58, 0x116B05CF])
 
     def bits(seed: int, index: int, step: int, stream: int):  # type: ignore[no-untyped-def]
-        base = random.base_keys(torch.tensor([seed]), torch.tensor([index]))
+        base = base_keys(torch.tensor([seed]), torch.tensor([index]))
         keys = random.step_keys(base, torch.tensor([step]), idents)
         draws = random.draws(keys[stream], 16, 256, 256)[0]
         return torch.stack([(draws >> j) & 1 for j in range(16)]).double() * 2 - 1
@@ -46,7 +47,7 @@ def test_draws_are_uniform_and_unrelated(torch) -> None:  # type: ignore[no-unty
 DEVIATIONS = 6.0
 """Standard deviations that a statistic may be off: by chance, 2 in 10^9 are."""
 
-IDENTS = (stream_ident("movement"), stream_ident("interact"), stream_ident("pack.pass#1"), 0, 1)
+IDENTS = (name_number("movement"), name_number("interact"), name_number("pack.pass#1"), 0, 1)
 
 
 def draws(

@@ -124,11 +124,3 @@ def report_ids(
                 f"`{owner.qualified}` has id {wanted}",
                 notes=["saved worlds, datasets and checkpoints know elements by name, not by id"],
             )
-
-
-def compact_palette(palette: Palette, slots: int = 0) -> list[str | None]:
-    """A palette without free ids at its end, but with at least `slots` ids."""
-    found = list(palette)
-    while found and found[-1] is None:
-        found.pop()
-    return found + [None] * (slots - len(found))

@@ -26,14 +26,7 @@ from powderdsl.model.types import (
     integer,
 )
 from powderdsl.syntax.ast import Syntax
-
-
-def stream_ident(name: str) -> int:
-    """The number under which a stream enters the hash: FNV-1a of its name, 32 bits. Packs never shift it."""
-    ident = 0x811C9DC5
-    for byte in name.encode():
-        ident = (ident ^ byte) * 0x01000193 & 0xFFFFFFFF
-    return ident
+from powderdsl.system.random import name_number
 
 
 @dataclass
@@ -99,7 +92,7 @@ def base_symbols(composition: Composition) -> Symbols:
     constants |= {name: SetOf((element.id,), name) for name, element in composition.elements.items()}
     constants |= {name: SetOf(tuple(sorted(ids))) for name, ids in composition.tags.items()}
     symbols.streams |= {
-        name: Stream(name, stream_ident(name), s.decl.bits) for name, s in composition.streams.items()
+        name: Stream(name, name_number(name), s.decl.bits) for name, s in composition.streams.items()
     }
     return symbols
 

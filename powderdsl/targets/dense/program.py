@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.ops import Program, Threshold
+from powderdsl.system.random import base_keys
 from powderdsl.targets import random
 from powderdsl.targets.codec import limits, pieces
 from powderdsl.targets.dense.source import load_source, pass_source
@@ -195,7 +196,7 @@ class DenseProgram:
         batch, height, width = job.state["element"].shape
         kernels = Kernels(
             (batch, height, width), self.device, job.params, self._streams, job.draws,
-            random.base_keys(seed, index), self._idents, start,
+            base_keys(seed, index), self._idents, start,
         )  # fmt: skip
         planes = self._unpack(job.state)
         with torch.no_grad():

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from powderdsl.targets.random import MASK, base_keys, mix
+from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.tasks.task import Drawing, Generator, Group, Region
 from powderdsl.tasks.tensors.shapes import covered_rows, pack, unpack, words_of_rows
 from powderdsl.worlds.raster import Size, mask
@@ -95,14 +95,6 @@ class Hashes:
         assert self.drawn is not None
         start, most, wanted = self.table.blocks[statement]
         return self.drawn[:, start : start + most * wanted].view(-1, most, wanted)[:, :repeats]
-
-
-def name_number(name: str) -> int:
-    """The number of a name of `let`, by which it draws the same in every split: FNV-1a, 32 bits."""
-    found = 0x811C9DC5
-    for byte in name.encode():
-        found = (found ^ byte) * 0x01000193 & MASK
-    return found
 
 
 class _Draws:

@@ -1,4 +1,4 @@
-"""Test cases: a ruleset from text, and start worlds that are random in everything a world holds."""
+"""A ruleset from text, and start worlds that are random in everything a world holds."""
 
 from __future__ import annotations
 
@@ -69,30 +69,6 @@ class Start:
             f"{name} {values.tolist() if values.size <= 160 else '…'}" for name, values in self.fields.items()
         ]
         return "\n".join([*told, *(f"{name} = {values}" for name, values in self.params.items())])
-
-
-@dataclass(frozen=True)
-class Case:
-    """Rules, worlds and a number of steps to run on a backend and compare with the reference."""
-
-    text: str
-    start: Start
-    steps: int
-    backend: str
-
-
-def fitted(start: Start, ruleset: Ruleset) -> Start:
-    """The same worlds for a ruleset from which something went: without what it does not have."""
-    known = sorted(element.id for element in ruleset.elements)
-    ids = np.where(np.isin(start.ids, known), start.ids, known[0]).astype(np.uint8)
-    names = {slot.name for slot in slots(ruleset)[1:]}
-    params = {param.name for param in ruleset.params}
-    return replace(
-        start,
-        ids=ids,
-        fields={name: values for name, values in start.fields.items() if name in names},
-        params={name: values for name, values in start.params.items() if name in params},
-    )
 
 
 def random_start(

@@ -1,0 +1,41 @@
+"""Counter-based random numbers: hashes of what a draw is for. No generator, no state; needs torch only for tensors.
+
+The reference (`model.reference`) has its own, which these are compared with.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MASK = 0xFFFFFFFF
+START_0, START_1 = 0x243F6A88, 0x85A308D3
+
+
+def name_number(name: str) -> int:
+    """The number under which a name enters the hash: FNV-1a, 32 bits. It is the same wherever the name stands."""
+    found = 0x811C9DC5
+    for byte in name.encode():
+        found = (found ^ byte) * 0x01000193 & MASK
+    return found
+
+
+def mix(x: Tensor) -> Tensor:
+    """A 32-bit finalizer. int64 below 2³² in and out."""
+    x = x ^ (x >> 16)
+    x = (x * 0x7FEB352D) & MASK
+    x = x ^ (x >> 15)
+    x = (x * 0x846CA68B) & MASK
+    return x ^ (x >> 16)
+
+
+def base_keys(seed: Tensor, index: Tensor) -> Tensor:
+    """The part of the keys that stays the same for a whole run: int64 [2, B]."""
+    import torch
+
+    keys = torch.tensor([[START_0], [START_1]], dtype=torch.int64, device=seed.device).expand(2, len(seed))
+    for part in (seed & MASK, (seed >> 32) & MASK, index & MASK):
+        keys = mix((keys + part) & MASK)
+    return keys
