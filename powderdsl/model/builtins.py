@@ -122,7 +122,7 @@ FUNCTIONS: dict[str, Function] = {
         Function("max", "max(A, B)", "the larger of two numbers", (2, 8)),
         Function("abs", "abs(A)", "a number without its sign", (1, 1)),
         Function("clamp", "clamp(A, LOW, HIGH)", "a number kept between two bounds", (3, 3)),
-        Function("opposite", "opposite(PLACE)", "the neighbor on the other side", (1, 1)),
+        Function("opposite", "opposite(PLACE)", "the neighbor, or the direction, the other way", (1, 1)),
     )
 }
 

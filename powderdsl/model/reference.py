@@ -264,6 +264,7 @@ _OPS: dict[str, Any] = {
     "sum": lambda e, at, a: neighborhood(a, e.value),
     "choose": _choose,
     "octant": _octant,
+    "opposite": lambda e, at, a: (a + 4) % 8,
     "length": _length,
     "row_part": lambda e, at, v: v[:, 0],
     "column_part": lambda e, at, v: v[:, 1],

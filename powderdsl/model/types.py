@@ -108,6 +108,7 @@ OPS: dict[str, str] = {
     "sum": "value: kernel; weighted sum of the argument, within a row from the left, then the rows from the top",
     "choose": "condition, value if it holds, value otherwise",
     "octant": "the direction a vec2 points to",
+    "opposite": "the direction the other way",
     "length": "√(y² + x²) in float32",
     "row_part": "the first component of a vec2",
     "column_part": "the second component of a vec2",

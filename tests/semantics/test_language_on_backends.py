@@ -151,7 +151,41 @@ passes:
           - head := opposite(dir) where ant and head is dir with chance 30%
 """
 
-PACKS = {"division": DIVISION, "kernels": KERNELS, "defaults": DEFAULTS, "together": TOGETHER}
+HEADINGS = """\
+pack: headings
+elements:
+  air: {id: 0, color: "#101010", glyph: "."}
+  bug: {id: 1, color: "#909090"}
+  wall: {id: 2, color: "#FF0000"}
+fields:
+  head: {type: direction, at: element, of: bug, default: above.left}
+  trail: {type: direction, at: place, default: below}
+  wind: {type: vec2(-9..9), at: place}
+  turned: {type: 0..9, at: place}
+passes:
+  look:
+    let: {back: opposite(head), lee: opposite(octant(wind))}
+    do:
+      - trail := opposite(left.head) where left is bug and left.back is not lee
+      - turned += 1 where opposite(trail) in (left, below.right, lee) or left.back == head
+      - wind := wind / 2 where opposite(lee if bug else below.trail) is back
+  walk:
+    conflicts: first_wins
+    for side in octants:
+      - bug moves side leaving air if side is opposite(opposite(head)) and side is air, then side.turned := 0
+      - bug -> air if head is opposite(side) and side is bug and side.head is opposite(head)
+    then:
+      do: head := opposite(head) where bug and turned mod 2 == 0
+      then: head := opposite(above.left if turned == 3 else trail) where bug and above in (wall, bug)
+"""
+
+PACKS = {
+    "division": DIVISION,
+    "kernels": KERNELS,
+    "defaults": DEFAULTS,
+    "together": TOGETHER,
+    "headings": HEADINGS,
+}
 TORCH = ("dense", "planes", "torch")
 SIZES = ((3, 4, 5), (2, 9, 33), (1, 3, 64), (1, 17, 70))
 """Worlds smaller than the kernels, rows that end within a word, of one word and of three."""

@@ -357,6 +357,10 @@ def _octant(expr: Expr, at: Planes) -> Node:
     return result
 
 
+def _opposite(expr: Expr, at: Planes) -> Node:
+    return at.build.mod(at.build.arithmetic("add", node(expr.args[0], at), at.build.whole(4)), 8)
+
+
 def _vector(expr: Expr, at: Planes) -> Pair:
     return node(expr.args[0], at), node(expr.args[1], at)
 
@@ -404,6 +408,7 @@ _LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
     "sum": _sum,
     "choose": _choose,
     "octant": _octant,
+    "opposite": _opposite,
     "length": lambda e, at: _length(pair(e.args[0], at), at.build),
     "row_part": lambda e, at: pair(e.args[0], at)[0],
     "column_part": lambda e, at: pair(e.args[0], at)[1],

@@ -365,7 +365,8 @@ def choose(
         return Expr("choose", CHANCE, (condition, typer.chance(a, yes[1]), typer.chance(b, no[1])), span=span)
     if set(kinds) <= {"int", "number", "real", "chance", "draw"}:
         return Expr("choose", REAL, (condition, typer.real(a, yes[1]), typer.real(b, no[1])), span=span)
-    target = next(o for o in (a, b) if isinstance(o, Expr)).kind
+    # A place is an element or a direction, whichever the other value is.
+    target = next(o for o in (yes[0], no[0], a, b) if isinstance(o, Expr)).kind
     first, second = typer.of_kind(yes[0], target, yes[1]), typer.of_kind(no[0], target, no[1])
     return Expr("choose", target, (condition, first, second), span=span)
 

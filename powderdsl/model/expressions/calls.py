@@ -192,7 +192,11 @@ def _bounds_of(value: Expr | Number) -> tuple[Fraction | float, Fraction | float
 
 
 def _opposite(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    place = typer.place(typer.evaluate(syntax.children[0], scope), syntax.children[0].span)
+    span = syntax.children[0].span
+    operand = typer.evaluate(syntax.children[0], scope)
+    if isinstance(operand, Expr) and operand.kind == DIRECTION:
+        return Expr("opposite", DIRECTION, (operand,), span=syntax.span)
+    place = typer.place(operand, span)
     return Place((-place.offset[0], -place.offset[1]))
 
 

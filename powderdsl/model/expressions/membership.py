@@ -23,7 +23,7 @@ from powderdsl.model.expressions.operands import (
     look,
     member,
 )
-from powderdsl.model.types import FLAG, Expr
+from powderdsl.model.types import DIRECTION, FLAG, Expr
 from powderdsl.syntax.ast import Syntax
 
 if TYPE_CHECKING:
@@ -47,6 +47,8 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
             return TRUE if left.ids[0] in right.ids else FALSE
         case Expr(), Place():
             return arithmetic.compare(typer, "==", left, typer.direction(right, second.span), span)
+        case _, Expr() if right.kind == DIRECTION:
+            return arithmetic.compare(typer, "==", typer.direction(left, first.span), right, span)
         case _, Bounds():
             value = typer.value(left, first.span)
             low, high = Number(Fraction(right.lo)), Number(Fraction(right.hi))
@@ -57,7 +59,7 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
                 ],
                 span,
             )
-        case _, Items() if any(isinstance(item, (Number, Place)) for item in right.items):
+        case _, Items() if any(_stands_alone(item) for item in right.items):
             return disjunction([_equals(typer, left, item, syntax) for item in right.items], span)
         case _, Number():
             raise _not_a_set(typer, syntax)
@@ -69,6 +71,11 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
     if isinstance(left, SetOf) and left.name is None:
         raise typer.wrong(left, "a place or an element before `is`", first.span, "such as `below is …`")
     return member(typer.element(left, first.span), ids, span)
+
+
+def _stands_alone(item: Operand) -> bool:
+    """Whether an item of a list is compared by itself: numbers and directions. The others join to a set of elements."""
+    return isinstance(item, (Number, Place)) or (isinstance(item, Expr) and item.kind == DIRECTION)
 
 
 def _equals(typer: Typer, left: Operand, item: Operand, syntax: Syntax) -> Expr:

@@ -361,6 +361,7 @@ _EVALUATE: dict[str, Callable] = {
     "min": lambda node, a, b: min(a, b),
     "max": lambda node, a, b: max(a, b),
     "mod": lambda node, a: a % node.value,
+    "opposite": lambda node, a: (a + 4) % 8,
 }
 """Exact evaluation of discrete operations."""
 
@@ -400,6 +401,7 @@ _BOUNDS: dict[str, Callable[..., Bounds]] = {
     "min": lambda node, a, b: (min(a[0], b[0]), min(a[1], b[1])),
     "max": lambda node, a, b: (max(a[0], b[0]), max(a[1], b[1])),
     "mod": lambda node, a: (a[0] % node.value,) * 2 if a[0] == a[1] else (0, node.value - 1),
+    "opposite": lambda node, a: ((a[0] + 4) % 8,) * 2 if a[0] == a[1] else (0, 7),
     "mul": _product_bounds,
     "abs": _abs_bounds,
     "quotient": _quotient_bounds,

@@ -298,6 +298,8 @@ class Phrases:
                     f"({left.text} is {self.choices.pick(sides)})",
                     f"({left.text} in ({self.choices.pick(sides)}, {self.choices.pick(sides)}))",
                     f"({left.text} != {self.runtime_direction(depth - 1).text})",
+                    f"({self.choices.pick(sides)} is {left.text})",
+                    f"({left.text} is not {self.runtime_direction(depth - 1).text})",
                 ]
             )
         )
@@ -461,7 +463,9 @@ class Phrases:
         return Phrase(self.choices.pick([*SIDES, *self._locals("side")]))
 
     def runtime_direction(self, depth: int) -> Phrase:
-        """A direction that hangs on the world."""
+        """A direction that depends on the world."""
+        if depth > 0 and self.choices.maybe(20):
+            return Phrase(f"opposite({self.runtime_direction(depth - 1).text})")
         name = self._named("direction")
         if name is None or (depth > 0 and self.choices.maybe(30)):
             return Phrase(f"octant({self.vector(depth - 1).text})")
