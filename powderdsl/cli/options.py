@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from dataclasses import fields
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -63,6 +64,23 @@ class WholeType(click.ParamType):
         return int(value)
 
 
+class CountType(click.ParamType):
+    """A whole number, also written as ``1e6`` or ``200_000``. Whether it is in range the settings say."""
+
+    name = "N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        text = str(value).replace("_", "")
+        if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
+            self.fail(f"`{value}` is no whole number: write 200000 or 2e5", param, ctx)
+        number = float(text) if "e" in text.lower() else int(text)
+        if number != int(number):
+            self.fail(f"`{value}` is no whole number", param, ctx)
+        return int(number)
+
+
 class SizeType(click.ParamType):
     """`48x64`: rows and columns; `64`: as many of both."""
 
@@ -91,6 +109,21 @@ def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...
             raise click.BadParameter(f"`{value}`: write pack.param=VALUE", ctx, param)
         found[name.strip()] = text.strip()
     return found
+
+
+def setting_options(config: type) -> Callable[[Decorated], Decorated]:
+    """An option for each field of a dataclass that says what it is for (`system.settings`); None where none is given."""
+
+    def decorate(function: Decorated) -> Decorated:
+        for one in reversed(fields(config)):
+            if about := one.metadata.get("about"):
+                usual = CountType() if isinstance(one.default, int) else type(one.default)
+                kind = click.Choice(one.metadata["choices"]) if one.metadata["choices"] else usual
+                name = f"--{one.name.replace('_', '-')}"
+                function = click.option(name, one.name, type=kind, help=about)(function)
+        return function
+
+    return decorate
 
 
 def rules_argument(function: Decorated) -> Decorated:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
@@ -10,12 +9,15 @@ from typing import Any
 
 from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
+from powderdsl.system.settings import out_of_bounds, setting
 
 NETWORKS = ("paper", "small")
 OBSERVATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"paper": ("compact", "ids", "matrix"), "small": ("ids", "compact", "matrix")}
 )
 """What each network takes; the first is the usual one."""
+
+KINDS = ("compact", "ids", "matrix")
 
 HOW = ("steps", "backend", "device", "threads", "checkpoint_minutes")
 """Settings that may change while a run goes on: how long and on what it is trained, not what is trained."""
@@ -27,37 +29,33 @@ class TrainConfig:
 
     task: str
     """A shipped task's name, or a file's path."""
-    split: str = "train"
+    split: str = setting("train", "Which worlds.  [default: train]")
     knobs: Mapping[str, int] = field(default_factory=dict)
     params: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the rules: numbers, or text such as ``5%``."""
     packs: tuple[str, ...] = ()
     """Packs, by name or file, that are added to the task's rules."""
-    slots: int = 0
-    """Room for this many elements at least: packs that come later take free slots."""
-    worlds: int = 1_000_000
-    """How many worlds there are to draw from: "N start states"."""
-    observation: str = "compact"
-    network: str = "paper"
-    features: int = 256
-    """Width of the fully connected layers."""
-    envs: int = 32
-    rollout: int = 2048
-    """Actions in every world between two updates."""
-    batch: int = 256
-    epochs: int = 10
-    learning_rate: float = 3e-4
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    entropy: float = 0.0
-    seed: int = 0
-    steps: int = 1_000_000
-    """Interactions, of all worlds together. A run ends with the first whole rollout that reaches them."""
+    slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
+    worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
+    observation: str = setting("compact", "What the network sees.", choices=KINDS)
+    network: str = setting("paper", "The paper's, or a small one.", choices=NETWORKS)
+    features: int = setting(256, "Width of its fully connected layers.", 1, 1 << 16)
+    envs: int = setting(32, "Worlds that are played at once.", 1, 1 << 20)
+    rollout: int = setting(2048, "Actions in every world between two updates.", 1, 1 << 20)
+    batch: int = setting(256, "Actions that one gradient is taken of.", 2, 1 << 24)
+    epochs: int = setting(10, "How often an update goes over a rollout.", 1, 1000)
+    learning_rate: float = setting(3e-4, "Of Adam.", 1e-9, 10.0)
+    gamma: float = setting(0.99, "Discount of later rewards.", 0.0, 1.0)
+    gae_lambda: float = setting(0.95, "Of generalized advantages.", 0.0, 1.0)
+    clip: float = setting(0.2, "How far an update may change chances.", 1e-6, 10.0)
+    entropy: float = setting(0.0, "Weight of the entropy.", 0.0, 100.0)
+    seed: int = setting(0, "Of the run: worlds, network, and actions.", 0, 2**32 - 1)
+    steps: int = setting(1_000_000, "Interactions, of all worlds together, such as 2e5.", 1, 10**12)
+    """A run ends with the first whole rollout that reaches them."""
     backend: str = "auto"
-    device: str = "cpu"
-    threads: int = 1
-    checkpoint_minutes: float = 2.0
+    device: str = setting("cpu", "A torch device: cpu, cuda, cuda:1.  [default: cpu]")
+    threads: int = setting(1, "CPU threads.  [default: 1]", 1, 1024)
+    checkpoint_minutes: float = setting(2.0, low=0.0, high=1e6)
     """How much work a kill may cost; 0 saves after every rollout."""
 
     def as_json(self) -> dict[str, Any]:
@@ -85,31 +83,6 @@ _SMALL: Mapping[str, Any] = MappingProxyType(
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType({"paper": MappingProxyType({}), "small": _SMALL})
 """``paper``: its network and figures. ``small``: a network and figures for a few minutes on one processor core."""
-
-_WHOLE: Mapping[str, tuple[int, int]] = MappingProxyType(
-    {
-        "worlds": (1, 2**62),
-        "slots": (0, 256),
-        "features": (1, 1 << 16),
-        "envs": (1, 1 << 20),
-        "rollout": (1, 1 << 20),
-        "batch": (2, 1 << 24),
-        "epochs": (1, 1000),
-        "seed": (0, 2**32 - 1),
-        "steps": (1, 10**12),
-        "threads": (1, 1024),
-    }
-)
-_REAL: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {
-        "learning_rate": (1e-9, 10.0),
-        "gamma": (0.0, 1.0),
-        "gae_lambda": (0.0, 1.0),
-        "clip": (1e-6, 10.0),
-        "entropy": (0.0, 100.0),
-        "checkpoint_minutes": (0.0, 1e6),
-    }
-)
 
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
@@ -148,16 +121,7 @@ def check_config(config: TrainConfig) -> TrainConfig:
 
 
 def _mistakes(config: TrainConfig) -> list[Diagnostic]:
-    found = []
-    for name, (low, high) in _WHOLE.items():
-        value = getattr(config, name)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            found.append(_wrong(f"`{name}` is {value!r}: it takes a whole number from {low:,} to {high:,}"))
-    for name, (least, most) in _REAL.items():
-        value = getattr(config, name)
-        real = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if not real or not least <= value <= most:
-            found.append(_wrong(f"`{name}` is {value!r}: it takes a number from {least:g} to {most:g}"))
+    found = [_wrong(message) for message in out_of_bounds(config)]
     for name in ("task", "split", "device"):
         value = getattr(config, name)
         if not isinstance(value, str) or not value:
@@ -165,7 +129,7 @@ def _mistakes(config: TrainConfig) -> list[Diagnostic]:
     for name, choices in (("network", NETWORKS), ("backend", tuple(BACKENDS))):
         if getattr(config, name) not in choices:
             found.append(_no_choice(name, getattr(config, name), choices))
-    takes = OBSERVATIONS.get(str(config.network), ("ids", "compact", "matrix"))
+    takes = OBSERVATIONS.get(str(config.network), KINDS)
     if config.observation not in takes:
         found.append(_no_choice("observation", config.observation, takes))
     if not all(isinstance(one, str) for one in config.packs) or "" in config.packs:

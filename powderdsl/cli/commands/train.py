@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import ManyWords, WholeType, backend_option, packs_option, set_option
+from powderdsl.cli.options import (
+    ManyWords,
+    WholeType,
+    backend_option,
+    packs_option,
+    set_option,
+    setting_options,
+)
 from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
-from powderdsl.rl.config import NETWORKS, OBSERVATIONS, PRESETS, TrainConfig, from_json, preset
-
-if TYPE_CHECKING:
-    pass
-
-KINDS = tuple(dict.fromkeys(kind for kinds in OBSERVATIONS.values() for kind in kinds))
-
-
-class CountType(click.ParamType):
-    """A whole number, also written as ``1e6`` or ``200_000``. Whether it is in range the settings say."""
-
-    name = "N"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        if isinstance(value, int):
-            return value
-        text = str(value).replace("_", "")
-        if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
-            self.fail(f"`{value}` is no whole number: write 200000 or 2e5", param, ctx)
-        number = float(text) if "e" in text.lower() else int(text)
-        if number != int(number):
-            self.fail(f"`{value}` is no whole number", param, ctx)
-        return int(number)
+from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 
 
 @click.command("train", cls=ManyWords)
@@ -53,11 +37,7 @@ class CountType(click.ParamType):
     show_default=True,
     help="Where other options start from: the paper's figures, or a few minutes on one core.",
 )
-@click.option("--steps", type=CountType(), help="Interactions, of all worlds together, such as 2e5.")
-@click.option("--seed", type=CountType(), help="Of the run: worlds, network, and actions.")
-@click.option("--envs", type=CountType(), help="Worlds that are played at once.")
-@click.option("--split", help="Which worlds.  [default: train]")
-@click.option("--worlds", type=CountType(), help="How many of them there are to draw from.")
+@setting_options(TrainConfig)
 @click.option(
     "--knob",
     "knobs",
@@ -74,21 +54,7 @@ class CountType(click.ParamType):
 )
 @set_option
 @packs_option
-@click.option("--slots", type=CountType(), help="Room for this many elements, for packs that come later.")
-@click.option("--observation", type=click.Choice(KINDS), help="What the network sees.")
-@click.option("--network", type=click.Choice(NETWORKS), help="The paper's, or a small one.")
-@click.option("--features", type=CountType(), help="Width of its fully connected layers.")
-@click.option("--learning-rate", type=float, help="Of Adam.")
-@click.option("--rollout", type=CountType(), help="Actions in every world between two updates.")
-@click.option("--batch", type=CountType(), help="Actions that one gradient is taken of.")
-@click.option("--epochs", type=CountType(), help="How often an update goes over a rollout.")
-@click.option("--entropy", type=float, help="Weight of the entropy.")
-@click.option("--gamma", type=float, help="Discount of later rewards.")
-@click.option("--gae-lambda", type=float, help="Of generalized advantages.")
-@click.option("--clip", type=float, help="How far an update may change chances.")
 @backend_option("auto")
-@click.option("--device", help="A torch device: cpu, cuda, cuda:1.  [default: cpu]")
-@click.option("--threads", type=CountType(), help="CPU threads.  [default: 1]")
 @click.option(
     "--checkpoint-every",
     "checkpoint_minutes",

@@ -1,0 +1,39 @@
+"""Settings of a run: fields of a dataclass that say what they are for and which values they take.
+
+Checks and the options of commands (`cli.options.setting_options`) follow from the declaration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import field, fields
+from typing import Any, TypeVar
+
+Value = TypeVar("Value", int, float, str)
+
+
+def setting(
+    default: Value,
+    about: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: Sequence[str] = (),
+) -> Value:
+    """A field of a dataclass: numbers from `low` to `high`, or one of `choices`. With `about` it has an option."""
+    bounds = None if low is None else (low, high)
+    return field(default=default, metadata={"about": about, "bounds": bounds, "choices": tuple(choices)})
+
+
+def out_of_bounds(config: Any) -> Iterator[str]:
+    """What is wrong with the numbers of a dataclass of settings, a sentence each."""
+    for one in fields(config):
+        value, bounds = getattr(config, one.name), one.metadata.get("bounds")
+        if bounds is None:
+            continue
+        low, high = bounds
+        whole = isinstance(one.default, int)
+        takes = f"a whole number from {low:,} to {high:,}" if whole else f"a number from {low:g} to {high:g}"
+        number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value) or not low <= value <= high:
+            yield f"`{one.name}` is {value!r}: it takes {takes}"
