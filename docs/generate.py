@@ -128,7 +128,7 @@ def functions() -> str:
 
 
 def kinds() -> str:
-    rows = [("`LOW..HIGH`", "a whole number between two bounds, both included")]
+    rows = [("`LOW..HIGH`", "an integer between two bounds, both included")]
     rows += [(f"`{word}`", about) for word, about in KIND_WORDS.items()]
     return table(("kind", "values"), rows)
 
@@ -158,7 +158,7 @@ def limits() -> str:
         ("sets that are defined by each other, in a row", MAX_SET_DEPTH),
         ("rulesets that extend each other, in a row", MAX_BASES),
         ("passes of a ruleset", MAX_PASSES),
-        ("moments of a pass", MAX_MOMENTS),
+        ("substeps of a pass", MAX_MOMENTS),
         ("rules of a ruleset, loops unrolled", MAX_RULES),
         ("side of a world in a test", MAX_SIDE),
     ]

@@ -49,7 +49,7 @@ def layout_options(about: str, *more: tuple[str, str]) -> Callable[[Decorated], 
 
 
 class WholeType(click.ParamType):
-    """A whole number from `low` to `high`."""
+    """An integer from `low` to `high`."""
 
     name = "N"
 
@@ -60,7 +60,7 @@ class WholeType(click.ParamType):
         if isinstance(value, int):
             return value
         if not re.fullmatch(r"[0-9]{1,20}", str(value)) or not self.low <= int(value) <= self.high:
-            self.fail(f"`{value}` is no whole number from {self.low} to {self.high}", param, ctx)
+            self.fail(f"`{value}` is no integer from {self.low} to {self.high}", param, ctx)
         return int(value)
 
 

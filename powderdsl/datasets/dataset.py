@@ -266,7 +266,7 @@ class Dataset:
 
 
 def drawn(seed: int, number: int, count: int, below: int) -> Array:
-    """Whole numbers 0 … below − 1, hashes of `seed` and `number`: int64 [count]."""
+    """Integers 0 … below − 1, hashes of `seed` and `number`: int64 [count]."""
     key = torch.zeros(2, dtype=torch.int64) + torch.tensor([0x243F6A88, 0x85A308D3])
     for part in (seed & MASK, seed >> 32, number & MASK, number >> 32):
         key = mix((key + part) & MASK)

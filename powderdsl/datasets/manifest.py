@@ -219,7 +219,7 @@ class _Rule:
 
 
 def _whole(low: int, high: int) -> _Rule:
-    return _Rule(f"a whole number from {low} to {high}", lambda value: _is_whole(value, low, high))
+    return _Rule(f"an integer from {low} to {high}", lambda value: _is_whole(value, low, high))
 
 
 def _is_whole(value: Any, low: int, high: int) -> bool:
@@ -263,7 +263,7 @@ _RECIPE: dict[str, _Rule] = {
     "task": _TEXT,
     "split": _TEXT,
     "knobs": _Rule(
-        "a mapping to whole numbers", _mapping_of(lambda one: _is_whole(one, -(1 << 31), 1 << 31))
+        "a mapping to integers", _mapping_of(lambda one: _is_whole(one, -(1 << 31), 1 << 31))
     ),
     "params": _Rule("a mapping to numbers", _mapping_of(_NUMBER.holds)),
     "task_fingerprint": _DIGEST,
@@ -278,12 +278,12 @@ _RECIPE: dict[str, _Rule] = {
     "compress": _Rule("true or false", lambda value: isinstance(value, bool)),
     "observation": _one_of("ids", "compact"),
     "channels": _Rule("a list of texts", _list_of(_is_text, 1, 1000)),
-    "shape": _Rule("three whole numbers from 1", _list_of(lambda one: _is_whole(one, 1, MAX_SIDE), 3, 3)),
+    "shape": _Rule("three integers from 1", _list_of(lambda one: _is_whole(one, 1, MAX_SIDE), 3, 3)),
     "palette": _Rule(
         "names by id", _mapping_of(_is_text, key=r"[0-9]|[1-9][0-9]|1[0-9]{2}|2[0-4][0-9]|25[0-5]")
     ),
     "action_nvec": _Rule(
-        "five whole numbers from 1", _list_of(lambda one: _is_whole(one, 1, (1 << 15) - 1), 5, 5)
+        "five integers from 1", _list_of(lambda one: _is_whole(one, 1, (1 << 15) - 1), 5, 5)
     ),
     "choices": _Rule("a list of texts", _list_of(_is_text, 1, 1000)),
     "actions": _whole(1, 1_000_000),

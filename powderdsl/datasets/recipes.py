@@ -18,9 +18,9 @@ USUAL_SHARD_BYTES = 1 << 28
 
 
 def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
-    """Raises ValueError if a value is no whole number from `least` to `most`."""
+    """Raises ValueError if a value is no integer from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise ValueError(f"{name} must be a whole number from {least} to {most}, found {value!r}")
+        raise ValueError(f"{name} must be an integer from {least} to {most}, found {value!r}")
 
 
 def recipe_of(

@@ -174,12 +174,12 @@ class TensorEnv:
         elif isinstance(seed, Sequence) and not isinstance(seed, str):
             seeds = list(seed)
         else:
-            raise TypeError(f"seed takes a whole number, a list of them, or None; found {seed!r}")
+            raise TypeError(f"seed takes an integer, a list of them, or None; found {seed!r}")
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
         for one in seeds:
             if one is not None and (isinstance(one, bool) or not isinstance(one, int | np.integer)):
-                raise TypeError(f"a seed is a whole number, found {one!r}")
+                raise TypeError(f"a seed is an integer, found {one!r}")
             if one is not None and not 0 <= one < 1 << 62:
                 raise ValueError(f"a seed lies in 0..2⁶²−1, found {one}")
         new = torch.tensor([0 if one is None else int(one) for one in seeds], device=self.device)
@@ -203,7 +203,7 @@ class TensorEnv:
     def _numbers(self, value: Any, name: str) -> Tensor:
         tensor = torch.as_tensor(value, device=self.device)
         if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
-            raise TypeError(f"{name} must be whole numbers, found {tensor.dtype}")
+            raise TypeError(f"{name} must be integers, found {tensor.dtype}")
         if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) != self.num_envs):
             raise ValueError(f"{name} takes one number or {self.num_envs}, found shape {list(tensor.shape)}")
         if bool((tensor < 0).any()):
@@ -269,7 +269,7 @@ class TensorEnv:
         """One action in every episode.
 
         Args:
-            actions: whole numbers [B, 5]: x, y, choice, vx, vy, each from 0 to ``action_nvec − 1``.
+            actions: integers [B, 5]: x, y, choice, vx, vy, each from 0 to ``action_nvec − 1``.
 
         Returns:
             observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; infos: ``success``, whether
@@ -354,14 +354,14 @@ class TensorEnv:
 
 def _check_count(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"{name} must be a whole number from 1, found {value!r}")
+        raise ValueError(f"{name} must be an integer from 1, found {value!r}")
 
 
 def check_cells(num_envs: int, size: tuple[int, int]) -> None:
     """Raises ValueError for more worlds than a simulator takes."""
     most = MAX_CELLS // (size[0] * size[1])
     if num_envs > most:
-        raise ValueError(f"num_envs must be a whole number from 1 to {most:,} here, found {num_envs:,}")
+        raise ValueError(f"num_envs must be an integer from 1 to {most:,} here, found {num_envs:,}")
 
 
 def _mode(value: AutoresetMode | str) -> AutoresetMode:

@@ -29,7 +29,7 @@ DIRECTION_SETS: dict[str, tuple[Offset, ...]] = {
 
 
 def grid_kernel(name: str, rows: tuple[tuple[int, ...], ...], wrap: bool = False) -> Kernel:
-    """A kernel from a matrix of whole weights with odd sides; zero weights are left out."""
+    """A kernel from a matrix of integer weights with odd sides; zero weights are left out."""
     cy, cx = len(rows) // 2, len(rows[0]) // 2
     weights = tuple((y - cy, x - cx, w) for y, row in enumerate(rows) for x, w in enumerate(row) if w)
     return Kernel(name, weights, wrap)
@@ -127,7 +127,7 @@ FUNCTIONS: dict[str, Function] = {
 }
 
 COORDINATES = ("row", "column", "step")
-"""Where and when: whole numbers that are used with `mod`, as in `(row + step) mod 2`."""
+"""Where and when: integers that are used with `mod`, as in `(row + step) mod 2`."""
 
 KIND_WORDS: dict[str, str] = {
     "flag": "yes or no",

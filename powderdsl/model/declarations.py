@@ -73,7 +73,7 @@ class StreamDecl:
 
 @dataclass(frozen=True)
 class Block:
-    """A block of a pass: lets, then one action (a moment of rules, or further blocks, maybe in a loop), then the rest."""
+    """A block of a pass: lets, then one action (a substep of rules, or further blocks, maybe in a loop), then the rest."""
 
     lets: tuple[tuple[Scalar, Syntax], ...]
     header: Syntax | None

@@ -271,7 +271,7 @@ class Elaborator:
     def _too_many(self, rules: tuple[Syntax, ...]) -> Poisoned:
         return self.typer.fail(
             "PD508",
-            f"loops unroll to more than {MAX_MOMENTS} moments or {MAX_RULES} rules",
+            f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules",
             rules[0].span,
             "here",
             ("loop over fewer things",),
@@ -424,7 +424,7 @@ class Elaborator:
                     f"the chance `{name}` cannot be assigned",
                     syntax.span,
                     "chances belong to elements",
-                    ("declare it as a whole number",),
+                    ("declare it as an integer",),
                 )
             self.result.overridden.add(name)
         return name, operand.kind, offset

@@ -195,8 +195,8 @@ def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
     if call.text == "sum" and len(operands) == 1:
         value = typer.value(operands[0], call.children[0].span)
         if isinstance(value, Expr) and value.kind.name not in ("int", "flag"):
-            cure = "real numbers are rounded: their sums are constant for no rule"
-            raise typer.wrong(value, "a whole number", call.children[0].span, cure)
+            cure = "floats are rounded: their sums are constant for no rule"
+            raise typer.wrong(value, "an integer", call.children[0].span, cure)
         if isinstance(value, Number):
             raise typer.wrong(value, "something that worlds have", call.children[0].span)
         return Total(value, trend, None)

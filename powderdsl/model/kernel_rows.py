@@ -18,7 +18,7 @@ def kernel_rows(reader: Reader, key: Scalar, node: Node) -> tuple[tuple[int, ...
         if not parts or not all(re.fullmatch(r"-?[0-9]{1,3}", part) for part in parts):
             reader.reporter.error(
                 "PD110",
-                "a kernel row that is not whole numbers",
+                "a kernel row that is not integers",
                 word.span,
                 "not a row of weights",
                 helps=['write "1 0 1", numbers up to 999 with blanks between them'],

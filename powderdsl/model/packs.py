@@ -258,7 +258,7 @@ class _PackReader(Reader):
                 self.reporter.error(
                     "PD109", f"the kernel `{key.text}` has {'rows and a shape' if both else 'no rows'}",
                     entries["shape"][0].span if both else key.span, "one of them" if both else "`rows` is missing",
-                    helps=["`rows`: rows of whole weights; or `shape`: a shape and its radius, such as `disc(3)`"],
+                    helps=["`rows`: rows of integer weights; or `shape`: a shape and its radius, such as `disc(3)`"],
                 )  # fmt: skip
                 return None
             rows = kernel_rows(self, key, entries["rows"][1])
@@ -364,7 +364,7 @@ class _PackReader(Reader):
         )
 
     def body(self, node: Node) -> tuple[tuple[Syntax, ...], tuple[Block, ...]]:
-        """A rule or a list of rules (one moment), or a block or a list of blocks (one after the other)."""
+        """A rule or a list of rules (one substep), or a block or a list of blocks (one after the other)."""
         items = node.items if isinstance(node, Sequence) else (node,)
         if not items or (isinstance(node, Scalar) and not node.text):
             self.reporter.error(
@@ -379,7 +379,7 @@ class _PackReader(Reader):
                 "rules and blocks in one list",
                 first_line(first),
                 "not of the kind of the first item",
-                notes=["a list of rules is one moment; a list of blocks happens one after the other"],
+                notes=["a list of rules is one substep; a list of blocks happens one after the other"],
                 helps=[
                     "put each group of rules under a `- do:` of its own; quote a rule that has `: ` in it"
                 ],

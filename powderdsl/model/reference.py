@@ -1,7 +1,7 @@
 """The oracle: a slow, obvious NumPy interpreter of the checked model. It defines what rules mean.
 
-It shares nothing with the compiler: no IR, no passes. Arrays are [B, H, W] ([B, 2, H, W] for vectors). Whole numbers
-are int64 here, reals float32 with one rounding an operation, draws float64.
+It shares nothing with the compiler: no IR, no passes. Arrays are [B, H, W] ([B, 2, H, W] for vectors). Integers
+are int64 here, floats float32 with one rounding an operation, draws float64.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def neighborhood(value: Array, kernel: Kernel) -> Array:
 
 @dataclass
 class Context:
-    """What an expression reads: the world as the moment finds it, values fixed earlier, draws, parameters."""
+    """What an expression reads: the world as the substep finds it, values fixed earlier, draws, parameters."""
 
     ruleset: Ruleset
     state: State
@@ -272,11 +272,11 @@ _OPS: dict[str, Any] = {
 }
 
 
-# Moments
+# Substeps
 
 
 def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
-    """The state after one simultaneous sub-step. `at.lets` gains the moment's lets."""
+    """The state after one simultaneous sub-step. `at.lets` gains the substep's lets."""
     for let in moment.lets:
         at.lets[let.name] = evaluate(let.value, at)
     masks = masks_of(moment, at)
@@ -318,7 +318,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
 
 
 def masks_of(moment: Moment, at: Context) -> dict[int, Array]:
-    """Where each rule of a moment happens, bool [B, H, W] by `id`. `at.lets` has the moment's lets."""
+    """Where each rule of a substep happens, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
     masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None}
     if moment.policy != "prove":
         claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
@@ -358,7 +358,7 @@ def _become(target: Array, mask: Array, state: State, at: Context, table: Mappin
 
 
 def _assign(write: Assign, value: Array, mask: Array, state: State, table: Mapping[str, Slot]) -> None:
-    """`field op value` at the cell `write.offset` away from each cell of the mask; whole numbers are cut off."""
+    """`field op value` at the cell `write.offset` away from each cell of the mask; integers are cut off."""
     back = (-write.offset[0], -write.offset[1])
     mask, value = look(mask, back), look(value, back)
     old = state[write.field]
@@ -416,7 +416,7 @@ def settle(state: State, table: Mapping[str, Slot]) -> State:
 
 
 Seen = Callable[[Pass, Moment, Context, State], None]
-"""Called after a moment with what it read, its lets among it, and what it left."""
+"""Called after a substep with what it read, its lets among it, and what it left."""
 
 
 def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | None = None) -> State:
@@ -465,7 +465,7 @@ def step(
         passes: names of the passes to run; all of them by default.
         draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
         lap: called with the name of each pass when it is done.
-        seen: called after each moment; it changes nothing and keeps copies of contexts, which go on changing.
+        seen: called after each substep; it changes nothing and keeps copies of contexts, which go on changing.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
     wide = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}

@@ -27,8 +27,8 @@ class Key:
 
 _BLOCK = {
     "let": Key("mapping", "names for values, fixed here, in order, before the rules run"),
-    "do": Key("block", "a rule, a list of rules (one moment), or blocks in sequence"),
-    "then": Key("block", "what comes after: a rule, a list of rules (one moment), or blocks in sequence"),
+    "do": Key("block", "a rule, a list of rules (one substep), or blocks in sequence"),
+    "then": Key("block", "what comes after: a rule, a list of rules (one substep), or blocks in sequence"),
     "symmetry": Key("word", "`mirror`, `rotations` or `all`: the rules hold in these orientations at once"),
     "conflicts": Key("word", "`drop_both` or `first_wins`: what happens when rules claim one cell"),
 }
@@ -88,7 +88,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "about": Key("text", "what it does, in a sentence"),
     },
     "kernel": {
-        "rows": Key("words", "rows of whole weights, an odd number of each, at most 31"),
+        "rows": Key("words", "rows of integer weights, an odd number of each, at most 31"),
         "shape": Key("line", "instead of rows: a shape and its radius, `disc(3)`"),
         "edges": Key("word", "`nothing` (the default) or `wrap`: what lies outside the grid"),
     },
@@ -355,7 +355,7 @@ class Reader:
             return None
         if not re.fullmatch(r"-?(0|[1-9][0-9]*)", value.text):
             self.reporter.error(
-                "PD110", f"`{key}` must be a whole number", value.span, "not a whole number",
+                "PD110", f"`{key}` must be an integer", value.span, "not an integer",
                 helps=[f"write a number from {lo} to {hi}"],
             )  # fmt: skip
             return None

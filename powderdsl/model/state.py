@@ -17,7 +17,7 @@ class Slot:
     """One array of a world's state.
 
     `dtype` is the NumPy name of its storage: uint8 for elements, flags and directions, the smallest signed
-    integer type that holds the range of whole numbers, float32 for reals. `planes` is 2 for vec2, else 1.
+    integer type that holds the range of integers, float32 for floats. `planes` is 2 for vec2, else 1.
     """
 
     name: str

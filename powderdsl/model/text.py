@@ -201,7 +201,7 @@ class _Printer:
     def moment_lines(self, moment: Moment) -> Iterator[str]:
         label = f" [{moment.label}]" if moment.label else ""
         policy = "" if moment.policy == "prove" else f" conflicts {moment.policy}"
-        yield f"  moment{label}{policy}"
+        yield f"  substep{label}{policy}"
         for let in moment.lets:
             yield self.placed(f"    let {let.name}: {let.value.kind} = {self.expr(let.value)}", let.span)
         for rule in moment.rules:

@@ -33,7 +33,7 @@ class Kind:
     ``element``     an element id
     ``direction``   0..7: right, right-down, down, … as octants, counted clockwise on the screen
     ``chance``      an exact probability in 0..1 (constants, parameters, properties)
-    ``draw``        a random number strictly between lo and hi: a stream's draw, plus whole numbers
+    ``draw``        a random number strictly between lo and hi: a stream's draw, plus integers
     ``real``        float32;  ``vec2``  two float32, (rows, columns)
     """
 
@@ -97,12 +97,12 @@ OPS: dict[str, str] = {
     "sub": "",
     "mul": "",
     "div": "real division; x / 0 is 0",
-    "quotient": "whole division, rounded down; x div 0 is 0",
+    "quotient": "integer division, rounded down; x div 0 is 0",
     "neg": "",
     "abs": "",
     "min": "",
     "max": "",
-    "mod": "value: the modulus, a whole number above 0",
+    "mod": "value: the modulus, an integer above 0",
     "to_real": "an int, flag or chance as float32; a draw rounded to float32",
     "count": "value: kernel; weighted number of neighborhood cells where the argument holds",
     "sum": "value: kernel; weighted sum of the argument, within a row from the left, then the rows from the top",
@@ -367,7 +367,7 @@ class Unchanging:
 
 @dataclass(frozen=True)
 class Total:
-    """The sum of a whole number over all cells is ``constant``, ``never rises`` or ``never falls`` from step to step.
+    """The sum of an integer over all cells is ``constant``, ``never rises`` or ``never falls`` from step to step.
 
     `ids` are the elements that are counted, if it is such a number; `value` is an int then too, 1 or 0.
     """

@@ -171,7 +171,7 @@ def evaluate(
     if unknown or not chosen or not names:
         raise ValueError(f"policies are {', '.join(there)}; found {unknown[0] if unknown else 'none'}")
     if episodes < 1:
-        raise ValueError(f"episodes is {episodes}: it takes a whole number from 1")
+        raise ValueError(f"episodes is {episodes}: it takes an integer from 1")
     first = compile_task(
         task,
         split=names[0],

@@ -29,7 +29,7 @@ PAPER = (30, 30, 30)
 
 @dataclass(frozen=True)
 class Scene:
-    """One moment of all worlds: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None, `fields` [B, H, W] each,
+    """One substep of all worlds: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None, `fields` [B, H, W] each,
     those that colors follow; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns` float64
     [B] before them; `over` bool [B]."""
 

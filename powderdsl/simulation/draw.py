@@ -155,7 +155,7 @@ def _rgb_torch(ids: Any, table: NDArray[np.uint8], motion: Any, ramped: Sequence
 def scale(image: Array, factor: int) -> Any:
     """Every pixel of [..., H, W, 3] as a square of `factor` by `factor`. Raises ValueError below 1."""
     if factor < 1:
-        raise ValueError(f"a picture cannot be scaled by {factor}: the factor is a whole number from 1")
+        raise ValueError(f"a picture cannot be scaled by {factor}: the factor is an integer from 1")
     if factor == 1:
         return image
     if _is_tensor(image):

@@ -172,7 +172,7 @@ class Observer:
 
     @cached_property
     def planes_there(self) -> tuple[PlaneName, ...]:
-        """The planes of flags and whole numbers, slot by slot, lowest bit first. Reals have none."""
+        """The planes of flags and integers, slot by slot, lowest bit first. Floats have none."""
         return tuple(
             PlaneName(slot.name, bit)
             for slot in self.slots.values()
@@ -182,7 +182,7 @@ class Observer:
 
     @property
     def plane_names(self) -> tuple[str, ...]:
-        """What each plane is: a flag's name, or ``name:bit`` for whole numbers."""
+        """What each plane is: a flag's name, or ``name:bit`` for integers."""
         flags = {slot.name for slot in self.slots.values() if slot.kind.name == "flag"}
         return tuple(p.slot if p.slot in flags else f"{p.slot}:{p.bit}" for p in self.planes_there)
 

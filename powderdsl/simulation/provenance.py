@@ -26,7 +26,7 @@ SLOT = "last writer"
 class NumberedRule:
     """A rule of the checked model. One line of a file makes several under loops and symmetries.
 
-    `number` counts from 1 in the order in which they run; `moment` counts the pass's moments from 0; `label` has the
+    `number` counts from 1 in the order in which they run; `moment` counts the pass's substeps from 0; `label` has the
     loop variables, such as ``side = left``.
     """
 

@@ -133,7 +133,7 @@ class Simulator:
 
         Args:
             ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
-            seed: one whole number for all, or one a world.
+            seed: one integer for all, or one a world.
             index: which world of its seed each is; 0, 1, … for one common seed, 0 for seeds of their own.
 
         Raises:
@@ -225,7 +225,7 @@ class Simulator:
         return self.observer.rgb(world.state, out)
 
     def planes(self, world: World, out: Tensor | None = None) -> Tensor:
-        """Flags and whole numbers in bits: int64 [B, P, H, ⌈W/64⌉].
+        """Flags and integers in bits: int64 [B, P, H, ⌈W/64⌉].
 
         Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of `plane_names`.
         Real fields have none: `read` them.
@@ -291,7 +291,7 @@ class Simulator:
     def _checked(self, slot: Slot, value: Any, ids: Tensor) -> Tensor:
         tensor = self._shaped(value, slot.name, tuple(ids.shape), slot.planes == 2)
         if tensor.dtype.is_complex:
-            raise TypeError(f"{slot.name} takes real numbers, found {tensor.dtype}")
+            raise TypeError(f"{slot.name} takes floats, found {tensor.dtype}")
         if slot.is_real:
             return checked_reals(tensor, slot)
         usual = None if self.ruleset.property(slot.name) is None else self.observer.table(slot.name)
@@ -394,7 +394,7 @@ class Simulator:
         return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
     def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Tensor]:
-        """Draws as whole numbers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
+        """Draws as integers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
         bits = {stream.name: stream.bits for stream in self.ruleset.streams}
         draws = {}
         for name, value in random.items():
@@ -428,19 +428,19 @@ class Simulator:
             if not bool(((tensor >= lo) & (tensor <= hi)).all()):
                 raise ValueError(f"{name} takes {lo:g}..{hi:g}")
             if kind.name in ("int", "flag") and not bool((tensor == tensor.round()).all()):
-                raise ValueError(f"{name} takes whole numbers")
+                raise ValueError(f"{name} takes integers")
             values[name] = tensor.expand(batch).clone()
         return values
 
 
 def _whole(value: Any, name: str) -> int:
-    """A whole number of 0 or more, Python's or NumPy's."""
+    """An integer of 0 or more, Python's or NumPy's."""
     try:
         number = index(value)
     except TypeError:
         number = -1
     if number < 0 or isinstance(value, bool):
-        raise ValueError(f"{name} must be a whole number of 0 or more, found {value!r}")
+        raise ValueError(f"{name} must be an integer of 0 or more, found {value!r}")
     return number
 
 

@@ -82,7 +82,7 @@ def _integers(
 ) -> Tensor:
     kind = slot.kind
     if tensor.dtype.is_floating_point and not bool((tensor == tensor.round()).all()):
-        raise TypeError(f"{slot.name} takes whole numbers, found {tensor.dtype}")
+        raise TypeError(f"{slot.name} takes integers, found {tensor.dtype}")
     whole = tensor.to(torch.int64)
     if kind.name == "element":
         check_ids(whole, known, slot.name, ruleset)

@@ -176,7 +176,7 @@ ROUND = 1 << (SHIFT - 1)
 def code_values(slot: CodedSlot, floor: float) -> Tensor:
     """What each of the 256 codes of a slot stands for: float32 [256].
 
-    Whole numbers in a range of at most 256 are counted from the lowest. Others have a sign and a size: code 128 is 0,
+    Integers in a range of at most 256 are counted from the lowest. Others have a sign and a size: code 128 is 0,
     and 128 ± n is ±(x − `floor`), where x grows by an eighth of a power of two with each n: steps of ``floor / 8`` near
     0, and of an eighth of the value, at most, far from it.
     """

@@ -9,7 +9,7 @@ from difflib import get_close_matches
 
 TERMINAL_WORDS = {
     "NAME": "a name",
-    "INTEGER": "a whole number",
+    "INTEGER": "an integer",
     "DECIMAL": "a number",
     "PERCENT": "a percentage",
     "UPDATE": "`:=`",
@@ -201,7 +201,7 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
     if shape and token.isdigit():
         return f"write `{shape[1]}({token})`"
     if token == "/" and before.endswith("/"):
-        return "whole division, rounded down, is `div`: `a div b`"
+        return "integer division, rounded down, is `div`: `a div b`"
     if token == "->" and "->" in before:
         return "one line is one rule: put the next one on a line of its own"
     if token.endswith("%") and ("CHANCE" in accepted or before.rstrip().endswith("chance")):

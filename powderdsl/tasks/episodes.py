@@ -342,7 +342,7 @@ def check_actions(program: TaskProgram, actions: Any) -> Tensor:
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"actions: {' '.join(str(error).split())}") from None
     if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
-        raise TypeError(f"actions must be whole numbers, found {tensor.dtype}")
+        raise TypeError(f"actions must be integers, found {tensor.dtype}")
     if tensor.ndim != 2 or tensor.shape[1] != 5:
         raise ValueError(f"actions must have the shape [episodes, 5], found {list(tensor.shape)}")
     tensor = tensor.to(torch.int64)

@@ -174,7 +174,7 @@ class _TaskReader:
         if node is None:
             return 64, 64
         if len(items) != 2 or len(numbers) != 2 or not all(1 <= one <= MAX_SIDE for one in numbers):
-            label = f"two whole numbers from 1 to {MAX_SIDE}"
+            label = f"two integers from 1 to {MAX_SIDE}"
             helps = ["size: [64, 64]"]
             self.reporter.error("PD607", "a size is [rows, columns]", first_line(node), label, helps=helps)
             return 64, 64
@@ -229,7 +229,7 @@ class _TaskReader:
             ends = [arg.value for arg in bounds.args if arg.is_number]
             if bounds.op != "draw" or len(ends) != 2:
                 self.reporter.error(
-                    "PD803", "a knob's range has two whole numbers", bounds.span, "such as `0..64`"
+                    "PD803", "a knob's range has two integers", bounds.span, "such as `0..64`"
                 )
                 continue
             low, high = int(ends[0] or 0), int(ends[1] or 0)
@@ -239,7 +239,7 @@ class _TaskReader:
             except ZeroDivisionError:
                 value = default
             if not value.is_number:
-                label = "a whole number, or knobs that stand above this one"
+                label = "an integer, or knobs that stand above this one"
                 helps = suggest(default.span.text if default.span else "", found, "knobs above it")
                 self.reporter.error("PD803", f"the default of `{key.text}`", default.span, label, helps=helps)
                 continue

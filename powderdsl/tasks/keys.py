@@ -21,7 +21,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
         "params": Key("mapping", "other values for the rules' parameters"),
         "size": Key("any", "[rows, columns]", True),
         "fill": Key("word", "the element that is everywhere before anything is drawn", True),
-        "knobs": Key("mapping", "whole numbers that are set from outside"),
+        "knobs": Key("mapping", "integers that are set from outside"),
         "let": Key("mapping", "numbers and draws that statements and regions share, in order"),
         "regions": Key("mapping", "names for sets of cells: a shape each, or a list of shapes"),
         "stamps": Key("mapping", "pictures that statements paint"),

@@ -51,7 +51,7 @@ def load_task_with_diagnostics(
     reporter = Reporter()
     for name, value in (knobs or {}).items():
         if isinstance(value, bool) or not isinstance(value, int):
-            raise TypeError(f"the knob `{name}` takes a whole number, found {value!r}")
+            raise TypeError(f"the knob `{name}` takes an integer, found {value!r}")
     text = str(name_or_path)
     path = shipped("tasks") / f"{text}.yaml" if text in shipped_tasks() else Path(text)
     if text not in shipped_tasks() and not text.lower().endswith((".yaml", ".yml")):

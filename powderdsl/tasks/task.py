@@ -31,7 +31,7 @@ MAX_REPEATS = 256
 
 @dataclass(frozen=True)
 class Knob:
-    """A whole number that is set from outside: ``--lines 8``. `value` is what it is in this task."""
+    """An integer that is set from outside: ``--lines 8``. `value` is what it is in this task."""
 
     name: str
     default: int

@@ -100,7 +100,7 @@ def test_all_mistakes_are_told_at_once(task: Path, tmp_path: Path) -> None:
     [
         (("--verify", "gone"), "PD630"),
         (("small", "--verify", "gone"), "--verify takes a folder"),
-        (("--seed", "-1"), "no whole number"),
+        (("--seed", "-1"), "no integer"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
         (("--observation", "matrix"), "matrix"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--device", "tpu"), "PD701"),
@@ -133,7 +133,7 @@ def recording(task: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.mark.slow
 def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> None:
-    """Ctrl-C, SIGKILL at several moments, then what is left: the same bytes as without any of it."""
+    """Ctrl-C, SIGKILL at several substeps, then what is left: the same bytes as without any of it."""
     out, other = tmp_path / "data", tmp_path / "other"
     with recording(task, out) as running:
         running.send_signal(signal.SIGINT)

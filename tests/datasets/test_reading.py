@@ -170,7 +170,7 @@ def test_numbers_that_there_are_not(recorded: Dataset) -> None:
         lambda: recorded.transitions(4, seed=-1),
         lambda: recorded.sequences(7, 4),
     ):
-        with pytest.raises(ValueError, match="must be a whole number"):
+        with pytest.raises(ValueError, match="must be an integer"):
             call()
 
 

@@ -218,9 +218,9 @@ def test_folders_of_others_are_left_alone(small: TaskProgram, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"episodes": 0}, "episodes must be a whole number from 1"),
-        ({"episodes": True}, "episodes must be a whole number"),
-        ({"seed": -1}, "seed must be a whole number from 0"),
+        ({"episodes": 0}, "episodes must be an integer from 1"),
+        ({"episodes": True}, "episodes must be an integer"),
+        ({"seed": -1}, "seed must be an integer from 0"),
         ({"envs": 0}, "envs must be"),
         ({"shard": 0}, "shard must be"),
         ({"shard": 1 << 30}, "a shard of 1073741824 episodes may take"),

@@ -143,7 +143,7 @@ def test_ppo_learns_with_the_papers_network(small: TaskProgram, kind: str) -> No
 
 
 def test_compact_expands_to_the_matrix(small: TaskProgram) -> None:
-    """Exactly, but for reals, which are off by a sixteenth at most."""
+    """Exactly, but for floats, which are off by a sixteenth at most."""
     env = TensorEnv(small, 4, observation="compact")
     actions = np.random.default_rng(2).integers(0, small.action_nvec, (5, 4, 5))
     env.reset(seed=0)

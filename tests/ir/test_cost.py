@@ -37,7 +37,7 @@ def by_name(text: str) -> dict[str, PassCost]:
 
 
 def test_counted_by_hand() -> None:
-    """An element of two is one plane. 25 % of 2^32 draws are decided by two bits; settled reals are compared once more."""
+    """An element of two is one plane. 25 % of 2^32 draws are decided by two bits; settled floats are compared once more."""
     found = by_name(PACK)
     fade, fall, warm = (found[name] for name in ("fade", "fall", "warm"))
     # dust and above and below a quarter: they change, which leaves dust and not that

@@ -1,4 +1,4 @@
-"""Circuits against Python's whole numbers: every value of small ranges, by evaluating the gates."""
+"""Circuits against Python's integers: every value of small ranges, by evaluating the gates."""
 
 from __future__ import annotations
 

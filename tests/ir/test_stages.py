@@ -85,7 +85,7 @@ def test_golden_ir(name: str, stage: str, tmp_path: Path, golden) -> None:  # ty
 
 
 def test_densities_become_sets_of_elements(tmp_path: Path) -> None:
-    """After `resolve` no property is looked up any more, and moments that cannot happen are gone."""
+    """After `resolve` no property is looked up any more, and substeps that cannot happen are gone."""
     before = program_of("fall", tmp_path)
     after = run_passes(before)
     assert "table" in print_program(before)

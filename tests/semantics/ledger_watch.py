@@ -1,4 +1,4 @@
-"""Watches the reference interpreter, moment by moment, and holds what rules do against a ledger."""
+"""Watches the reference interpreter, substep by substep, and holds what rules do against a ledger."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Watch:
         return np.stack([(held == number).any((1, 2, 3)) for number in numbers], 1)
 
     def _masks(self, moment: Moment, at: Any) -> tuple[dict[int, Array], dict[int, Array]]:
-        """Where the rules of a moment want to happen, and where they do."""
+        """Where the rules of a substep want to happen, and where they do."""
         for let in moment.lets:
             at.lets[let.name] = reference.evaluate(let.value, at)
         wanted = {

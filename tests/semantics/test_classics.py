@@ -117,7 +117,7 @@ def test_a_glider_moves_one_cell_down_and_right_in_four_generations(backend: str
 def test_a_glider_crosses_the_edges_of_the_torus(backend: str) -> None:
     sim = simulator("life", backend)
     start = life(sim, GLIDER, 12, 8, at=(0, 0))
-    # It is home when it has gone round the 12 rows and the 8 columns a whole number of times: after 24 cells.
+    # It is home when it has gone round the 12 rows and the 8 columns an integer of times: after 24 cells.
     halfway = sim.step(start, 4 * 12)
     assert not torch.equal(halfway.ids, start.ids)
     assert torch.equal(sim.step(halfway, 4 * 12).ids, start.ids)
@@ -193,7 +193,7 @@ XOR_GATE = """
     .....=.....
     bB===......
     """
-# A and not (A and not B): an electron stops where three heads come down on it at the same moment.
+# A and not (A and not B): an electron stops where three heads come down on it at the same substep.
 AND_GATE = """
     ..bB====............
     ........=...........

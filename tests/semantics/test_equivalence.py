@@ -57,7 +57,7 @@ SAME = {
         "do: soil -> moss if luck < 50%",
     ),
     "fields that only some have": ("do: soil -> rock if age == 0", "do: soil -> rock"),
-    "a value that is fixed in the same moment": (
+    "a value that is fixed in the same substep": (
         "let: {wet: damp > 2}\ndo: soil -> moss if wet",
         "let: {wet: damp > 2}\ndo: soil -> moss if damp > 2 or wet",
     ),
@@ -100,11 +100,11 @@ OTHER = {
         "do: moss -> soil if count(damp > 4 and age == 1) == 2",
         "do: moss -> soil if count(damp > 4 and age == 2) == 2",
     ),
-    "one moment or two": ("do: soil -> moss\nthen: moss -> rock", "do:\n  - soil -> moss\n  - moss -> rock"),
+    "one substep or two": ("do: soil -> moss\nthen: moss -> rock", "do:\n  - soil -> moss\n  - moss -> rock"),
     "edges": ("do: soil -> moss if left is rock", "do: soil -> moss if left is rock and inside(left)"),
     "a range": ("do: damp := 3 where damp > 8", "do: damp := 3 where damp > 7"),
     "a draw": ("do: soil -> moss if luck < 20%", "do: soil -> moss if luck < 21%"),
-    "real numbers": ("do: heat := heat * 0.5", "do: heat := heat * 0.25"),
+    "floats": ("do: heat := heat * 0.5", "do: heat := heat * 0.25"),
     "a neighbor": ("do: soil -> moss if below is moss", "do: soil -> moss if right is moss"),
     "an effect": (
         "do: moss swaps below if below is soil, then below.damp += 1",

@@ -113,7 +113,7 @@ def test_what_planes_refuse_and_rules_cannot_say() -> None:
     slots = (SlotType("number", number.type, 0, False), SlotType("found", FLAG, 0, False))
     rare = build.in_set(number, frozenset({3, 1 << 20}))
     rounded = build.compare("lt", build.to_real(number), build.real(2.5))
-    for node, why in ((rare, "a table over 26 planes"), (rounded, "a whole number too large for float32")):
+    for node, why in ((rare, "a table over 26 planes"), (rounded, "an integer too large for float32")):
         pass_ = PassGraph("made", "made", (), (("found", node),))
         found = carry(Program("made", slots, (), (), (pass_,)), pass_)
         assert (found.planes, found.why, found.place) == (None, why, "made.yaml:7")

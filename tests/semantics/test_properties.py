@@ -211,7 +211,7 @@ def test_changes_stay_within_reach() -> None:
 
 
 def reach(ruleset: Ruleset) -> tuple[int, int]:
-    """How many rows and columns away a step may look and write: the sum over its moments."""
+    """How many rows and columns away a step may look and write: the sum over its substeps."""
     total = np.zeros(2, int)
     for moment in (moment for pass_ in ruleset.passes for moment in pass_.moments):
         seen = [np.zeros(2, int)]
@@ -328,7 +328,7 @@ def test_every_value_is_one_that_was_declared(backend: str, seeds: range) -> Non
 
 
 def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Moments without a policy have no conflicts, and rules that "can never fire" (PD503) never fire."""
+    """Substeps without a policy have no conflicts, and rules that "can never fire" (PD503) never fire."""
     silent: set[Span] = set()
     counts = {"claims": 0, "moments": 0, "silent": 0}
     run_moment = reference.run_moment

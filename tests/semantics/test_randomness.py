@@ -58,7 +58,7 @@ def draws(
     bits: int = 32,
     shape: Shape = (128, 160),
 ) -> Planes:
-    """Draws of one world by the oracle, as whole numbers below 2^bits: uint64 [H, W]."""
+    """Draws of one world by the oracle, as integers below 2^bits: uint64 [H, W]."""
     clock = Clock(np.array([seed]), np.array([index]), np.array([step]))
     return (draw(clock, ident, bits, *shape)[0] * 2.0**bits).astype(np.uint64)  # type: ignore[no-any-return]
 

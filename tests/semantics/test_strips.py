@@ -30,7 +30,7 @@ def needs_compiler() -> None:
 
 @pytest.mark.parametrize("name", ["powderworld", "forest_fire", "langtons_ant", "margolus", "wireworld"])
 def test_shipped_rulesets_in_strips(name: str) -> None:
-    """With edges that wrap and with nothing outside, parities of rows, reals, draws, and parameters by world."""
+    """With edges that wrap and with nothing outside, parities of rows, floats, draws, and parameters by world."""
     ruleset = load(name)
     simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("dense", "native")]
     for seed, shape in enumerate(STRIPS):

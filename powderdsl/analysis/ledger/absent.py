@@ -114,7 +114,7 @@ def _nodes_of(rule: Rule, lets: dict[str, Expr]) -> Iterator[Expr]:
 
 
 class Lacking:
-    """A moment in a world without some elements, which has had none of them since the step began.
+    """A substep in a world without some elements, which has had none of them since the step began.
 
     Rival rules are left out of account: more is taken for possible.
     """

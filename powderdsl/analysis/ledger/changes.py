@@ -58,7 +58,7 @@ class Found:
 
 @dataclass
 class Asked:
-    """A moment, and how to ask about its rules."""
+    """A substep, and how to ask about its rules."""
 
     moment: Moment
     facts: Facts
@@ -78,7 +78,7 @@ class Asked:
         return not rivals or possible(self.facts, (*first, *rivals), self.lets)
 
     def rivals(self, rule: Rule) -> list[Condition]:
-        """What must not hold for the rule to happen, by the moment's conflict policy.
+        """What must not hold for the rule to happen, by the substep's conflict policy.
 
         Under ``drop_both`` no other rule may claim its cells; under ``first_wins`` no transform before it may. An
         earlier swap or move that is wanted may itself be dropped, so that says nothing.
@@ -149,7 +149,7 @@ def rule_line(rule: Rule, pass_: Pass) -> RuleLine:
 
 
 def _look_at(rule: Rule, asked: Asked, found: Found) -> None:
-    """Add to `found` what one rule of a moment may do."""
+    """Add to `found` what one rule of a substep may do."""
     if not asked.may(rule):
         return
     found.fires = True

@@ -29,7 +29,7 @@ class FieldEntry:
     fresh_bounds: Bounds | None
     writers: tuple[RuleLine, ...]
     reaches: tuple[tuple[RuleLine, float | None, float | None], ...]
-    """For each line that writes a whole number: how low and how high it can bring it. None: it never lowers or raises."""
+    """For each line that writes an integer: how low and how high it can bring it. None: it never lowers or raises."""
 
 
 def find_fields(ruleset: Ruleset, found: Iterable[Found]) -> tuple[FieldEntry, ...]:
@@ -83,7 +83,7 @@ def _entry(
 
 
 def reach(assign: Assign, declared: Bounds) -> tuple[float | None, float | None]:
-    """How low and how high an assignment may bring a whole number; None where it never lowers or never raises it."""
+    """How low and how high an assignment may bring an integer; None where it never lowers or never raises it."""
     low, high = assign.value.kind.lo, assign.value.kind.hi
     if assign.op == ":=":
         return min(max(low, declared[0]), declared[1]), min(max(high, declared[0]), declared[1])

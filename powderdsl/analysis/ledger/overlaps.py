@@ -20,7 +20,7 @@ OUTCOMES = {
 """What becomes of two rules that meet, in words."""
 
 MAX_LINES = 64
-"""Lines that transform cells, up to which every two of different moments are compared."""
+"""Lines that transform cells, up to which every two of different substeps are compared."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def _meet(first: Expr, second: Expr, at: Offset, asked: Asked) -> bool:
 
 
 def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
-    """Rules of one moment that may claim one cell, where a policy decides."""
+    """Rules of one substep that may claim one cell, where a policy decides."""
     if asked.moment.policy == "prove":
         return
     # What is always dropped meets others too: here only the conditions count.
@@ -83,7 +83,7 @@ def _alike(first: Rule, second: Rule) -> bool:
 
 
 def _writes(rules: list[Rule], asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
-    """Writes of one field in one moment whose order makes a difference. Roundings of reals are left out."""
+    """Writes of one field in one substep whose order makes a difference. Roundings of floats are left out."""
     plain = [(rule, rule.mask, rule) for rule in rules if isinstance(rule, Assign)]
     effects = [
         (effect, rule.mask, rule) for rule in rules if not isinstance(rule, Assign) for effect in rule.effects
@@ -130,7 +130,7 @@ def _ways(assign: Assign) -> set[str]:
 
 
 def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iterator[Overlap]:
-    """Transforms of different moments that could happen to one cell of one world, with different results."""
+    """Transforms of different substeps that could happen to one cell of one world, with different results."""
     rules = [
         (number, pass_, rule, _renamed_lets(moment.lets, number), _renamed(rule.mask, number))
         for number, (pass_, moment) in enumerate((p, m) for p in ruleset.passes for m in p.moments)
@@ -157,7 +157,7 @@ def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iter
 
 
 def _renamed(expr: Expr, number: int) -> Expr:
-    """Values under `let` of different moments may share a name: here they get the moment's number."""
+    """Values under `let` of different substeps may share a name: here they get the substep's number."""
     if expr.op == "let":
         return replace(expr, value=f"{expr.value}@{number}")
     args = tuple(_renamed(arg, number) for arg in expr.args)

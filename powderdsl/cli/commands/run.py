@@ -217,7 +217,7 @@ class _Run:
         return pictures(self.world, most=MOST_PICTURES, factor=self.plan.scale)
 
     def _watched(self, moments: Iterator[int]) -> Iterator[int]:
-        """Shows each moment, no faster than the frame rate on a terminal."""
+        """Shows each substep, no faster than the frame rate on a terminal."""
         from powderdsl.cli.pictures import first_world
 
         due = time.perf_counter()

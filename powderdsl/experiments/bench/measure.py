@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
 
 Clock = Callable[[], float]
-"""Seconds since some moment."""
+"""Seconds since some substep."""
 
 
 def measure(plan: Plan, on_event: Callable[[Event], None] | None = None) -> Report:

@@ -17,7 +17,7 @@ from powderdsl.worlds.strewn import check_cells
 WORKLOADS: dict[str, str] = {
     "gusts": "shapes, and rectangles of ±20 in every vector field that stays in its place: busy worlds",
     "shapes": "shapes of all elements at random places, everything else at rest",
-    "noise": "every cell a random element, every field of reals random: more than worlds ever do",
+    "noise": "every cell a random element, every field of floats random: more than worlds ever do",
     "few": "shapes of two elements: by default the first two that move",
 }
 """Worlds to start from, for any ruleset."""
@@ -99,7 +99,7 @@ def make_plan(
     counts = {"batches": batches, "threads": threads, "steps": (steps,), "rounds": (rounds,)}
     for name, numbers in {**counts, "sizes": [side for size in sizes for side in size]}.items():
         if not numbers or min(numbers) < 1:
-            raise ValueError(f"{name}: whole numbers of 1 or more are needed")
+            raise ValueError(f"{name}: integers of 1 or more are needed")
     if not 0 < seconds <= MAX_SECONDS:  # false for NaN
         raise ValueError(f"seconds: a number above 0, up to {MAX_SECONDS:g}, is needed")
     for size in sizes:

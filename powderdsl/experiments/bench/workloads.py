@@ -22,7 +22,7 @@ REACH = 7
 """Of the shapes. They cover about a quarter of the world."""
 GUST_SIDE, GUST_SPEED = 10, 20.0
 NOISE = 3.0
-"""Standard deviation of noisy reals."""
+"""Standard deviation of noisy floats."""
 
 
 def start_worlds(sim: Simulator, cell: Cell, workload: str, seed: int) -> World:

@@ -1,6 +1,6 @@
 """Arithmetic and comparisons: kinds, ranges and exact constant folding.
 
-Whole numbers carry their bounds; draws add up with whole numbers only and compare exactly; everything else is
+Integers carry their bounds; draws add up with integers only and compare exactly; everything else is
 float32, one rounding an operation, in the order written.
 """
 
@@ -94,7 +94,7 @@ def _compare_discrete(
 
 
 def _compare_whole(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
-    """Whole numbers with whole numbers; a bound such as 1.5 is rounded to the whole number that means the same."""
+    """Integers with integers; a bound such as 1.5 is rounded to the integer that means the same."""
     if isinstance(left, Number) and left.value.denominator != 1:
         if op == "eq":
             return FALSE
@@ -256,7 +256,7 @@ def negate(typer: Typer, value: Value, span: Span) -> Operand:
 
 
 def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    """`a div b`: whole numbers, rounded down; 0 where b is 0."""
+    """`a div b`: integers, rounded down; 0 where b is 0."""
     left, right = (typer.value(typer.evaluate(child, scope), child.span) for child in syntax.children)
     a, b = (
         _whole_part(typer, value, child.span)
@@ -273,7 +273,7 @@ def _whole_part(typer: Typer, value: Value, span: Span) -> Expr:
     """An operand of `div`."""
     if isinstance(value, Expr) and value.kind.name == "real":
         raise typer.wrong(
-            value, "a whole number", span, "`div` divides whole numbers; for real numbers say `/`"
+            value, "an integer", span, "`div` divides integers; for floats say `/`"
         )
     return typer.whole(value, span)
 
@@ -288,7 +288,7 @@ def _quotient_bounds(a: Kind, b: Kind) -> Kind:
 
 
 def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    """`x mod n` for a whole constant n; coordinates (and their sums) may only appear here."""
+    """`x mod n` for an integer constant n; coordinates (and their sums) may only appear here."""
     left, right = syntax.children
     divisor = typer.value(typer.evaluate(right, scope), right.span)
     if (
@@ -296,12 +296,12 @@ def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         or divisor.value.denominator != 1
         or not 1 <= divisor.value <= MAX_MODULUS
     ):
-        raise typer.fail("PD405", "`mod` takes a whole constant", right.span, f"expected 1 to {MAX_MODULUS}")
+        raise typer.fail("PD405", "`mod` takes an integer constant", right.span, f"expected 1 to {MAX_MODULUS}")
     modulus = int(divisor.value)
     value = _coordinate_sum(typer, left, modulus, scope)
     if isinstance(value, Number):
         if value.value.denominator != 1:
-            raise typer.fail("PD401", "`mod` takes whole numbers", left.span)
+            raise typer.fail("PD401", "`mod` takes integers", left.span)
         return Number(Fraction(int(value.value) % modulus))
     return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
 
@@ -335,7 +335,7 @@ def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scop
     most = MAX_MODULUS // modulus
     if not isinstance(divisor, Number) or divisor.value.denominator != 1 or not 1 <= divisor.value <= most:
         label = f"expected 1 to {most}: times {modulus} it is at most {MAX_MODULUS}"
-        raise typer.fail("PD405", "a coordinate is divided by a whole constant", right.span, label)
+        raise typer.fail("PD405", "a coordinate is divided by an integer constant", right.span, label)
     number = int(divisor.value)
     inner = typer.whole(_coordinate_sum(typer, left, modulus * number, scope), left.span)
     known = Expr("mod", integer(0, modulus * number - 1), (inner,), modulus * number, left.span)
@@ -350,7 +350,7 @@ def part(vector: Expr, name: str, span: Span) -> Expr:
 def choose(
     typer: Typer, condition: Expr, yes: tuple[Operand, Span], no: tuple[Operand, Span], span: Span
 ) -> Expr:
-    """`a if c else b`, both of one kind; whole numbers join their ranges."""
+    """`a if c else b`, both of one kind; integers join their ranges."""
     a, b = typer.value(*yes), typer.value(*no)
     kinds = [o.kind.name if isinstance(o, Expr) else "number" for o in (a, b)]
     if set(kinds) <= {"int", "number"} and all(

@@ -45,10 +45,10 @@ def _kernel(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel | None:
 
 
 def read_radius(typer: Typer, syntax: Syntax, scope: Scope) -> int:
-    """The radius of a kernel: a whole constant."""
+    """The radius of a kernel: an integer constant."""
     value = typer.evaluate(syntax, scope)
     if not isinstance(value, Number) or value.value.denominator != 1:
-        raise typer.fail("PD405", "a radius is a whole constant", syntax.span, f"expected 1 to {MAX_RADIUS}")
+        raise typer.fail("PD405", "a radius is an integer constant", syntax.span, f"expected 1 to {MAX_RADIUS}")
     radius = int(value.value)
     if not 1 <= radius <= MAX_RADIUS:
         label = f"a radius lies in 1..{MAX_RADIUS}"
@@ -116,7 +116,7 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         if not isinstance(value, Number) or value.value.denominator != 1:
             cure = "where it varies, loop over the values: `any(… for n in 0..3)`"
             raise typer.fail(
-                "PD405", "`at` takes two whole constants", child.span, "not a whole constant", (cure,)
+                "PD405", "`at` takes two whole constants", child.span, "not an integer constant", (cure,)
             )
         steps.append(int(value.value))
     place = Place(typer.offset((steps[0], steps[1]), syntax.span))

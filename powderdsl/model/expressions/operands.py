@@ -101,8 +101,8 @@ def describe(operand: Operand) -> str:
     """An operand's kind in words, for messages."""
     match operand:
         case Expr():
-            return {"int": "a whole number", "flag": "a condition", "element": "an element", "direction": "a direction",
-                    "chance": "a chance", "draw": "a random draw", "real": "a real number", "vec2": "a vector"}.get(operand.kind.name, "a number")  # fmt: skip
+            return {"int": "an integer", "flag": "a condition", "element": "an element", "direction": "a direction",
+                    "chance": "a chance", "draw": "a random draw", "real": "a float", "vec2": "a vector"}.get(operand.kind.name, "a number")  # fmt: skip
         case SetOf():
             return "an element" if operand.name else "a set of elements"
         case Place():
@@ -234,7 +234,7 @@ class Coercer:
         if value.kind.name == "draw" and value.op in (
             "add",
             "sub",
-        ):  # as real numbers: a rounding an operation
+        ):  # as floats: a rounding an operation
             return Expr(value.op, REAL, tuple(self.real(arg, span) for arg in value.args), span=span)
         if value.kind.name == "draw" and value.op == "look":
             return look(self.real(value.args[0], span), value.value, span)
@@ -247,13 +247,13 @@ class Coercer:
         if isinstance(value, Number):
             if value.value.denominator != 1:
                 raise self.fail(
-                    "PD401", "expected a whole number", span, f"{float(value.value):g} is not whole",
-                    ("write a whole number; a field may also be declared as `real(LOW..HIGH)`",),
+                    "PD401", "expected an integer", span, f"{float(value.value):g} is not whole",
+                    ("write an integer; a field may also be declared as `real(LOW..HIGH)`",),
                 )  # fmt: skip
             return constant(value, span)
         if value.kind.name == "int":
             return value
-        raise self.wrong(value, "a whole number", span, *_whole_helps(value, span))
+        raise self.wrong(value, "an integer", span, *_whole_helps(value, span))
 
     def chance(self, operand: Operand, span: Span) -> Expr:
         """A probability: a constant within 0..1, or a property, parameter or field that is one."""
@@ -333,7 +333,7 @@ class Coercer:
         return offset
 
     def bounded(self, value: Expr, span: Span) -> Expr:
-        """A whole number whose declared range is still reasonable."""
+        """An integer whose declared range is still reasonable."""
         if max(abs(value.kind.lo), abs(value.kind.hi)) > MAX_MAGNITUDE:
             raise self.fail(
                 "PD402",
@@ -345,14 +345,14 @@ class Coercer:
 
 
 def _whole_helps(value: Expr, span: Span) -> tuple[str, ...]:
-    """What to write instead of a real number where a whole one is wanted."""
+    """What to write instead of a float where a whole one is wanted."""
     if value.kind.name != "real":
         return ()
     declared = "or declare what takes it as `real(LOW..HIGH)`"
     whole = all(arg.op in ("to_real", "const") for arg in value.args)
     if value.op == "div" and whole and span.text.count("/") == 1:
         left, _, right = span.text.partition("/")
-        return (f"whole division rounds down: `{left.strip()} div {right.strip()}`", declared)
+        return (f"integer division rounds down: `{left.strip()} div {right.strip()}`", declared)
     factor = next((arg.value for arg in value.args if arg.op == "const"), None)
     if value.op == "mul" and whole and isinstance(factor, (int, float)) and span.text.count("*") == 1:
         number = next(
@@ -360,8 +360,8 @@ def _whole_helps(value: Expr, span: Span) -> tuple[str, ...]:
         )
         ratio = Fraction(factor).limit_denominator(1000)
         times = "" if ratio.numerator == 1 else f" * {ratio.numerator}"
-        return (f"whole numbers stay whole: `{number}{times} div {ratio.denominator}`", declared)
-    return ("`a div b` divides whole numbers and rounds down", declared)
+        return (f"integers stay whole: `{number}{times} div {ratio.denominator}`", declared)
+    return ("`a div b` divides integers and rounds down", declared)
 
 
 def constant(number: Number, span: Span | None = None) -> Expr:

@@ -155,7 +155,7 @@ def default_of(kind: Kind, first_id: int = 0) -> Value:
 
 
 def settled(default: Value, kind: Kind) -> Value:
-    """A field's default as steps leave it: real numbers within bounds, and zero where they are smaller than SNAP."""
+    """A field's default as steps leave it: floats within bounds, and zero where they are smaller than SNAP."""
     if kind.name not in ("real", "vec2"):
         return default
     parts = default if isinstance(default, tuple) else (default,)

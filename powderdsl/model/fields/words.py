@@ -12,7 +12,7 @@ from powderdsl.model.expressions.symbols import settled
 from powderdsl.model.types import Kind
 
 FORMS = {
-    "int": ("a whole number", "a whole number such as `3` or `-2`"),
+    "int": ("an integer", "an integer such as `3` or `-2`"),
     "flag": ("a flag", "`yes` or `no`"),
     "element": ("an element", "an element's name"),
     "direction": ("a direction", "a neighbor such as `left` or `above.right`"),

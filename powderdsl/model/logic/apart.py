@@ -12,7 +12,7 @@ GLANCE = 3
 
 
 class Glances:
-    """What conditions of a moment's rules ask of single variables: elements, fields and counts at places."""
+    """What conditions of a substep's rules ask of single variables: elements, fields and counts at places."""
 
     def __init__(self, masks: Sequence[Expr], facts: Facts, lets: dict[str, Expr]):
         self._facts = facts

@@ -27,7 +27,7 @@ HERE: Offset = (0, 0)
 ASSIGN = "two rules may assign"
 
 ALL_MOMENTS = 3
-"""Work for the conflicts of all moments together, as a multiple of that for one."""
+"""Work for the conflicts of all substeps together, as a multiple of that for one."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def claim(span: Span) -> Span:
 
 @dataclass
 class _Found:
-    """A conflict as it was met first, with an example, and where it was met: passes and moments by number."""
+    """A conflict as it was met first, with an example, and where it was met: passes and substeps by number."""
 
     example: dict[Offset, int]
     labels: list[str]
@@ -195,10 +195,10 @@ def _either(first: bool | None, second: bool | None) -> bool | None:
 
 
 def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
-    """Report moments whose rules take too much work to compare. Work is counted: the same rules always take the same.
+    """Report substeps whose rules take too much work to compare. Work is counted: the same rules always take the same.
 
     Args:
-        work: for each moment the work that was spent, the number of its rules, and its pass.
+        work: for each substep the work that was spent, the number of its rules, and its pass.
     """
     hard = {pass_.name: (count, pass_) for spent, count, pass_ in work if spent > BUDGET}
     together = sum(spent for spent, _, _ in work) > ALL_MOMENTS * BUDGET
@@ -234,7 +234,7 @@ def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool | None:
 def _check_moment(
     rules: list[Rule], facts: Facts, lets: dict[str, Expr]
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
-    """The conflicts of one moment, with an example: for each rule the first one, maybe itself, that it meets."""
+    """The conflicts of one substep, with an example: for each rule the first one, maybe itself, that it meets."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
     glances = Glances([rule.mask for rule in movers], facts, lets)
     for i, second in enumerate(movers):
@@ -299,7 +299,7 @@ def _check_assigns(
             question = ((first, HERE), (second, shift))
             answer = decide(facts, question, lets)
             if answer is not False and not facts.budget.is_exhausted:
-                message = f"{ASSIGN} `{a.field}` of one cell in the same moment"
+                message = f"{ASSIGN} `{a.field}` of one cell in the same substep"
                 conflict = Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
                 if answer:
                     yield conflict, example(facts, question, lets)
@@ -358,7 +358,7 @@ _EXCLUDE = "make their conditions exclude each other, or put one under `then:`"
 
 def _conflict(first: Rule, second: Rule) -> Conflict:
     if first is second or first.span == second.span:
-        note = "the moves of one moment happen at once: no cell may take part in two of them"
+        note = "the moves of one substep happen at once: no cell may take part in two of them"
         helps = (
             "add a condition that a target cannot fulfill, such as a comparison of densities",
             "or choose what happens then: `conflicts: drop_both`",
@@ -367,7 +367,7 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
             "PD501", "a cell may be both mover and target", first.span, first.span, (note,), helps
         )
     movement = isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move))
-    message = "two rules may claim one cell in the same moment"
+    message = "two rules may claim one cell in the same substep"
     choice = "or choose what happens then: `conflicts: first_wins` or `conflicts: drop_both`"
     return Conflict(
         "PD501" if movement else "PD502", message, first.span, second.span, (), (_EXCLUDE, choice)

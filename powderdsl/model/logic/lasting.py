@@ -1,4 +1,4 @@
-"""What a value under `let` still says after later moments have changed the world: what it asks of rows, columns, the step."""
+"""What a value under `let` still says after later substeps have changed the world: what it asks of rows, columns, the step."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def _arrives(
 
 
 def _brought(moment: Moment) -> Iterator[tuple[Expr, Expr]]:
-    """What the rules of a moment may bring into some cell, with the condition under which they do."""
+    """What the rules of a substep may bring into some cell, with the condition under which they do."""
     for rule in moment.rules:
         if isinstance(rule, Transform):
             yield rule.mask, rule.target

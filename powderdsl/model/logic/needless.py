@@ -23,7 +23,7 @@ BUDGET = 100_000
 """Nodes evaluated for these warnings: a quarter of a second. After that nothing more is found, and a note says so."""
 
 GLANCES = 10
-"""Rules of a moment that are looked at for the work of one node."""
+"""Rules of a substep that are looked at for the work of one node."""
 
 SILENT = ("PD503", "PD506", "PD509")
 """Who reads that a rule never happens does not want to read why twice."""
@@ -84,7 +84,7 @@ def _parts(rule: Rule) -> Iterator[Expr]:
 
 
 def decided(node: Expr) -> bool | None:
-    """What a comparison of whole numbers comes to by their ranges alone; None if it depends on the world."""
+    """What a comparison of integers comes to by their ranges alone; None if it depends on the world."""
     a, b = node.args
     if a.kind.name != "int" or b.kind.name != "int" or a.op == b.op == "const":
         return None
@@ -151,7 +151,7 @@ def _report_overruled(
 
 
 def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: dict[str, Expr]) -> Rule | None:
-    """One of the rules of a moment that never leave anything to this one; None if it matters. Raises Exhausted."""
+    """One of the rules of a substep that never leave anything to this one; None if it matters. Raises Exhausted."""
     if rule.mask is None:
         return None
     facts.budget.spend(len(moment.rules) // GLANCES)
@@ -163,7 +163,7 @@ def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: dict
 
 
 def _rivals(rule: Rule, place: int, moment: Moment) -> Iterator[Rule]:
-    """The rules of a moment that keep this one from having an effect where they happen."""
+    """The rules of a substep that keep this one from having an effect where they happen."""
     if isinstance(rule, Assign):
         for other in moment.rules[place + 1 :]:
             if not isinstance(other, Assign) or other.op != ":=" or other.span == rule.span:
@@ -241,7 +241,7 @@ def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> bool:
 
 @dataclass
 class _Reads:
-    """Where expressions read a property. `many`: also of cells whose places or moments are not told apart."""
+    """Where expressions read a property. `many`: also of cells whose places or substeps are not told apart."""
 
     name: str
     lets: dict[str, Expr]

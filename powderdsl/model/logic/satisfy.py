@@ -75,7 +75,7 @@ class Search:
         self._opened: dict[str, tuple[Expr, int]] = {}
 
     def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
-        """Add a condition; conjunctions are split, lets of this moment are looked through."""
+        """Add a condition; conjunctions are split, lets of this substep are looked through."""
         self._split(self._resolve(condition)[0], at)
 
     def _split(self, condition: Expr, at: Offset) -> None:
@@ -88,7 +88,7 @@ class Search:
             self.conditions.append((condition, at))
 
     def _resolve(self, expr: Expr) -> tuple[Expr, int]:
-        """The expression with this moment's lets looked through, and how many nodes it has then."""
+        """The expression with this substep's lets looked through, and how many nodes it has then."""
         if expr.op == "let" and expr.value in self.lets:
             name = str(expr.value)
             if name not in self._opened:

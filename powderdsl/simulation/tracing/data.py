@@ -14,7 +14,7 @@ SCHEMA = 1
 
 
 def trace_data(trace: Trace) -> dict[str, Any]:
-    """Rows and columns count from 0, steps, lines, columns of text, rules and moments from 1."""
+    """Rows and columns count from 0, steps, lines, columns of text, rules and substeps from 1."""
     return {
         "schema": SCHEMA,
         "ruleset": trace.ruleset.name,

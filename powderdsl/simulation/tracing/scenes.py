@@ -1,4 +1,4 @@
-"""One step of one world on the reference interpreter, moment by moment, with everything a moment read and left."""
+"""One step of one world on the reference interpreter, substep by substep, with everything a substep read and left."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PARAMS = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.f
 
 @dataclass(frozen=True)
 class Scene:
-    """A moment of the step: what it found and left, and its rules. Arrays have a batch of one."""
+    """A substep of the step: what it found and left, and its rules. Arrays have a batch of one."""
 
     ruleset: Ruleset
     pass_: Pass
@@ -54,9 +54,9 @@ class Scene:
 
 @dataclass
 class Step:
-    """The moments of a step in order, the state that it began with, and the one that it left.
+    """The substeps of a step in order, the state that it began with, and the one that it left.
 
-    States are the reference's: whole numbers int64, reals float32, [1, H, W] or [1, 2, H, W].
+    States are the reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
     """
 
     ruleset: Ruleset
@@ -117,7 +117,7 @@ def _widened(state: reference.State, table: dict[str, Slot]) -> reference.State:
 
 
 def _rules_by_moment(ruleset: Ruleset) -> Iterator[tuple[NumberedRule, ...]]:
-    """The numbered rules of each moment, in the order in which moments run."""
+    """The numbered rules of each substep, in the order in which substeps run."""
     rules = iter(numbered_rules(ruleset))
     for pass_ in ruleset.passes:
         for moment in pass_.moments:

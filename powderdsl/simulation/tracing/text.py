@@ -41,7 +41,7 @@ def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -
 
 
 def _event(cause: Cause) -> tuple[int, int, object]:
-    """What the writes of one rule in one moment have in common."""
+    """What the writes of one rule in one substep have in common."""
     write = cause.write
     return (
         id(write.scene),
@@ -122,7 +122,7 @@ def _miss(trace: Trace, miss: Miss, color: bool) -> str:
 def _rule_note(rule: NumberedRule, asked: Cell | None, cell: Cell) -> str:
     label = f" ({rule.label})" if rule.label else ""
     where = f", asked at {at(asked)}" if asked not in (None, cell) else ""
-    return f"pass {rule.pass_name} of {rule.pack}, moment {rule.moment + 1}{label}{where}"
+    return f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment + 1}{label}{where}"
 
 
 def _part_text(part: Part, asked: Cell | None) -> str:

@@ -20,7 +20,7 @@ HOW = {
     "leave": "the element moved away; this is what it left",
     "arrive": "what stood in another cell came here",
     "limit": "no rule: cells of this element keep the field's default",
-    "settle": "no rule: at the end of a pass reals are cut off at their bounds, and tiny ones are zero",
+    "settle": "no rule: at the end of a pass floats are cut off at their bounds, and tiny ones are zero",
     "reset": "no rule: the field starts each step at its default",
 }
 """The kinds of writes. The last three have no rule."""
@@ -31,7 +31,7 @@ class Write:
     """One write to one slot of the cell. Values are NumPy numbers, or two of a vector.
 
     `cell` is where the rule's condition held; `source` is where content came from that moved here. `scene` is the
-    moment; None before the first one.
+    substep; None before the first one.
     """
 
     slot: Slot
@@ -72,14 +72,14 @@ def writes_of(step: Step, cell: Cell) -> list[Write]:
 def _differences(
     scene: Scene | None, table: dict[str, Slot], held: dict[str, Any], now: Any, cell: Cell, how: str
 ) -> Iterator[Write]:
-    """What changed without a rule between two moments."""
+    """What changed without a rule between two substeps."""
     for name, array in now.items():
         if name in held and not np.array_equal(held[name], pick(array, cell)):
             yield Write(table[name], held[name], pick(array, cell), how, scene)
 
 
 def _moment(scene: Scene, cell: Cell, held: dict[str, Any]) -> Iterator[Write]:
-    """The writes of a moment; `held` becomes what it leaves. The order is that of `model.reference.run_moment`."""
+    """The writes of a substep; `held` becomes what it leaves. The order is that of `model.reference.run_moment`."""
     claims = [rule for rule in scene.rules if not isinstance(rule.rule, Assign)]
 
     def put(name: str, value: Any, how: str, rule: NumberedRule | None, *places: Cell | None) -> Write:
@@ -159,7 +159,7 @@ def _assigned_value(scene: Scene, write: Assign, anchor: Cell, old: Any) -> Any:
 
 
 def _after_assignments(scene: Scene, cell: Cell) -> dict[str, Any]:
-    """What a cell holds once the moment's assignments are done: that is what moves."""
+    """What a cell holds once the substep's assignments are done: that is what moves."""
     held = {name: pick(array, cell) for name, array in scene.at.state.items()}
     for rule in scene.moment.rules:
         if isinstance(rule, Assign):

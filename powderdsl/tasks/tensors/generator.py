@@ -107,7 +107,7 @@ class _Draws:
         self.used = 0
 
     def uniform(self, low: Tensor | int, high: Tensor | int) -> Tensor:
-        """Whole numbers from `low` to `high`, both included; where there are none, `low`."""
+        """Integers from `low` to `high`, both included; where there are none, `low`."""
         if self.drawn is None:
             self.drawn = self.hashes.block(self.statement, self.repeats).unbind(-1)
         drawn = self.drawn[self.used]

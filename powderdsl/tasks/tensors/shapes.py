@@ -1,4 +1,4 @@
-"""Shapes of a whole batch at once: in each column a shape covers one run of rows, which whole numbers give.
+"""Shapes of a whole batch at once: in each column a shape covers one run of rows, which integers give.
 
 `worlds.raster` says what shapes cover; these are the same cells.
 """
@@ -118,7 +118,7 @@ def _wave(column: Tensor, n: list[Tensor], size: Size) -> Rows:
 
 
 def root(x: Tensor) -> Tensor:
-    """The whole part of the square root of whole numbers from 0 to 2⁵²."""
+    """The whole part of the square root of integers from 0 to 2⁵²."""
     found = x.double().sqrt().long()
     found = found - (found * found > x).long()
     return found + ((found + 1) ** 2 <= x).long()

@@ -2,7 +2,7 @@
 
 Nodes of one graph that look alike are one object. Others are compared part by part, and where that does not do, by
 trying everything that the cells around can hold: each input at each place is a variable, and so is whatever cannot be
-enumerated, such as a comparison of real numbers. Variables that a small world makes equal, because its grid wraps, are
+enumerated, such as a comparison of floats. Variables that a small world makes equal, because its grid wraps, are
 tried as if they were free, so that equality here is equality everywhere.
 """
 
@@ -153,7 +153,7 @@ def _reads(node: Node, at: Offset) -> list[tuple[Node, Offset]]:
 
 
 def _is_free(node: Node) -> bool:
-    """Whether a node that is not a real number is a variable of its own: it depends on some, or on a parameter."""
+    """Whether a node that is not a float is a variable of its own: it depends on some, or on a parameter."""
     if node.op in ("param", "inside", "draw", "sqrt"):
         return node.op != "inside"
     if node.op == "below":
@@ -403,4 +403,4 @@ _EVALUATE: dict[str, Callable[..., Any]] = {
     ),
     "arrive": lambda node, cases, at, target, back, rest: np.where(target != 0, back, rest),
 }
-"""Exact evaluation of the operations on whole numbers and flags."""
+"""Exact evaluation of the operations on integers and flags."""

@@ -1,4 +1,4 @@
-"""Proves that a mutant means the same as the original: pass by pass, and moment by moment."""
+"""Proves that a mutant means the same as the original: pass by pass, and substep by substep."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _cells(ruleset: Ruleset) -> Cells:
 
 
 def _same_pass(first: Ruleset, one: Pass, second: Ruleset, other: Pass, cells: Cells) -> bool:
-    """Moment by moment, each from whatever the one before may have left; if that does not do, as a whole."""
+    """Moment by substep, each from whatever the one before may have left; if that does not do, as a whole."""
     if one.scratch != other.scratch:
         return False
     numbers = range(len(one.moments))

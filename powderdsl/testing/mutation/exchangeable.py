@@ -20,7 +20,7 @@ class Names:
     kinds: dict[str, str]
     own: frozenset[str]
     ranges: dict[str, tuple[int, int]]
-    """Bounds of properties that are whole numbers."""
+    """Bounds of properties that are integers."""
     flags: frozenset[str]
     """Properties that are flags."""
     local: dict[str, str] = field(default_factory=dict)

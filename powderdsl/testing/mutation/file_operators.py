@@ -314,7 +314,7 @@ class _FileChanges:
             yield Change("order", tuple(Edit(at.start, at.end, f"do: {words}") for at, words in blocks))
 
     def _merged(self, node: Mapping) -> Iterator[Change]:
-        """`do` and `then` at once: one moment where there were two."""
+        """`do` and `then` at once: one substep where there were two."""
         entries = {key.text: (key, value) for key, value in node.entries}
         _, first = entries["do"]
         key, second = entries["then"]

@@ -97,7 +97,7 @@ def described(grid: FieldGrid, world: World, place: Place) -> str:
 
 
 def field_rows(name: str, world: World, index: int) -> tuple[str, ...]:
-    """A field of one world as tests draw it: rows of words, in columns. Real numbers with all their digits."""
+    """A field of one world as tests draw it: rows of words, in columns. Floats with all their digits."""
     kind = next(slot.kind for slot in world.sim.slots if slot.name == name)
     values = to_numpy(world.state[name])[index]
     height, width = values.shape[-2:]

@@ -1,4 +1,4 @@
-"""Which rule broke a claim: the last step is run by the oracle, pass by pass and moment by moment."""
+"""Which rule broke a claim: the last step is run by the oracle, pass by pass and substep by substep."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def culprits(claim: Tested, ruleset: Ruleset, sample: Sample, steps: int) -> tup
 
 
 def _turning(passes: tuple[Pass, ...], broken) -> Iterator[tuple[Pass, ...]]:  # type: ignore[no-untyped-def]
-    """The beginnings of the step, each up to a moment, after which the claim is broken and was not before; last first."""
+    """The beginnings of the step, each up to a substep, after which the claim is broken and was not before; last first."""
     was = [broken(passes[:count]) for count in range(len(passes) + 1)]
     for count in range(len(passes), 0, -1):
         if not was[count] or was[count - 1]:

@@ -1,4 +1,4 @@
-"""Whole numbers in statements: written out, named, drawn (`a..b`), and arithmetic on them."""
+"""Integers in statements: written out, named, drawn (`a..b`), and arithmetic on them."""
 
 from __future__ import annotations
 

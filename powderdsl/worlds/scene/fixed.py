@@ -1,4 +1,4 @@
-"""Statements without names and draws: shapes of whole numbers, as scenes have them."""
+"""Statements without names and draws: shapes of integers, as scenes have them."""
 
 from __future__ import annotations
 

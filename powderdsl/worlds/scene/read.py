@@ -147,7 +147,7 @@ def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
             "PD607",
             "a size is [rows, columns]",
             first_line(node),
-            "not two whole numbers",
+            "not two integers",
             helps=["size: [64, 64]"],
         )
         return None

@@ -318,8 +318,8 @@ class _Reading:
                     self._refuse(span, "a range without numbers", "the first must not be above the second")
             return Amount(op, args, None, span)
         if not re.fullmatch(r"[0-9]{1,9}", token):
-            message = f"{what} must be a whole number"
-            label = "not a whole number" if not token.isdecimal() or not token.isascii() else "too large"
+            message = f"{what} must be an integer"
+            label = "not an integer" if not token.isdecimal() or not token.isascii() else "too large"
             self._refuse(span, message, label)
             return number(instead, span)
         return number(int(token), span)
