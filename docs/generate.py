@@ -2,7 +2,7 @@
 
 `python docs/generate.py` writes them, `--check` names the pages that are stale.
 
-A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is between them is written anew.
+A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is between them is rewritten.
 """
 
 from __future__ import annotations
@@ -301,7 +301,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def generated(markdown: str) -> str:
-    """A page with all its tables written anew. Raises KeyError for a table that does not exist."""
+    """A page with all its tables rewritten. Raises KeyError for a table that does not exist."""
     return MARKED.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], markdown)
 
 

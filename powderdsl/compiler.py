@@ -1,6 +1,6 @@
 """The sequence: text → located tree → checked model → IR → passes → program. Each stage takes one value and gives one.
 
-`load` stops at the checked model, `lower` at optimized IR; neither needs torch. `simulation.simulator.compile` goes on from there.
+`load` stops at the checked model, `lower` at optimized IR; neither needs torch. `simulation.simulator.compile` continues from there.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--update-golden", action="store_true", help="write golden files anew instead of comparing with them"
+        "--update-golden", action="store_true", help="write golden files again instead of comparing with them"
     )
     parser.addoption(
         "--campaigns", action="store_true", help="also run the long tests, which are marked `campaign`"

@@ -39,7 +39,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
 MANY_STEPS = 4
-"""Commands that run longer are cut to this many steps: what they print does not hang on it."""
+"""Commands that run longer are cut to this many steps: what they print does not depend on it."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def run_yaml(block: Block) -> None:
     path = Path(f"{name[1]}.yaml")
     path.write_text(text, encoding="utf-8")
     ruleset, found = diagnosed(*filter(None, [packs]), path)
-    # What others' files are told, such as tags that nothing has, hangs on which packs the example needs.
+    # What others' files are told, such as tags that nothing has, depends on which packs the example needs.
     own = [one for one in found if one.primary.span is None or one.primary.span.source.name == str(path)]
     for severity in Severity:
         codes = sorted({one.code for one in own if one.severity is severity})

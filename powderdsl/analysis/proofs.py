@@ -95,7 +95,7 @@ def _bounded(claim: Bounded, ruleset: Ruleset, ledger: Ledger) -> Verdict:
 def horizon(ruleset: Ruleset) -> int:
     """What a cell holds after a step depends on cells at most so many rows and columns away: an upper bound.
 
-    Each substep sees what the substeps before it saw around each cell that it reads. `step` and `row` are no cells.
+    Each substep sees what the substeps before it saw around each cell that it reads. `step` and `row` are not cells.
     """
     seen = 0
     for pass_ in ruleset.passes:

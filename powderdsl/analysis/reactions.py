@@ -103,7 +103,7 @@ def moved_ids(ruleset: Ruleset) -> frozenset[int]:
 
 
 def unchanging_ids(ruleset: Ruleset) -> frozenset[int]:
-    """The elements that no rule moves or turns into anything: what stands, stands for good."""
+    """The elements that no rule moves or turns into anything: what stands, stands permanently."""
     changed = {number for reaction in reactions(ruleset) for number in reaction.before}
     everything = frozenset(element.id for element in ruleset.elements)
     return everything - moved_ids(ruleset) - changed

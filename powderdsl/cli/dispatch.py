@@ -24,7 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "trace": ("trace", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
     "record": ("record", "Record episodes of a task: data for offline learning and world models."),
     "bench": ("bench", "Measure how fast rules run, on each backend, batch and size."),
-    "train": ("train", "Train an agent on a task; go on where it was interrupted."),
+    "train": ("train", "Train an agent on a task; continue where it was interrupted."),
     "evaluate": ("evaluate", "Compare an agent with acting at random, and with doing nothing."),
     "watch": ("watch", "Make a film of an agent at its task."),
     "wm": ("wm", "World models: train networks that predict worlds, test them, teach them packs."),
@@ -32,7 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "cache": ("cache", "List or remove compiled code that is kept on this machine."),
     "new": ("new", "Write a first pack: an element, a rule and a test."),
     "render": ("render", "Draw a world as a picture, without running it."),
-    "explain": ("explain", "Say what a diagnostic code means, and how to mend it."),
+    "explain": ("explain", "Say what a diagnostic code means, and how to fix it."),
 }
 
 

@@ -60,7 +60,7 @@ class WholeType(click.ParamType):
         if isinstance(value, int):
             return value
         if not re.fullmatch(r"[0-9]{1,20}", str(value)) or not self.low <= int(value) <= self.high:
-            self.fail(f"`{value}` is no integer from {self.low} to {self.high}", param, ctx)
+            self.fail(f"`{value}` is not an integer from {self.low} to {self.high}", param, ctx)
         return int(value)
 
 
@@ -93,7 +93,7 @@ class SizeType(click.ParamType):
             return value
         match = re.fullmatch(r"([0-9]{1,8})(?:[xX×]([0-9]{1,8}))?", str(value))
         if match is None:
-            self.fail(f"`{value}` is no size: write ROWSxCOLUMNS, such as 48x64", param, ctx)
+            self.fail(f"`{value}` is not a size: write ROWSxCOLUMNS, such as 48x64", param, ctx)
         rows, columns = int(match[1]), int(match[2] or match[1])
         if not (1 <= rows <= MAX_SIDE and 1 <= columns <= MAX_SIDE):
             self.fail(f"`{value}`: a world has at least one row and one column", param, ctx)

@@ -29,7 +29,7 @@ def progress(title: str, total: float | None = None, *, lines: bool = False) -> 
 
     Args:
         total: what `done` will be at the end. Without it the bar only says that something happens, and for how long.
-        lines: where stderr is no terminal, write a line every `SECONDS`; otherwise nothing.
+        lines: where stderr is not a terminal, write a line every `SECONDS`; otherwise nothing.
     """
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         yield _lines(total) if lines else _silent

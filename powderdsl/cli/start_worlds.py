@@ -1,4 +1,4 @@
-"""Where a run starts: a saved world, a picture, a drawing, a scene, or shapes strewn at random."""
+"""Where a run starts: a saved world, a picture, a drawing, a scene, or shapes scattered at random."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def start_drawn(
 ) -> Drawn | None:
     """What a run starts from, or None for a saved world, which has everything.
 
-    A saved world goes on as it was saved, random future included, so `size`, `batch` and `seed` do not go
-    with it. A drawn world stands `batch` times. Without a name every world is strewn by itself.
+    A saved world continues as it was saved, random future included, so `size`, `batch` and `seed` do not go
+    with it. A drawn world stands `batch` times. Without a name every world is scattered by itself.
 
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
     """

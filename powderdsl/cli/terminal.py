@@ -52,7 +52,7 @@ class LiveView:
         with LiveView(rules.elements) as view:
             view.show(ids, caption="step 12")
 
-    Where the output is no terminal, frames follow one another as plain text. With NO_COLOR set
+    Where the output is not a terminal, frames follow one another as plain text. With NO_COLOR set
     (https://no-color.org) or an encoding without half blocks, glyphs are redrawn in place. Worlds that do not
     fit are thinned out.
     """

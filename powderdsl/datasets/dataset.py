@@ -174,7 +174,7 @@ class Dataset:
     ) -> Iterator[Batch]:
         """Endless minibatches of `batch` transitions, all equally likely, drawn with replacement.
 
-        Minibatch n hangs on `seed` and n alone. `start` is the first one's number, to go on where one stopped.
+        Minibatch n depends on `seed` and n alone. `start` is the first one's number, to continue where one stopped.
         """
         _check_draw(batch, seed, start)
         return self._batches(1, self._ends, batch, seed, device, start, lambda found: found[:, 0])

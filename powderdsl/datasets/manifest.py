@@ -130,11 +130,11 @@ def read_manifest(folder: Path) -> Manifest:
         check_links(folder)
     except OSError as error:
         name = Path(error.filename or path).name
-        raise damaged(f"{folder} is no dataset", f"{name}: {error.strerror or error}") from None
+        raise damaged(f"{folder} is not a dataset", f"{name}: {error.strerror or error}") from None
     except ValueError as error:  # also of a NUL in the name
-        raise damaged(f"{path} is no manifest", " ".join(str(error).split())) from None
+        raise damaged(f"{path} is not a manifest", " ".join(str(error).split())) from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise damaged(f"{path} is no manifest", f'it lacks "format": "{FORMAT}"')
+        raise damaged(f"{path} is not a manifest", f'it lacks "format": "{FORMAT}"')
     if data.get("version") not in (1, VERSION):
         raise damaged(
             f"{path} has the version {_short(data.get('version'))}", f"this powderdsl reads {VERSION}"
@@ -173,7 +173,9 @@ def check_place(folder: Path) -> None:
         return
     found = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     if found and FILE not in found:
-        raise damaged(f"{folder} is no dataset", f"it holds {found[0]} and no {FILE}", "take an empty folder")
+        raise damaged(
+            f"{folder} is not a dataset", f"it holds {found[0]} and no {FILE}", "take an empty folder"
+        )
 
 
 def damaged(message: str, reason: str, *helps: str) -> CompileError:
@@ -262,9 +264,7 @@ _TOP = {
 _RECIPE: dict[str, _Rule] = {
     "task": _TEXT,
     "split": _TEXT,
-    "knobs": _Rule(
-        "a mapping to integers", _mapping_of(lambda one: _is_whole(one, -(1 << 31), 1 << 31))
-    ),
+    "knobs": _Rule("a mapping to integers", _mapping_of(lambda one: _is_whole(one, -(1 << 31), 1 << 31))),
     "params": _Rule("a mapping to numbers", _mapping_of(_NUMBER.holds)),
     "task_fingerprint": _DIGEST,
     "ruleset": _TEXT,

@@ -18,7 +18,7 @@ USUAL_SHARD_BYTES = 1 << 28
 
 
 def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
-    """Raises ValueError if a value is no integer from `least` to `most`."""
+    """Raises ValueError if a value is not an integer from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         raise ValueError(f"{name} must be an integer from {least} to {most}, found {value!r}")
 

@@ -63,7 +63,7 @@ def record(
     """Play whole episodes and write them to a folder.
 
     Episode e plays world (`seed` + e) mod `worlds` of the split. A folder that has some of the shards already is
-    completed; a shard that is damaged is recorded anew.
+    completed; a shard that is damaged is recorded again.
 
     Args:
         policy: a name of `SCRIPTED`, or a function from observations and keys to actions: see `envs.acting.Policy`.
@@ -124,7 +124,7 @@ def _held(folder: Path) -> Iterator[None]:
 
 
 def _begun(folder: Path, recipe: Recipe) -> Manifest:
-    """The manifest to go on with: a new one, or that of the same recipe with the shards that are whole."""
+    """The manifest to continue with: a new one, or that of the same recipe with the shards that are whole."""
     for left in sorted([*folder.glob(".shard-*.npz"), *folder.glob(".dataset-*.json")]):
         left.unlink(missing_ok=True)  # of a process that was killed
     if not (folder / FILE).exists():

@@ -142,7 +142,7 @@ class _Wrong(Exception):
 
 
 def _bad_shard(path: Path, reason: str) -> Exception:
-    return damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it anew")
+    return damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it again")
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]]) -> Shard:

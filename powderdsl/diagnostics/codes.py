@@ -16,7 +16,7 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Code:
-    """A row: the code, its slug (names the fault, not the cure), how severe it is."""
+    """A row: the code, its slug (names the fault, not the fix), how severe it is."""
 
     code: str
     slug: str

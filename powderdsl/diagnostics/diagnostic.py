@@ -18,7 +18,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """One mistake (or remark): a code of the table, the place, what is wrong, and how to mend it."""
+    """One mistake (or remark): a code of the table, the place, what is wrong, and how to fix it."""
 
     code: str
     message: str

@@ -1,4 +1,4 @@
-"""Pages that explain a diagnostic code: what it means, an example, the cure. One Markdown file a code."""
+"""Pages that explain a diagnostic code: what it means, an example, the fix. One Markdown file a code."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from powderdsl.system.random import MASK, mix
 
 Policy = Callable[[Tensor, Tensor], Tensor]
-"""From observations [B, …] and keys, int64 [B], to actions int64 [B, 5]. Keys are what random numbers hang on."""
+"""From observations [B, …] and keys, int64 [B], to actions int64 [B, 5]. Keys are what random numbers depend on."""
 
 
 def uniforms(keys: Tensor, count: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Batches of episodes that start anew by themselves: torch in, torch out, on the simulator's device."""
+"""Batches of episodes that restart by themselves: torch in, torch out, on the simulator's device."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def world_seeds(base: Tensor, episode: Tensor, worlds: int) -> Tensor:
     """Which world each slot plays: int64 [B].
 
     Episode 0 of a slot whose seed is `base` plays world `base`. Later ones play worlds below `worlds`, drawn by a hash
-    of `base` and `episode` (both int64 [B]), so that no slot hangs on what happens in others.
+    of `base` and `episode` (both int64 [B]), so that no slot depends on what happens in others.
     """
     key = mix(mix(base & MASK) ^ ((base >> 32) & MASK))
     high, low = mix((key + episode) & MASK), mix((key ^ mix(episode & MASK)) & MASK)
@@ -45,13 +45,13 @@ class TensorEnv:
             a program has its split, knobs, parameters, backend and device already.
         split: which worlds: ``train``, ``test``, or another of the task's.
         observation: a kind of `observations.KINDS`.
-        knobs: values for the task's knobs. params: for parameters of its rules, for good; `reset` sets them for a while.
+        knobs: values for the task's knobs. params: for parameters of its rules, permanently; `reset` sets them for a while.
         worlds: how many worlds there are to draw from: numbers 0 … worlds − 1 of the split.
         autoreset_mode: what happens after an episode's last step, as Gymnasium defines it: ``SAME_STEP`` returns the
             next episode's first observation, and the last one in the infos; ``NEXT_STEP`` starts it with the following
             call, whose action is ignored; ``DISABLED`` leaves it to `reset`.
         last_action: what running out of actions is: it ``truncates``, or ``terminates``. ``auto``: it terminates where
-            the task has a `final` reward, which has then been given, and truncates where rewards would go on.
+            the task has a `final` reward, which has then been given, and truncates where rewards would continue.
         max_episode_steps: truncates earlier than the task does.
         backend, device, threads: those of `powderdsl.compile`.
 
@@ -119,12 +119,12 @@ class TensorEnv:
         """Begin all episodes, or those of a mask.
 
         Args:
-            seed: s gives slot i the seed s + i; a list gives one each, None to go on as without. A seed decides the
-                worlds of this and all later episodes of a slot: see `world_seeds`. Without one, every slot goes on
+            seed: s gives slot i the seed s + i; a list gives one each, None to continue as without. A seed decides the
+                worlds of this and all later episodes of a slot: see `world_seeds`. Without one, every slot continues
                 with its next episode.
             options: ``params``: parameters of the rules from now on, a number each or [B]; they stay until others are
                 given, ``{}`` brings back the defaults. ``worlds``: which worlds to play in these episodes, a number
-                or [B]. ``reset_mask``: bool [B], which slots; the others go on where they were.
+                or [B]. ``reset_mask``: bool [B], which slots; the others continue where they were.
 
         Returns:
             observations [B, …], and infos: ``world``, int64 [B], which worlds they play.
@@ -224,7 +224,7 @@ class TensorEnv:
     # Saving
 
     def state(self) -> dict[str, Any]:
-        """All that decides how things go on, as dicts of tensors on the CPU: worlds, seeds, episodes, returns, parameters.
+        """All that decides how things continue, as dicts of tensors on the CPU: worlds, seeds, episodes, returns, parameters.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -244,7 +244,7 @@ class TensorEnv:
         }
 
     def restore(self, state: Mapping[str, Any]) -> Tensor:
-        """Go on from what `state` gave, in another process, or on another backend or device.
+        """Continue from what `state` gave, in another process, or on another backend or device.
 
         Returns:
             the observations there, [B, …].

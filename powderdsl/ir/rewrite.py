@@ -22,7 +22,7 @@ def rewrite_pass(pass_: PassGraph, rules: Sequence[Rewrite]) -> PassGraph:
     done: dict[int, Node] = {}
 
     def rewritten(node: Node) -> Node:
-        """A node whose arguments are final; what a rule makes anew is finished the same way."""
+        """A node whose arguments are final; what a rule makes again is finished the same way."""
         for _ in range(MAX_ROUNDS):
             for rule in rules:
                 found = rule(node, build)
@@ -97,7 +97,7 @@ def _copy(node: Node, done: dict[int, Node], build: Builder, finish: Callable[[N
 
 
 def rebuild(node: Node, args: tuple[Node, ...], build: Builder) -> Node:
-    """The same operation on other arguments; ranges are derived anew where they follow from the arguments."""
+    """The same operation on other arguments; ranges are derived again where they follow from the arguments."""
     match node.op:
         case "add" | "sub" | "mul" | "min" | "max":
             return build.arithmetic(node.op, *args)

@@ -1,6 +1,6 @@
 """A program in consecutive parts, each in one form: bit planes, or one value a cell where planes cannot carry a pass.
 
-Random numbers hang on streams, cells and steps, never on the pass that reads them: parts draw what the whole drew.
+Random numbers depend on streams, cells and steps, never on the pass that reads them: parts draw what the whole drew.
 """
 
 from __future__ import annotations

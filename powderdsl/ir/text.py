@@ -20,7 +20,7 @@ def print_program(program: Program, only: str | None = None) -> str:
 
 
 def print_pass(pass_: PassGraph) -> str:
-    """One pass. Numbers are given in order of use, so that they do not hang on what was built and dropped."""
+    """One pass. Numbers are given in order of use, so that they do not depend on what was built and dropped."""
     names: dict[int, str] = {}
     lines = [f"pass {pass_.name}"]
 
@@ -40,7 +40,7 @@ def print_pass(pass_: PassGraph) -> str:
 
     for number, step in enumerate(pass_.moments):
         label = f" ({step.label})" if step.label else ""
-        lines.append(f"  moment {number}{label}" + (f"  # {step.place}" if step.place else ""))
+        lines.append(f"  substep {number}{label}" + (f"  # {step.place}" if step.place else ""))
         for slot, node in step.writes:
             reference = show(node)
             lines.append(f"    write {slot} = {reference}")

@@ -41,7 +41,7 @@ def _verify_pass(pass_: PassGraph, slots: dict, params: set[str], streams: set[t
             _demand(inside, f"{name} of {slots[name]} gets {node.type}")
     for step in pass_.moments:
         for guard in step.guards:
-            _demand(guard.type == FLAG, "a guard is no flag")
+            _demand(guard.type == FLAG, "a guard is not a flag")
 
 
 def _verify_node(node: Node) -> None:

@@ -188,8 +188,8 @@ def _shaped_kernels(symbols: Symbols, typer: Typer) -> None:
         try:
             found = typer.evaluate(shape, Scope(named.pack, {}))
             if not isinstance(found, Kernel):
-                cure = "such as `box(5)`, or rows of weights"
-                raise typer.wrong(found, "a shape with its radius", shape.span, cure)
+                fix = "such as `box(5)`, or rows of weights"
+                raise typer.wrong(found, "a shape with its radius", shape.span, fix)
             symbols.constants[name] = replace(found, name=name, wrap=named.decl.wrap)
         except (Poisoned, Asleep):
             symbols.constants.setdefault(name, Broken())

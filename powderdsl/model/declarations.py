@@ -138,7 +138,7 @@ class PackDecl:
 class RulesetDecl:
     """One ruleset file. `packs`, `slots`, `matrix`, `params` and `rename` are as written, without what it inherits.
 
-    `base` is the ruleset that it extends; `beside` are rulesets that were named before it, of which it is no part.
+    `base` is the ruleset that it extends; `beside` are rulesets that were named before it, of which it is not a part.
     """
 
     name: Scalar

@@ -434,12 +434,12 @@ class Elaborator:
         before = syntax.children[0]
         operand = self.typer.evaluate(before, scope)
         if isinstance(operand, SetOf):
-            cure = f"write `{syntax.text} := … where {before.span.text}`"
-            raise self.typer.wrong(operand, "a neighbor before the dot", before.span, cure)
+            fix = f"write `{syntax.text} := … where {before.span.text}`"
+            raise self.typer.wrong(operand, "a neighbor before the dot", before.span, fix)
         if isinstance(operand, Expr) and operand.kind.name == "vec2":
-            cure = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
+            fix = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
             raise self.typer.fail(
-                "PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", (cure,)
+                "PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", (fix,)
             )
         return self.typer.place(operand, before.span)
 
@@ -449,7 +449,7 @@ class Elaborator:
         if kind.name != "vec2":
             raise self.typer.fail(
                 "PD401",
-                f"`{name}` is no vector",
+                f"`{name}` is not a vector",
                 target.span,
                 f"this is a {kind}",
                 ("`push` works on vec2 fields",),

@@ -121,7 +121,7 @@ def _words(typer: Typer, words: tuple[Syntax, ...], wanted: tuple[tuple[str, ...
     for word, options in zip(words, wanted, strict=True):
         if word.text not in options:
             listed = " or ".join(f"`{option}`" for option in options)
-            close = [cure for cure in suggest(word.text, options) if cure.startswith("did")]
+            close = [fix for fix in suggest(word.text, options) if fix.startswith("did")]
             raise typer.fail(
                 "PD201", f"unexpected `{word.text}`", word.span, f"expected {listed}",
                 tuple(close) or _FORMS,
@@ -195,8 +195,8 @@ def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
     if call.text == "sum" and len(operands) == 1:
         value = typer.value(operands[0], call.children[0].span)
         if isinstance(value, Expr) and value.kind.name not in ("int", "flag"):
-            cure = "floats are rounded: their sums are constant for no rule"
-            raise typer.wrong(value, "an integer", call.children[0].span, cure)
+            fix = "floats are rounded: their sums are constant for no rule"
+            raise typer.wrong(value, "an integer", call.children[0].span, fix)
         if isinstance(value, Number):
             raise typer.wrong(value, "something that worlds have", call.children[0].span)
         return Total(value, trend, None)
@@ -221,7 +221,7 @@ def _never(typer: Typer, line: Syntax, scope: Scope) -> Claim:
 
 
 def _asked(typer: Typer, condition: Expr, span: Span) -> Expr:
-    """The condition, unless it is no question: it may hang on a pack that is not loaded, or be false by its words."""
+    """The condition, unless it is not a question: it may depend on a pack that is not loaded, or be false by its words."""
     if condition == FALSE and typer.absent:
         raise Asleep(", ".join(sorted(typer.absent)))
     if condition in (TRUE, FALSE):

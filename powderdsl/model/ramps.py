@@ -72,14 +72,14 @@ def _shows(field: Field, element: Element, decl: RampDecl, typer: Typer) -> bool
     """Whether cells of an element can differ in a field in an order; reports if not."""
     declared = (Label(field.span, "declared here"),)
     if field.kind.name not in ORDERED:
-        cure = (
+        fix = (
             f"declare a field for its length, `real(0..{field.kind.hi:g})`, and assign it in a pass"
             if field.kind.name == "vec2"
             else "a color follows numbers and flags: LOW..HIGH, real(LOW..HIGH), flag"
         )
         typer.reporter.error(
             "PD401", f"a color cannot follow a field of kind {field.kind}", decl.field.span, "its values have no order",
-            secondary=declared, helps=[cure],
+            secondary=declared, helps=[fix],
         )  # fmt: skip
         return False
     if field.of is not None and element.id not in field.of:

@@ -27,7 +27,7 @@ FAN = {
 
 @dataclass(frozen=True)
 class Clock:
-    """What the random numbers of a batch hang on: arrays [B] of seed (64 bits), world index and step."""
+    """What the random numbers of a batch depend on: arrays [B] of seed (64 bits), world index and step."""
 
     seed: Array
     index: Array
@@ -460,12 +460,12 @@ def step(
 
     Args:
         state: arrays by slot name in their storage dtypes (`model.state`); not changed.
-        clock: what the random numbers hang on.
+        clock: what the random numbers depend on.
         params: [B] arrays by qualified name.
         passes: names of the passes to run; all of them by default.
         draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
         lap: called with the name of each pass when it is done.
-        seen: called after each substep; it changes nothing and keeps copies of contexts, which go on changing.
+        seen: called after each substep; it changes nothing and keeps copies of contexts, which continue changing.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
     wide = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}

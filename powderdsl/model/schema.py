@@ -200,10 +200,10 @@ class Reader:
     def mapping(self, node: Node, context: str, what: str) -> dict[str, tuple[Scalar, Node]]:
         """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""
         if not isinstance(node, Mapping):
-            cure = "known keys: " + ", ".join(self.keys[context])
+            fix = "known keys: " + ", ".join(self.keys[context])
             if isinstance(node, Scalar) and node.text:
-                cure = "a key ends with `:`" if node.text.startswith(PREFIXES.get(context, ("\0",))) else cure
-            self.shape(node, f"a mapping with the keys of {what}", cure)
+                fix = "a key ends with `:`" if node.text.startswith(PREFIXES.get(context, ("\0",))) else fix
+            self.shape(node, f"a mapping with the keys of {what}", fix)
             return {}
         known = self.keys[context]
         missing = {name for name, row in known.items() if row.required and node.get(name) is None}
@@ -251,18 +251,18 @@ class Reader:
         if line.lstrip(": ").startswith("#"):
             start = key.span.end + line.index("#")
             comment = Span(key.span.source, start, key.span.end + len(line.rstrip()))
-            cure = f'put quotes around it: {key.text}: "{comment.text}"'
+            fix = f'put quotes around it: {key.text}: "{comment.text}"'
             self.reporter.error(
-                "PD109", f"`{key.text}` has no value", comment, "a comment, to YAML", helps=[cure]
+                "PD109", f"`{key.text}` has no value", comment, "a comment, to YAML", helps=[fix]
             )
             return
-        cure = f"`{key.text}`: {row.about}"
+        fix = f"`{key.text}`: {row.about}"
         self.reporter.error(
-            "PD109", f"`{key.text}` has no value", key.span, "nothing stands after it", helps=[cure]
+            "PD109", f"`{key.text}` has no value", key.span, "nothing stands after it", helps=[fix]
         )
 
     def _key_help(self, word: str, context: str, what: str) -> tuple[str, ...]:
-        """The cure for an unknown key: what it should be called, where it belongs, or that it is a rule."""
+        """The fix for an unknown key: what it should be called, where it belongs, or that it is a rule."""
         if any(sign in word for sign in ("->", ":=", " swaps ", " moves ", "swap ")):
             return ("YAML takes text before `: ` for a key: quote the rule",)
         if word in ("repeat", "for") and PREFIXES.get(context):
@@ -286,8 +286,8 @@ class Reader:
         wants_scalar = row.shape in ("text", "word", "number", "flag", "line")
         if wants_scalar and not isinstance(value, Scalar):
             is_set = row.shape == "line" and isinstance(value, Sequence)
-            cure = "a set is written `(a, b)`" if is_set else f"`{key.text}`: {row.about}"
-            self.shape(value, f"a single value for `{key.text}`", cure)
+            fix = "a set is written `(a, b)`" if is_set else f"`{key.text}`: {row.about}"
+            self.shape(value, f"a single value for `{key.text}`", fix)
 
     def named(self, node: Node | None, what: str) -> Iterator[tuple[Scalar, Node]]:
         """Entries of a mapping whose keys are new names; bad names are reported and left out."""

@@ -159,7 +159,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Property:
-    """A constant of each element; `stored` has the ids whose cells may override it one by one."""
+    """A constant of each element; `stored` has the ids whose cells may override it one at a time."""
 
     name: str
     kind: Kind
@@ -360,7 +360,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Unchanging:
-    """Cells that hold one of these elements keep it for good."""
+    """Cells that hold one of these elements keep it permanently."""
 
     ids: frozenset[int]
 

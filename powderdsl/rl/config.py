@@ -20,7 +20,7 @@ OBSERVATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 KINDS = ("compact", "ids", "matrix")
 
 HOW = ("steps", "backend", "device", "threads", "checkpoint_minutes")
-"""Settings that may change while a run goes on: how long and on what it is trained, not what is trained."""
+"""Settings that may change while a run continues: how long and on what it is trained, not what is trained."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
             wrong.append(_wrong(f"there is no setting `{other}`", suggest(other, known)))
     given = {"task": task, **PRESETS.get(name, {})}
     given |= {one: value for one, value in changes.items() if one in known}
-    # The usual observation hangs on the network.
+    # The usual observation depends on the network.
     if "network" in changes and "observation" not in changes and changes["network"] in OBSERVATIONS:
         given["observation"] = OBSERVATIONS[changes["network"]][0]
     given["packs"] = tuple(given.get("packs", ()))

@@ -96,7 +96,7 @@ def play(
 
     Args:
         policy: None does nothing at all: the worlds run by themselves.
-        worlds: which, int64 [n]. numbers: of the episodes, int64 [n], which a policy's random numbers hang on together
+        worlds: which, int64 [n]. numbers: of the episodes, int64 [n], which a policy's random numbers depend on together
             with `seed`; 0, 1, … otherwise.
         begun: called with the episodes at their start. seen: with the worlds after each action and step, see
             `TaskProgram.act`. acted: after each action, with the actions, the returns so far and which episodes are over.

@@ -1,6 +1,6 @@
-"""PPO of Stable-Baselines3's in a run folder. A run that is killed goes on as if nothing had happened.
+"""PPO of Stable-Baselines3's in a run folder. A run that is killed continues as if nothing had happened.
 
-What decides how a run goes on is saved between two rollouts: the policy and its optimizer, the worlds, all random
+What decides how a run continues is saved between two rollouts: the policy and its optimizer, the worlds, all random
 numbers. Files are read with ``weights_only``: networks are built from the settings, so loading executes nothing.
 """
 
@@ -45,15 +45,15 @@ Progress = Callable[[int, float | None], None]
 
 
 def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None = None) -> RunFolder:
-    """Train until `config.steps` interactions are reached: begin a run in `folder`, or go on with the one there.
+    """Train until `config.steps` interactions are reached: begin a run in `folder`, or continue with the one there.
 
-    Rollouts are whole: a run ends with the first that reaches `steps`. A run that is interrupted and goes on gives the
+    Rollouts are whole: a run ends with the first that reaches `steps`. A run that is interrupted and continues gives the
     same weights as one that was not, bit by bit, on a processor; so does one whose `steps` are raised.
 
     Raises:
         CompileError: PD640 for settings, all mistakes at once; what `load_task` says of the task; PD621 if the folder
             holds another run; PD622 if another process trains there.
-        KeyboardInterrupt: after the state before the rollout that was going on has been saved.
+        KeyboardInterrupt: after the state before the rollout that was in progress has been saved.
     """
     check_config(config)
     task, palette = _task_and_palette(config, Path(folder))
@@ -165,7 +165,7 @@ class _Keeper(BaseCallback):
         return True
 
     def save_kept(self) -> None:
-        """Save the state before the rollout that is going on, unless that has been done."""
+        """Save the state before the rollout that is in progress, unless that has been done."""
         if self.kept is not None and self.kept[0]:
             self.run.save_checkpoint(*self.kept)
 
@@ -194,7 +194,7 @@ def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _state(model: PPO, env: PowderVecEnv) -> dict[str, Any]:
-    """All that decides how training goes on. Tensors of the model are not copied."""
+    """All that decides how training continues. Tensors of the model are not copied."""
     return {
         "policy": model.policy.state_dict(),
         "optimizer": model.policy.optimizer.state_dict(),
@@ -243,7 +243,7 @@ def _set_random_state(state: Mapping[str, Any]) -> None:
     name, keys, *rest = state["numpy"]
     np.random.set_state((name, keys.numpy().astype(np.uint32), *rest))
     torch.set_rng_state(state["torch"])
-    # A run may go on with other devices than it had.
+    # A run may continue with other devices than it had.
     if torch.cuda.is_available() and len(state.get("cuda", ())) == torch.cuda.device_count():
         torch.cuda.set_rng_state_all(state["cuda"])
 

@@ -45,7 +45,7 @@ class Build:
             self.program = self._make()
         except NoCompiler as error:
             self.problem = str(error)
-        except Exception as error:  # torch goes on; `--backend native` shows what is wrong
+        except Exception as error:  # torch continues; `--backend native` shows what is wrong
             self.problem = f"{type(error).__name__}: {error}"
         self._took = time.perf_counter() - self._began
 

@@ -129,7 +129,7 @@ def _frame(image: Any) -> NDArray[np.uint8]:
 
 
 def _same_size(frames: Iterable[Any]) -> Iterator[NDArray[np.uint8]]:
-    """Checked frames, one by one. The first one is checked when it is asked for."""
+    """Checked frames, one at a time. The first one is checked when it is asked for."""
     shape = None
     for number, frame in enumerate(frames):
         picture = _frame(frame)

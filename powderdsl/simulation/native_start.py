@@ -1,6 +1,6 @@
 """From a checked model to running native code: at once if the same has been compiled before, else by lowering it.
 
-What is remembered hangs on the model, on every source file that turns models into C++, on the compiler and the
+What is remembered depends on the model, on every source file that turns models into C++, on the compiler and the
 processor. Values of parameters are inputs of a step, so they take no part.
 """
 

@@ -143,7 +143,7 @@ class Observer:
 
     @cached_property
     def _lasting(self) -> tuple[Slot, ...]:
-        """The slots that a step does not begin anew."""
+        """The slots that a step does not restart."""
         return tuple(slot for slot in self.slots.values() if not slot.resets)
 
     def _floor(self, slot: Slot) -> float:

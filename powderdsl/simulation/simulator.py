@@ -32,7 +32,7 @@ MAX_CELLS = 1 << 31
 class World:
     """A batch of worlds of one ruleset.
 
-    `state` has one tensor a slot; `seed`, `index` and `step` (int64 [B]) are what the random numbers hang on: the
+    `state` has one tensor a slot; `seed`, `index` and `step` (int64 [B]) are what the random numbers depend on: the
     same three give the same future, whatever stands beside a world in its batch.
     """
 
@@ -137,7 +137,7 @@ class Simulator:
             index: which world of its seed each is; 0, 1, … for one common seed, 0 for seeds of their own.
 
         Raises:
-            TypeError: ids are no integers. ValueError: wrong shape, or ids that the ruleset does not have.
+            TypeError: ids are not integers. ValueError: wrong shape, or ids that the ruleset does not have.
         """
         tensor = self._integers(ids, "ids")
         if tensor.ndim == 2:
@@ -212,7 +212,7 @@ class Simulator:
                 device, each of its worlds contiguous. `matrix`, `rgb` and `planes` take one too.
 
         Raises:
-            KeyError: an unknown name. TypeError, ValueError: `out` is no tensor, or does not fit.
+            KeyError: an unknown name. TypeError, ValueError: `out` is not a tensor, or does not fit.
         """
         return self.observer.read(world.state, name, out)
 

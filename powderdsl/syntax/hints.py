@@ -1,4 +1,4 @@
-"""What a syntax error most likely meant: words for what could follow, and the cure for common slips."""
+"""What a syntax error most likely meant: words for what could follow, and the fix for common slips."""
 
 from __future__ import annotations
 
@@ -133,13 +133,13 @@ CUT = "inside `{…}` and `[…]` YAML ends a value at a comma: quote it, or giv
 
 
 def character_help(text: str, position: int, begin: int) -> str:
-    """The cure for a character that no rule contains, or an empty string. The line starts at `begin`."""
-    cure = _LOOK_ALIKES.get(text[position])
-    if cure is None and not text[position].isascii():
+    """The fix for a character that no rule contains, or an empty string. The line starts at `begin`."""
+    fix = _LOOK_ALIKES.get(text[position])
+    if fix is None and not text[position].isascii():
         plain = unicodedata.normalize("NFKC", text[position])
-        cure = _CONFUSED.get(text[position]) or (plain if plain.isascii() and plain.isprintable() else None)
-    if cure is not None:
-        wanted = "a plain blank" if cure == " " else f"`{cure}`" if cure else ""
+        fix = _CONFUSED.get(text[position]) or (plain if plain.isascii() and plain.isprintable() else None)
+    if fix is not None:
+        wanted = "a plain blank" if fix == " " else f"`{fix}`" if fix else ""
         return f"it only looks like {wanted}: type {wanted}" if wanted else "it has no shape: remove it"
     before = text[begin:position]
     asks = re.search(r"\b(if|where|chance)\b", before) is not None
@@ -161,7 +161,7 @@ def was_cut(text: str, begin: int, end: int) -> bool:
 
 
 def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
-    """The cure for a word that cannot stand where it does. `token` is empty at the end of the line.
+    """The fix for a word that cannot stand where it does. `token` is empty at the end of the line.
 
     `accepted` are the terminals that could follow, `before` is the line up to the error.
     """
@@ -220,7 +220,7 @@ _AFTER_PLACES = ("is", "in", "and", "or", "if", "mod", "div", "not", "leaving", 
 
 
 def _phrase_help(token: str, before: str) -> str:
-    """The cure for a turn of phrase that other languages have."""
+    """The fix for a turn of phrase that other languages have."""
     last = re.search(r"([A-Za-z_]+)\s*\Z", before)
     word = last[1] if last else ""
     if word in ("count", "sum") and token.isidentifier():

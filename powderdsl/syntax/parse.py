@@ -121,10 +121,10 @@ def _report_syntax_error(
     text = source.text
     if isinstance(error, UnexpectedCharacters):
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
-        cure = character_help(text, start, begin)
+        fix = character_help(text, start, begin)
         reporter.error(
             "PD201", f"unexpected character {shown_character(text[start])}", Span(source, start, start + 1), "not part of a rule",
-            helps=[cure] if cure else [],
+            helps=[fix] if fix else [],
         )  # fmt: skip
         return
     assert isinstance(error, UnexpectedToken)
@@ -135,9 +135,9 @@ def _report_syntax_error(
     stop = start + (1 if at_end else len(token))
     accepted = set(error.accepts or error.expected or ())
     expected = expected_words(accepted)
-    cure = token_help("" if at_end else str(token), accepted, text[begin:start], was_cut(text, begin, end))
+    fix = token_help("" if at_end else str(token), accepted, text[begin:start], was_cut(text, begin, end))
     reporter.error(
         "PD201", "the line ends too early" if at_end else f"unexpected `{token}`",
         Span(source, start, max(stop, start + 1)), f"expected {expected}" if expected else "",
-        helps=[cure] if cure else [],
+        helps=[fix] if fix else [],
     )  # fmt: skip

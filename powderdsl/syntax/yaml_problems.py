@@ -1,4 +1,4 @@
-"""What PyYAML complains about, in plain words: where the mistake is, and how to mend it.
+"""What PyYAML complains about, in plain words: where the mistake is, and how to fix it.
 
 PyYAML reports where its scanner gave up, in its own terms. Each row of the table below knows what people
 usually did there.
@@ -65,7 +65,7 @@ class Place:
         return Span(self.source, start, start + max(length, 1))
 
     def quoted(self, at: int) -> str:
-        """The cure for the value on the line of a place: the same line with quotes."""
+        """The fix for the value on the line of a place: the same line with quotes."""
         begin, end = self.text.rfind("\n", 0, at) + 1, self.text.find("\n", at)
         found = _ENTRY.match(self.text[begin : end if end >= 0 else len(self.text)])
         if found is None or found.start("value") > at - begin:
@@ -167,14 +167,14 @@ def _unclosed(place: Place) -> Problem:
     opened = place.span(place.since)
     if place.at >= len(place.text.rstrip()) or not place.same_line:
         line = place.rest(place.since).text
-        cure = place.quoted(place.since)
+        fix = place.quoted(place.since)
         if (
             closer not in line
             and re.search(r"\b(given|expect): \Z", place.before_of(place.since))
-            and cure != QUOTE
+            and fix != QUOTE
         ):
             return Problem(
-                f"a `{opener}` that is never closed", opened, "not closed", f"write the `{closer}`, or {cure}"
+                f"a `{opener}` that is never closed", opened, "not closed", f"write the `{closer}`, or {fix}"
             )
     if place.same_line and place.at < len(place.text):
         return Problem(
@@ -239,17 +239,17 @@ def _escape(place: Place) -> Problem:
 def _no_colon(place: Place) -> Problem:
     return Problem(
         "a line that is neither a key nor a value", place.rest(place.since), "no `:` after it",
-        "a key ends with `:`; text that goes on is indented deeper than its key",
+        "a key ends with `:`; text that continues is indented deeper than its key",
     )  # fmt: skip
 
 
 def _list_beside_key(place: Place) -> Problem:
-    cure = place.quoted(place.at)
+    fix = place.quoted(place.at)
     return Problem(
         "a list on the line of its key",
         place.span(place.at),
         "a list starts on the next line",
-        "put `- …` on a line of its own" + ("" if cure == QUOTE else f"; if it is no list, {cure}"),
+        "put `- …` on a line of its own" + ("" if fix == QUOTE else f"; if it is not a list, {fix}"),
     )
 
 
@@ -271,9 +271,9 @@ def _nothing(place: Place) -> Problem:
 
 def _block_header(place: Place) -> Problem:
     char = place.text[place.since : place.since + 1]
-    cure = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
+    fix = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
     return Problem(
-        f"text after `{char}`", place.rest(place.at), f"`{char}` starts a block on the next lines", cure
+        f"text after `{char}`", place.rest(place.at), f"`{char}` starts a block on the next lines", fix
     )
 
 

@@ -114,18 +114,18 @@ class _Builder:
         start, end = event.start_mark.index, event.end_mark.index
         return Span(self.source, start, max(start, end))
 
-    def _forbid(self, event, what: str, cure: str) -> None:  # type: ignore[no-untyped-def]
+    def _forbid(self, event, what: str, fix: str) -> None:  # type: ignore[no-untyped-def]
         span = self._span(event)
         word = self.source.text[span.start : span.end].split(maxsplit=1)[:1]
         place = Span(self.source, span.start, span.start + max(len(word[0]) if word else 0, 1))
-        self.reporter.error("PD105", f"{what} is not allowed", place, "not allowed", helps=[cure])
+        self.reporter.error("PD105", f"{what} is not allowed", place, "not allowed", helps=[fix])
         raise _Abort
 
     def _fail(
-        self, code: str, message: str, span: Span, label: str, cure: str, secondary: tuple[Label, ...] = ()
+        self, code: str, message: str, span: Span, label: str, fix: str, secondary: tuple[Label, ...] = ()
     ) -> None:
         self.failed = True
-        self.reporter.error(code, message, span, label, secondary=secondary, helps=[cure])
+        self.reporter.error(code, message, span, label, secondary=secondary, helps=[fix])
 
     def _node(self, event, events, depth: int) -> Node:  # type: ignore[no-untyped-def]
         self.nodes += 1
@@ -240,16 +240,16 @@ class _Builder:
     def _no_value(self, key: Scalar, *, first: bool) -> None:
         """Nothing in `{…}` has a key without a value: most often a comma has cut a value in two."""
         if self.source.text[key.span.end :].lstrip().startswith(":"):
-            label, cure = (
+            label, fix = (
                 "nothing stands after its `:`",
                 'write its value; one with `#` in it needs quotes: "#RRGGBB"',
             )
         elif first:
-            label, cure = "a key without a `:`", "`{…}` holds `key: value` pairs; rules stand outside braces"
+            label, fix = "a key without a `:`", "`{…}` holds `key: value` pairs; rules stand outside braces"
         else:
             label = "the comma before it ended the value before it"
-            cure = "put quotes around a value with a comma, or give it a line of its own, outside `{…}`"
-        self._fail("PD107", f"`{key.text}` has no value", key.span, label, cure)
+            fix = "put quotes around a value with a comma, or give it a line of its own, outside `{…}`"
+        self._fail("PD107", f"`{key.text}` has no value", key.span, label, fix)
 
     def _in_braces(self, start) -> bool:  # type: ignore[no-untyped-def]
         """Whether a collection is written with `{…}` or `[…]`."""

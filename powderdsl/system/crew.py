@@ -1,4 +1,4 @@
-"""Processes that work through tasks: one that dies or hangs costs its task and says so, and the others go on."""
+"""Processes that work through tasks: one that dies or hangs costs its task and says so, and the others continue."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def work_through(
     """Results in the order in which they come. Tasks that the caller appends meanwhile are done too.
 
     Args:
-        work: runs in `jobs` fresh processes; one is replaced after `recycle` tasks, so that it cannot grow for ever.
+        work: runs in `jobs` fresh processes; one is replaced after `recycle` tasks, so that it cannot grow forever.
         limit: seconds that a task may take, busy or not. Without one, outcomes do not depend on how busy the
             machine is; tasks must then end by themselves.
     """

@@ -157,11 +157,11 @@ class _Machine:
     def fill(self, kinds: tuple[str, ...], items: list[_Node]) -> None:
         target = self.stack[-1]
         if target.kind not in kinds:
-            raise NotSaved("it fills what is no container")
+            raise NotSaved("it fills what is not a container")
         if target.kind != "list":
             keys = items[::2]
             if len(items) % 2 or any(one.kind != "atom" for one in keys):
-                raise NotSaved("it has keys that are no words")
+                raise NotSaved("it has keys that are not words")
             target.value += [one.value for one in keys]
         self.holding(target, items)
 
@@ -179,7 +179,7 @@ class _Machine:
     def reduce(self) -> None:
         function, arguments = self.pop(2)
         if function.kind != "global" or arguments.kind != "tuple":
-            raise NotSaved("it calls what is no function")
+            raise NotSaved("it calls what is not a function")
         if function.value == _ORDERED and not arguments.value:
             self.stack.append(_Node("ordered", []))
         elif function.value == _TENSOR:

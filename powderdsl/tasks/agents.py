@@ -19,7 +19,7 @@ MAX_ACTIONS = 1_000_000
 MAX_STEPS = 100_000
 MAX_SPEED = 1_000_000.0
 ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
-"""What `may:` calls what is no element."""
+"""What `may:` calls what is not an element."""
 
 
 def read_agent(
@@ -58,7 +58,7 @@ def read_agent(
 def _choices(
     reader: Reader, entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], ruleset: Ruleset
 ) -> tuple[int, ...]:
-    """Element ids ascending, then what is no element."""
+    """Element ids ascending, then what is not an element."""
     found: set[int] = set()
     acts: set[int] = set()
     words = reader.words(entries["may"][1]) if "may" in entries else ()
@@ -98,7 +98,7 @@ def _speed_field(
     named = reader.scalar(entries, "speed_field")
     if named is not None and slot_name(ruleset, named.text) not in vectors:
         helps = suggest(named.text, vectors, "vectors of these rules")
-        message = f"`{named.text}` is no vector field"
+        message = f"`{named.text}` is not a vector field"
         reader.reporter.error("PD804", message, named.span, "blowing sets a vector", helps=helps)
         return None
     if not blows:

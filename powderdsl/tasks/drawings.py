@@ -46,7 +46,7 @@ class Drawer:
     names: dict[str, Interval] = field(default_factory=dict)
     used_parts: set[str] = field(default_factory=set)
     broken: set[str] = field(default_factory=set)
-    """Names whose definition has been reported: using them is no second mistake."""
+    """Names whose definition has been reported: using them is not a second mistake."""
     count: int = 0
     cells: int = 0
 

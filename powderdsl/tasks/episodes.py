@@ -115,7 +115,7 @@ class TaskProgram:
         return Made(ids, regions, targets)
 
     def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
-        """The episodes where `mask`, bool [B], is set, made anew as worlds `seeds`, int64 [B]; the others unchanged.
+        """The episodes where `mask`, bool [B], is set, rebuilt as worlds `seeds`, int64 [B]; the others unchanged.
 
         With `reuse` the tensors of `episodes` are written to, and must not be used afterwards.
         """
@@ -160,7 +160,7 @@ class TaskProgram:
     # Saving
 
     def saved(self, episodes: Episodes) -> dict[str, Any]:
-        """Episodes as plain tensors in dicts, copies on the CPU, that any backend and device can go on from."""
+        """Episodes as plain tensors in dicts, copies on the CPU, that any backend and device can continue from."""
         world = episodes.world
         rows = ("seed", "acted", "failed", "start", "before")
         maps = {"state": world.state, "regions": episodes.regions, "targets": episodes.targets}
@@ -208,7 +208,7 @@ class TaskProgram:
                 placed or blown.
             reuse: the tensors of `episodes` are written to, and must not be used afterwards.
             params: parameters of the rules for this action, one number each or [B].
-            seen: called with the worlds after the action and after each step, which then run one by one. Free steps
+            seen: called with the worlds after the action and after each step, which then run one at a time. Free steps
                 are shown where all episodes have them. Not with `reuse`.
 
         Returns:
@@ -263,7 +263,7 @@ class TaskProgram:
         reuse: bool = False,
         seen: Callable[[World], None] | None = None,
     ) -> World:
-        """Some steps; one by one where they are to be seen."""
+        """Some steps; one at a time where they are to be seen."""
         if seen is None:
             return self.simulator.step(world, steps, params=params, reuse=reuse)
         for _ in range(steps):
@@ -332,7 +332,7 @@ def compile_task(
 
 
 def check_actions(program: TaskProgram, actions: Any) -> Tensor:
-    """Actions from outside as int64 [B, 5] on the program's device; those that are no numbers of an action are refused.
+    """Actions from outside as int64 [B, 5] on the program's device; those that are not numbers of an action are refused.
 
     Raises:
         TypeError: numbers that are not whole. ValueError: a wrong shape, or a number out of range, with its index.

@@ -87,7 +87,7 @@ class GoalChecker:
         except Poisoned:
             return None
         except Asleep as asleep:
-            self.typer.fail("PD301", f"`{asleep.name}` is not loaded", syntax.span, "hangs on it")
+            self.typer.fail("PD301", f"`{asleep.name}` is not loaded", syntax.span, "depends on it")
             return None
 
     # Arithmetic on numbers of the whole world
@@ -194,7 +194,7 @@ class GoalChecker:
         if name in MEMORIES:
             inner = self.value(parts[0])
             if any(one.op in ("start", "before", "action") for one in parts_of(inner)):
-                raise self.typer.fail("PD406", f"`{name}` of what is no number of a world", parts[0].span)
+                raise self.typer.fail("PD406", f"`{name}` of what is not a number of a world", parts[0].span)
             if name == "start":
                 return Scalar("start", (inner,))
             return Scalar("sub", (inner, Scalar("before", (inner,))))

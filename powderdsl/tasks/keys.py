@@ -34,7 +34,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
         "splits": Key("mapping", "other sets of worlds beside `train`"),
     },
     "knob": {
-        "default": Key("line", "its value unless another is set; it may hang on knobs above it", True),
+        "default": Key("line", "its value unless another is set; it may depend on knobs above it", True),
         "range": Key("line", "the values it may have: `LOW..HIGH`", True),
         "about": Key("text", "what it does, in a sentence"),
     },

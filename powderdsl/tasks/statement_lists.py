@@ -11,7 +11,7 @@ from powderdsl.worlds.scene.amounts import Amount
 from powderdsl.worlds.scene.statements import Statement, Word, read_amount, read_statement
 
 BROKEN = Amount("broken")
-"""A number whose mistake has been reported: what hangs on it is no second one."""
+"""A number whose mistake has been reported: what depends on it is not a second one."""
 
 MAX_STATEMENTS = 2_000
 """Statements of one list."""
@@ -108,12 +108,12 @@ def _not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, nested: bool) 
     key = item.entries[0][0] if item.entries else None
     word = key.text.split(maxsplit=1)[0] if key is not None and key.text else ""
     if nested and word == "repeat":
-        cure = "repetitions do not stand in repetitions: multiply the counts"
+        fix = "repetitions do not stand in repetitions: multiply the counts"
     elif word == "let":
-        cure = "`let:` stands at the top of the file, or in a repetition"
+        fix = "`let:` stands at the top of the file, or in a repetition"
     else:
-        cure = "say `48:end` for `48:`, or quote the statement; `repeat 0..5:` has a list below it"
+        fix = "say `48:end` for `48:`, or quote the statement; `repeat 0..5:` has a list below it"
     message = "YAML reads this statement as a mapping"
     reporter.error(
-        "PD605", message, first_line(item), "a `:` at the end of a word makes it a key", helps=[cure]
+        "PD605", message, first_line(item), "a `:` at the end of a word makes it a key", helps=[fix]
     )

@@ -80,7 +80,7 @@ class Region:
     name: str
     shapes: tuple[Drawing, ...]
     drawn: bool
-    """Whether it hangs on draws, so that every world has its own."""
+    """Whether it depends on draws, so that every world has its own."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The replay buffer: pairs as uint8, the oldest replaced as training goes on.
+"""The replay buffer: pairs as uint8, the oldest replaced as training continues.
 
 What it holds in an iteration, and which pairs a batch has, are functions of the configuration, the run's seed and the
 iteration. So a checkpoint needs no copy of it: `Replay.go_to` makes it again, cell by cell the same.
@@ -72,7 +72,7 @@ class Replay:
             self.advance()
 
     def advance(self) -> None:
-        """On to the next iteration: `refresh` worlds go on by some steps, and their pairs replace the oldest."""
+        """On to the next iteration: `refresh` worlds continue by some steps, and their pairs replace the oldest."""
         if self.iteration < 0:
             raise ValueError("the buffer is empty: `go_to` fills it")
         if not self.all_fit:

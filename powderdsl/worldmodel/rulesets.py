@@ -26,7 +26,7 @@ from powderdsl.tasks.task import Task
 from powderdsl.worldmodel.watched import Watched, watched
 
 TRIES = 8
-"""How often a swap or a selection of packs is drawn anew where the rules would contradict themselves."""
+"""How often a swap or a selection of packs is drawn again where the rules would contradict themselves."""
 
 MAX_RULESETS = 1024
 """Each is checked before the first step, and each structure compiled."""
@@ -108,7 +108,7 @@ class RulesetSource:
                 raise failure("PD301", f"the rules {self.base.name} have no property `{name}`", helps=helps)
 
     def draw(self, number: int) -> Drawn:
-        """Ruleset `number`, 0 or more. One whose rules would contradict themselves is drawn anew."""
+        """Ruleset `number`, 0 or more. One whose rules would contradict themselves is drawn again."""
         draws = _draws(number)
         for _ in range(TRIES):
             left_out = self._left_out(draws)
@@ -151,7 +151,7 @@ class RulesetSource:
         return model
 
     def _left_out(self, draws: Iterator[float]) -> tuple[str, ...]:
-        """Packs drawn one by one; those that another one needs stay."""
+        """Packs drawn one at a time; those that another one needs stay."""
         if not self.variety.leave_out:
             return ()
         needed = {name.text for pack in self.packs for name in pack.needs}
@@ -307,7 +307,7 @@ class VariedWorlds:
 
 
 def _draws(number: int) -> Iterator[float]:
-    """Endless numbers in 0..1 that hang on `number` alone."""
+    """Endless numbers in 0..1 that depend on `number` alone."""
     keys = base_keys(torch.tensor([number]), torch.tensor([_DRAW]))
     key, count = int(mix(keys[0] ^ keys[1])[0]), 0
     while True:

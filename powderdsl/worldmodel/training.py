@@ -88,7 +88,7 @@ PRESETS = {"paper": PAPER, "small": SMALL}
 
 @dataclass(frozen=True)
 class Machine:
-    """Where a run is computed. It takes no part in what a run is: one may go on elsewhere.
+    """Where a run is computed. It takes no part in what a run is: one may continue elsewhere.
 
     `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`.
     """
@@ -128,14 +128,14 @@ def train(
     tell: Callable[[Moment], None] | None = None,
     save_seconds: float = 60,
 ) -> RunFolder:
-    """Train a network until `config.iterations`, or go on with the run that is in the folder.
+    """Train a network until `config.iterations`, or continue with the run that is in the folder.
 
-    On one device and one thread the weights are the same however often a run is killed and goes on.
+    On one device and one thread the weights are the same however often a run is killed and continues.
 
     Args:
         worlds: your own, instead of those of the task that `config.data` names, whose rules and split then say nothing.
-        identity: what else decides which weights come out, such as what your own worlds hang on: kept in ``run.json``,
-            and compared when a run goes on.
+        identity: what else decides which weights come out, such as what your own worlds depend on: kept in ``run.json``,
+            and compared when a run continues.
         network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W]; the paper's U-net otherwise.
         parent: weights to start from, of the run that `finetuned` was given.
         note: more for ``run.json``, such as where the parent lies.
@@ -409,7 +409,9 @@ def load_trained(
     try:
         config, palette = TrainConfig.of(run.config), _recorded_palette(run)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise failure("PD620", f"{run.path} is no run that can be used here", notes=(str(error),)) from None
+        raise failure(
+            "PD620", f"{run.path} is not a run that can be used here", notes=(str(error),)
+        ) from None
     checkpoint = run.checkpoint(device)
     if network is None:
         _check_size(run, config, palette, checkpoint)
@@ -424,7 +426,7 @@ def _check_size(
     """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError."""
     if type(config.width) is not int or not 1 <= config.width <= MAX_WIDTH or not 1 <= len(palette) <= 256:
         why = "its network has sizes that no training gives"
-        raise failure("PD620", f"{run.path} is no run that can be used here", notes=(why,))
+        raise failure("PD620", f"{run.path} is not a run that can be used here", notes=(why,))
     with torch.device("meta"):
         wanted = {name: one.shape for name, one in UNet(len(palette), config.width).state_dict().items()}
     state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None

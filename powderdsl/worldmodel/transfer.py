@@ -1,4 +1,4 @@
-"""Transfer: packs that a network has not seen are plugged into its rules, and it goes on from its weights."""
+"""Transfer: packs that a network has not seen are plugged into its rules, and it continues from its weights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIMPLER = "kinds"
 def finetuned(
     trained: Trained, packs: Sequence[str], *, iterations: int = 100, **changes: Any
 ) -> TrainConfig:
-    """The configuration that goes on from a network, on worlds in which elements of `packs` alone are drawn.
+    """The configuration that continues from a network, on worlds in which elements of `packs` alone are drawn.
 
     The rules are those of the run with the packs added. Elements that the network knows keep their slots; others get
     its free slots, and where none are left the network grows. A knob for the number of elements is left at its default,

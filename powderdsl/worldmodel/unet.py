@@ -55,7 +55,7 @@ def _block(before: int, after: int) -> nn.Sequential:
 
 
 def fresh_unet(slots: int, width: int, seed: int) -> UNet:
-    """A network with random weights that hang on the seed alone: made on the CPU, the same for every device.
+    """A network with random weights that depend on the seed alone: made on the CPU, the same for every device.
 
     Their spread is that of He et al. (2015): activations keep their size from layer to layer. With torch's own, which
     shrink them, the loss takes about three times as many iterations to fall as far.

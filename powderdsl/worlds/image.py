@@ -20,7 +20,7 @@ from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_REPORTED = 8
-"""Wrong colors that are named one by one. A smoothed picture has thousands."""
+"""Wrong colors that are named one at a time. A smoothed picture has thousands."""
 
 MAX_COLORS = 1 << 16
 """Wrong colors that are counted. A picture with more has more of them below."""
@@ -38,7 +38,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
     Colors of a ramp mean its element; the values of its field are not read.
 
     PD609 names every pixel color that is no element's (and the nearest element), PD607 a picture of too many
-    pixels, which is not decoded, PD602 a file that is no PNG, PD101 one that cannot be read.
+    pixels, which is not decoded, PD602 a file that is not a PNG, PD101 one that cannot be read.
     """
     path = Path(path)
     # Four bytes a pixel as one number: red lowest, opacity highest.
@@ -148,7 +148,7 @@ def _wrong_color(
         message = f"{where} is {name} at {opacity * 100 // 255}% opacity"
         helps = ("save the picture without transparency",)
     else:
-        message = f"{where} is {name}, which is no element's color"
+        message = f"{where} is {name}, which is not any element's color"
         candidates = [element for owned in owners.values() for element in owned]
         nearest = min(candidates, key=lambda element: _distance(element.color, name))
         helps = (f"the nearest is `{nearest.name}`, {nearest.color}",)

@@ -29,7 +29,7 @@ MORE = 1 << 24
 
 
 def save(world: World, path: str | Path) -> None:
-    """Write worlds with everything their future hangs on. The file appears whole or not at all.
+    """Write worlds with everything their future depends on. The file appears whole or not at all.
 
     Raises:
         CompileError: PD613 if the place cannot be written, PD602 if the disk is full, PD607 if there are more than
@@ -188,7 +188,7 @@ def _bad(path: Path, problem: str) -> CompileError:
     return CompileError(reporter.diagnostics)
 
 
-def _mismatch(path: Path, problem: str, cure: str) -> CompileError:
+def _mismatch(path: Path, problem: str, fix: str) -> CompileError:
     reporter = Reporter()
-    reporter.error("PD603", f"`{path}` does not fit: {problem}", None, helps=[cure])
+    reporter.error("PD603", f"`{path}` does not fit: {problem}", None, helps=[fix])
     return CompileError(reporter.diagnostics)

@@ -1,4 +1,4 @@
-"""Shapes strewn at random: worlds for whoever has drawn none."""
+"""Shapes scattered at random: worlds for whoever has drawn none."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def test_several_sizes_have_a_figure_of_their_own(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.png", "two.png"]
 
 
-def test_without_matplotlib_the_cure_is_named(monkeypatch):
+def test_without_matplotlib_the_fix_is_named(monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)

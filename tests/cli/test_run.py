@@ -253,7 +253,7 @@ def test_a_picture_may_be_too_large():
     assert "choose a smaller --scale" in result.stderr
 
 
-# Strewn worlds
+# Scattered worlds
 
 
 def test_strewn_worlds_depend_on_seed_and_place_alone():

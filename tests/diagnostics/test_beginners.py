@@ -1,7 +1,7 @@
-"""Slips of people who are new to the language: a true message, the caret where it belongs, a cure that works.
+"""Slips of people who are new to the language: a true message, the caret where it belongs, a fix that works.
 
-A row has a mistake, the code, the text under the caret, and the mistake as it looks once the cure is followed. What the
-cure says must contain what was written instead.
+A row has a mistake, the code, the text under the caret, and the mistake as it looks once the fix is followed. What the
+fix says must contain what was written instead.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ tests:
 
 # fmt: off
 RULES = [
-    # mistake, code, caret, what it should be, part of the cure
+    # mistake, code, caret, what it should be, part of the fix
     ("heat += heat / 8 where soil", "PD401", "heat / 8", "heat += heat div 8 where soil", "`heat div 8`"),
     ("heat := heat * 0.9 where soil", "PD401", "heat * 0.9", "heat := heat * 9 div 10 where soil", "`heat * 9 div 10`"),
     ("heat := heat * 0.5 where soil", "PD401", "heat * 0.5", "heat := heat div 2 where soil", "`heat div 2`"),
@@ -85,7 +85,7 @@ DRAWN = [
     ("[ s", "w w", "PD103", "[", '". s"', '". s"'),
 ]
 WORDS = [
-    # text, what stands there instead, code, caret, part of the cure
+    # text, what stands there instead, code, caret, part of the fix
     ("density: 4}\n  weed", "density: 4, gravity: maybe}\n  weed", "PD110", "maybe", "`yes`"),
     ("density: 4}\n  weed", "density: 4, gravity: Yes}\n  weed", "PD110", "Yes", "write `yes`"),
     ("density: 4}\n  weed", "density: heavy}\n  weed", "PD110", "heavy", "from 0 to 7"),
@@ -107,17 +107,17 @@ def load(text: str, folder: Path) -> tuple:
     return ()
 
 
-def check(text: str, code: str, caret: str, cure: str, folder: Path) -> None:
+def check(text: str, code: str, caret: str, fix: str, folder: Path) -> None:
     (found,) = load(text, folder)
     assert found.code == code
     assert found.primary.span is not None
     assert found.primary.span.text == caret
-    assert any(cure in one for one in found.helps), found.helps
+    assert any(fix in one for one in found.helps), found.helps
 
 
-@pytest.mark.parametrize(("rule", "code", "caret", "mended", "cure"), RULES, ids=[row[0] for row in RULES])
-def test_a_rule(rule: str, code: str, caret: str, mended: str, cure: str, tmp_path: Path) -> None:
-    check(PACK.replace("RULE", rule), code, caret, cure, tmp_path)
+@pytest.mark.parametrize(("rule", "code", "caret", "mended", "fix"), RULES, ids=[row[0] for row in RULES])
+def test_a_rule(rule: str, code: str, caret: str, mended: str, fix: str, tmp_path: Path) -> None:
+    check(PACK.replace("RULE", rule), code, caret, fix, tmp_path)
     assert load(PACK.replace("RULE", mended), tmp_path) == ()
 
 
@@ -134,9 +134,9 @@ def test_a_drawing_on_the_line_of_its_key(
     assert load(pack + TEST.replace("GIVEN", good_given).replace("EXPECT", good_expect), tmp_path) == ()
 
 
-@pytest.mark.parametrize(("text", "wrong", "code", "caret", "cure"), WORDS, ids=[row[3] for row in WORDS])
-def test_a_word(text: str, wrong: str, code: str, caret: str, cure: str, tmp_path: Path) -> None:
-    check(PACK.replace(text, wrong, 1).replace("RULE", "soil -> weed"), code, caret, cure, tmp_path)
+@pytest.mark.parametrize(("text", "wrong", "code", "caret", "fix"), WORDS, ids=[row[3] for row in WORDS])
+def test_a_word(text: str, wrong: str, code: str, caret: str, fix: str, tmp_path: Path) -> None:
+    check(PACK.replace(text, wrong, 1).replace("RULE", "soil -> weed"), code, caret, fix, tmp_path)
 
 
 @pytest.mark.parametrize("end", ["", "\n"])

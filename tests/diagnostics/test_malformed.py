@@ -101,7 +101,7 @@ FILES: list[tuple[str, str | bytes, str, str | None]] = [
     ("100,000 keys", "".join(f"k{i}: 1\n" for i in range(50_000)), "PD106", "1"),
     ("1 MB without a line break", "about: " + "x" * (1 << 20), "PD102", None),
     ("10 MB", b"# " + b"x" * 10_000_000, "PD102", None),
-    # Bytes that are no text
+    # Bytes that are not text
     ("Latin-1", "about: Stra\xdfe\n".encode("latin-1"), "PD101", None),
     ("UTF-16", "pack: yard\n".encode("utf-16"), "PD101", None),
     ("a PNG", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "PD101", None),
@@ -110,7 +110,7 @@ FILES: list[tuple[str, str | bytes, str, str | None]] = [
     ("a stranger", "services:\n  web: 1\n", "PD109", "services"),
     ("a scene", "scene: hill\nsize: [8, 8]\nfill: empty\n", "PD109", "scene"),
     ("a pack without elements", "pack: yard\n", "PD109", "yard"),
-    ("a name that is no word", "pack: 1st\nelements: {}\n", "PD111", "1st"),
+    ("a name that is not a word", "pack: 1st\nelements: {}\n", "PD111", "1st"),
     ("a name of a mile", f"pack: {'x' * 5000}\n", "PD111", "x" * 5000),
     ("a list for a name", "pack: [a]\n", "PD107", "[a]"),
     ("a ruleset without packs", "ruleset: yard\n", "PD109", "r"),
@@ -227,7 +227,7 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     ("a mean", "invariants: [min(soil) is constant]\n", "PD406", "min(soil)"),
     ("never a number", "invariants: [never age]\n", "PD401", "age"),
     ("never for no steps", "invariants: [never wet for 0 steps]\n", "PD402", "for 0 steps"),
-    ("never for ever", "invariants: [never wet for 99999999 steps]\n", "PD402", "for 99999999 steps"),
+    ("never forever", "invariants: [never wet for 99999999 steps]\n", "PD402", "for 99999999 steps"),
     ("never for some years", "invariants: [never wet for 9 years]\n", "PD201", "years"),
     ("never what is always", "invariants: [never yes]\n", "PD511", "yes"),
     ("bounds of a flag", "invariants: [wet stays in 0..1]\n", "PD401", "wet"),
@@ -406,7 +406,7 @@ def test_there_are_many_of_them() -> None:
     assert len(FILES) + len(SECTIONS) + len(RULES) >= 80
 
 
-# Files that are no files, and line ends of other systems
+# Files that are not files, and line ends of other systems
 
 
 def test_a_folder_is_no_file(tmp_path: Path) -> None:

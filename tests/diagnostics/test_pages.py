@@ -1,6 +1,6 @@
 """Every diagnostic code has a page, every page's examples do what the page says, and every code is raised.
 
-A page has a wrong example and, mostly, the mended one:
+A page has a wrong example and, mostly, the fixed one:
 
 * ``yaml wrong`` and ``yaml right`` are rule files; ``# with: core`` at the top names packs to load with them.
 * ``yaml wrong scene`` is a drawn world, ``text wrong world`` one in ASCII, ``yaml wrong task`` a task, ``yaml wrong study`` a

@@ -147,7 +147,7 @@ def test_seeds_are_those_of_slots(small: TaskProgram) -> None:
     assert all(0 <= world < 50 for world in second)
     assert len({*second}) > 1
     assert env.reset(seed=[None, 4, None])[1]["world"][1] == 4
-    # What a slot plays hangs on its own seed and the number of its episode.
+    # What a slot plays depends on its own seed and the number of its episode.
     other = PowderVectorEnv(small, 1, worlds=50)
     other.reset(seed=10)
     assert other.reset()[1]["world"].tolist() == second[1:2]
@@ -172,7 +172,7 @@ def test_options_choose_worlds_and_parameters(small: TaskProgram) -> None:
     left = ice()
     assert left[0] > left[2]
     assert left[1] > left[3]
-    # They stay, also where others are set for one slot, until they are given anew.
+    # They stay, also where others are set for one slot, until they are given again.
     env.reset(options={"worlds": 5, "params": {"water.melt": 1}, "reset_mask": np.array([True, False] * 2)})
     assert env.tensors.params["water.melt"].tolist() == [1, 0, 1, 1]
     env.reset()

@@ -35,7 +35,7 @@ class SeedsType(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
         match = re.fullmatch(r"([0-9]{1,12})\.\.([0-9]{1,12})", str(value))
         if match is None or int(match[1]) >= int(match[2]):
-            self.fail(f"`{value}` is no range of seeds: write FROM..TO, such as 0..1000", param, ctx)
+            self.fail(f"`{value}` is not a range of seeds: write FROM..TO, such as 0..1000", param, ctx)
         return range(int(match[1]), int(match[2]))
 
 
@@ -81,7 +81,7 @@ class BackendsType(click.ParamType):
     show_default=True,
     help="Folder for what failed, and for how far it came.",
 )
-@click.option("--resume", is_flag=True, help="Go on where the run in that folder ended.")
+@click.option("--resume", is_flag=True, help="Continue where the run in that folder ended.")
 @click.option("--front-end", is_flag=True, help="Damage rule files instead, and load them.")
 @click.option("--jobs", type=WholeType(1, 256), help="Processes.  [default: one a processor]")
 @click.option(
@@ -106,7 +106,7 @@ def command(
     """Compare all backends with the reference on random rules and worlds.
 
     What differs is made small and saved as a file that `--replay` runs again. Ctrl-C ends a run with its report;
-    `--resume` goes on. Exit code: 0 if all agree, 1 if something was found.
+    `--resume` continues. Exit code: 0 if all agree, 1 if something was found.
 
     \b
         python -m tests.fuzz --seconds 60

@@ -61,7 +61,7 @@ def program_of(name: str, folder: Path) -> Program:
     program = lower_ruleset(load(path))
 
     def here(node: Node) -> None:
-        """Golden texts do not hang on where the test put its file."""
+        """Golden texts do not depend on where the test put its file."""
         object.__setattr__(node, "places", ())
 
     for pass_ in program.passes:

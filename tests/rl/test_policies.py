@@ -46,7 +46,7 @@ def test_scores_are_those_of_a_loop_by_hand(
     by_hand = {}
     for name, act in acts.items():
         returns = []
-        for world in range(6):  # one by one: no policy's draws hang on the batch
+        for world in range(6):  # one at a time: no policy's draws depend on the batch
             episodes, total = program.start(torch.tensor([world])), 0.0
             for step in range(4):
                 key = action_keys(9, torch.tensor([world]), step)

@@ -1,4 +1,4 @@
-"""Training: what was killed goes on bit by bit, what does not fit is refused, and agents learn."""
+"""Training: what was killed continues bit by bit, what does not fit is refused, and agents learn."""
 
 from __future__ import annotations
 

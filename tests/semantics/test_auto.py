@@ -380,7 +380,7 @@ while not (cache / 'pid').exists():
     assert waited(lambda: not alive(int((tmp_path / "pid").read_text())))
 
 
-# --- what it hangs on
+# --- what it depends on
 
 
 @pytest.mark.parametrize("name", ["powderworld", "life", "forest_fire", "margolus", "kettle"])

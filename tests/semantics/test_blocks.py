@@ -76,7 +76,7 @@ def test_what_meets_anyway_is_refused(tmp_path, rule):
         assert codes(tmp_path, rule, multiple) == ["PD501"]
 
 
-def test_the_cure_is_named_and_works(tmp_path):
+def test_the_fix_is_named_and_works(tmp_path):
     path = tmp_path / "blocks.yaml"
     path.write_text(HEAD.format(multiple=1) + MARGOLUS)
     with pytest.raises(CompileError) as raised:

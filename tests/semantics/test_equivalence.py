@@ -61,7 +61,7 @@ SAME = {
         "let: {wet: damp > 2}\ndo: soil -> moss if wet",
         "let: {wet: damp > 2}\ndo: soil -> moss if damp > 2 or wet",
     ),
-    "a property that cells of other elements hold one by one": (
+    "a property that cells of other elements hold one at a time": (
         "do: rock -> soil if weight == 3 and above is moss\nthen: weight := 1 where moss",
         "do: rock -> soil if above is moss\nthen: weight := 1 where moss",
     ),
@@ -92,7 +92,7 @@ OTHER = {
         "do: moss -> soil if count((damp > 4 and age == 1) in ring) == 2",
         "do: moss -> soil if count(damp > 4 and age == 1) == 2",
     ),
-    "a property that cells hold one by one": (
+    "a property that cells hold one at a time": (
         "do: moss -> soil if weight == 2\nthen: weight := 1 where moss and above is rock",
         "do: moss -> soil\nthen: weight := 1 where moss and above is rock",
     ),

@@ -78,7 +78,7 @@ def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
 
 @pytest.mark.parametrize("backend", ["planes", "native"])
 def test_the_oracles_worlds(backend: str) -> None:
-    """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one by one."""
+    """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one at a time."""
     rules = spread("heavy")
     skip_without_compiler(backend)
     sims = [powderdsl.compile(rules, backend=name) for name in ("reference", "dense", backend)]

@@ -411,7 +411,7 @@ def _total(masks: list[Any]) -> Any:
 
 
 def test_the_empty_world_of_an_empty_pack_stays() -> None:
-    """A ruleset without passes changes nothing, and a rule with chance 0 % is no rule."""
+    """A ruleset without passes changes nothing, and a rule with chance 0 % is not a rule."""
     head = "pack: p\nelements:\n  a: {id: 0, color: '#000000'}\n  b: {id: 1, color: '#000001'}\n"
     never = "passes: {one: {do: 'a -> b, with chance 0%'}}\n"
     always = "passes: {one: {do: 'a -> b, with chance 100%'}}\n"

@@ -214,8 +214,8 @@ def test_what_is_no_task_at_all(text):
     assert found(text)
 
 
-def test_cures_name_what_was_meant():
-    for written, instead, cure in (
+def test_fixes_name_what_was_meant():
+    for written, instead, fix in (
         ("count(sand in slot)", "count(sand in solt)", "slot"),
         ("- part ground", "- part grund", "ground"),
         ("repeat 0..lines", "repeat 0..liens", "lines"),
@@ -226,7 +226,7 @@ def test_cures_name_what_was_meant():
         reporter = Reporter()
         with pytest.raises(CompileError) as caught:
             read_task(Source("yard.yaml", GOOD.replace(written, instead)), reporter)
-        assert caught.value.diagnostics[0].helps == (f"did you mean `{cure}`?",)
+        assert caught.value.diagnostics[0].helps == (f"did you mean `{fix}`?",)
 
 
 def test_deep_and_long_files_end_well():

@@ -44,7 +44,7 @@ def test_packed_worlds_are_acted_on_alike(torch, size):
             for name, value in other.world.state.items():
                 assert torch.equal(one.world.state[name], value), name
             for name, value in (before or {}).items():
-                fresh = native.simulator.step(given.world, 0).state[name]  # unpacked anew
+                fresh = native.simulator.step(given.world, 0).state[name]  # unpacked again
                 assert torch.equal(fresh, value), name
 
 

@@ -1,4 +1,4 @@
-"""Cases as files: what is written is read again, bit for bit; what is no case is refused."""
+"""Cases as files: what is written is read again, bit for bit; what is not a case is refused."""
 
 from __future__ import annotations
 

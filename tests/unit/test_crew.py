@@ -1,4 +1,4 @@
-"""Processes that work through tasks: what one of them dies of is known, and the others go on."""
+"""Processes that work through tasks: what one of them dies of is known, and the others continue."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def test_a_wrong_color_names_the_pixel_the_color_and_the_nearest_element(tmp_pat
     Image.fromarray(pixels).save(path)
     black, sand = refused(path)
     assert (black.code, sand.code) == ("PD609", "PD609")
-    assert sand.message == "the pixel at row 1, column 3 is #F4C23B, which is no element's color"
+    assert sand.message == "the pixel at row 1, column 3 is #F4C23B, which is not any element's color"
     assert sand.helps == ("the nearest is `sand`, #F3C23A",)
     assert sand.notes == (f"{path}: 2 such pixels, this is the first",)
     assert "row 0, column 6" in black.message

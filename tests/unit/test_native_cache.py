@@ -341,7 +341,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not names(folder)
     wrong = powderdsl("cache", "clear", "--older-than", "soon")
     assert wrong.exit_code == 2
-    assert "no time span" in wrong.stderr
+    assert "not a time span" in wrong.stderr
     folder.chmod(0o777)
     refused = powderdsl("cache", "list")
     assert refused.exit_code == 2

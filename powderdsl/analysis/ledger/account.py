@@ -56,7 +56,7 @@ def _sources(ledger: Ledger) -> Iterator[str]:
     yield "elements"
     yield f"  no rule makes: {_listed(never)}"
     yield f"  made only in worlds that hold them already: {_listed(copied)}"
-    yield f"  stay where they are for good: {_listed(standing)}"
+    yield f"  stay in place permanently: {_listed(standing)}"
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -1,7 +1,7 @@
 """The ledger of a ruleset: what its rules create, destroy and move, and what follows for all worlds.
 
 A verdict `Proven` holds for worlds of every size and every content, for all parameter values and all random numbers
-that streams draw, at every step. `NotProven` names the lines of rules that stand in the way: it is no proof of the
+that streams draw, at every step. `NotProven` names the lines of rules that stand in the way: it is not a proof of the
 contrary, for several rules may make up for each other.
 """
 
@@ -107,7 +107,7 @@ class Ledger:
     def conserved(self, weights: Mapping[str, int]) -> Verdict:
         """Whether the weighted number of cells is constant: ``{"a": 1, "b": 1}`` is the sum of two elements.
 
-        Elements that are not named count 0. Raises KeyError for a name that is no element.
+        Elements that are not named count 0. Raises KeyError for a name that is not an element.
         """
         return self._weighed(weights, "changes", lambda before, after: before != after)
 
@@ -120,9 +120,9 @@ class Ledger:
         return self._weighed(_weights(what), "falls", lambda before, after: before > after)
 
     def unchanged(self, element: str) -> Verdict:
-        """Whether a cell with this element keeps it for good. Others may still become it: see `never_rises`.
+        """Whether a cell with this element keeps it permanently. Others may still become it: see `never_rises`.
 
-        Raises KeyError for a name that is no element.
+        Raises KeyError for a name that is not an element.
         """
         self._known([element])
         lines = [
@@ -137,7 +137,7 @@ class Ledger:
     def never_appears(self, element: str) -> Verdict:
         """Whether a world that starts without this element, in cells and in fields, stays without it.
 
-        Raises KeyError for a name that is no element.
+        Raises KeyError for a name that is not an element.
         """
         self._known([element])
         makers = [
@@ -157,7 +157,7 @@ class Ledger:
     def reach(self, start: Iterable[str]) -> tuple[str, ...]:
         """All elements that a world can ever hold, if it starts with these and its fields were not set by hand.
 
-        Raises KeyError for a name that is no element.
+        Raises KeyError for a name that is not an element.
         """
         start = dict.fromkeys(start)
         self._known(start)
@@ -178,13 +178,13 @@ class Ledger:
     def within(self, field: str, low: float, high: float) -> Verdict:
         """Whether a field's numbers stay within two bounds, in every cell. Both parts of a vector are numbers.
 
-        Raises KeyError for a name that is no field.
+        Raises KeyError for a name that is not a field.
         """
         entry = next((one for one in self.fields if one.name == field), None)
         if entry is None:
             raise KeyError(f"no field `{field}` in {self.name}")
         if entry.bounds is None:
-            return NotProven(f"`{field}` is no number: it holds {entry.kind}")
+            return NotProven(f"`{field}` is not a number: it holds {entry.kind}")
         if low <= entry.bounds[0] and entry.bounds[1] <= high:
             return Proven(f"`{field}` is declared as {entry.kind}, and every write is cut off there")
         if entry.fresh_bounds is None:

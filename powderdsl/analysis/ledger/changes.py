@@ -25,7 +25,7 @@ MAX_QUESTION = 20_000
 """Nodes evaluated for one question, after which the answer is that it may be."""
 
 MAX_PAIRS = 1024
-"""Pairs of elements that are asked about one by one where a rule computes what a cell becomes."""
+"""Pairs of elements that are asked about one at a time where a rule computes what a cell becomes."""
 
 Condition = tuple[Expr, Offset]
 Pairs = set[tuple[int, int]]
@@ -106,7 +106,7 @@ class Asked:
 
 
 def possible(facts: Facts, conditions: Sequence[Condition], lets: dict[str, Expr]) -> bool:
-    """Whether the conditions may hold together. False is a proof; hard questions are given up, easy ones go on."""
+    """Whether the conditions may hold together. False is a proof; hard questions are given up, easy ones continue."""
     with facts.budget.question(MAX_QUESTION):
         return satisfiable(facts, conditions, lets)
 

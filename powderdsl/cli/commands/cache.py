@@ -25,7 +25,7 @@ class AgeType(click.ParamType):
             return value
         match = re.fullmatch(r"([0-9]{1,6})([smhdw])", str(value))
         if match is None:
-            self.fail(f"`{value}` is no time span: write 30d, 12h or 90m", param, ctx)
+            self.fail(f"`{value}` is not a time span: write 30d, 12h or 90m", param, ctx)
         return float(match[1]) * UNITS[match[2]]
 
 
@@ -64,7 +64,7 @@ def list_entries(as_json: bool) -> None:
     "--older-than", type=AgeType(), default=0.0, help="Only what was not used for so long, such as 30d."
 )
 def clear_entries(older_than: float) -> None:
-    """Remove compiled code. What still runs goes on; it will be compiled again when it is next needed."""
+    """Remove compiled code. What still runs continues; it will be compiled again when it is next needed."""
     from powderdsl.targets.cache import clear
 
     gone = clear(_folder(), older_than)

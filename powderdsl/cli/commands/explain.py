@@ -17,7 +17,7 @@ PAGE_WIDTH = 100
 @click.command("explain")
 @click.argument("code", required=False)
 def command(code: str | None) -> None:
-    """Say what a diagnostic code means, and how to mend it.
+    """Say what a diagnostic code means, and how to fix it.
 
     CODE is a code such as PD301, or its name such as unknown-name. Without one, all codes are listed.
     """
@@ -28,8 +28,8 @@ def command(code: str | None) -> None:
     found = find_code(code)
     if found is None:
         close = similar(code)
-        cure = f"did you mean {', '.join(close)}?" if close else "`powderdsl explain` lists all codes"
-        raise BadInput(f"no code `{code}`; {cure}")
+        fix = f"did you mean {', '.join(close)}?" if close else "`powderdsl explain` lists all codes"
+        raise BadInput(f"no code `{code}`; {fix}")
     text = page(found)
     if not color_wanted(sys.stdout):
         click.echo(text.rstrip("\n"))

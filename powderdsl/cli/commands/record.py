@@ -94,7 +94,7 @@ def command(
     """Record whole episodes of TASK: observations, actions, rewards, ends.
 
     What is recorded follows from the options alone, and not from --envs. When it was interrupted, the same command
-    goes on.
+    continues.
 
     \b
         powderdsl record TASK --out data --episodes 1000
@@ -261,6 +261,6 @@ def _say_how_to_go_on(out: Path, episodes: int) -> None:
         manifest = read_manifest(out)
         there = sum(len(manifest.recipe.episodes_of(row.number)) for row in manifest.shards)
     click.echo(
-        f"stopped with {there:,} of {episodes:,} episodes in {shlex.quote(str(out))}: the same command goes on",
+        f"stopped with {there:,} of {episodes:,} episodes in {shlex.quote(str(out))}: the same command continues",
         err=True,
     )

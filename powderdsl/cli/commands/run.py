@@ -96,7 +96,7 @@ def command(
     """Run rules on a world: watch it, or write what became of it.
 
     Without --out and --watch the last step is drawn in the terminal. Without --world, shapes of all elements
-    are strewn at random: the same ones for the same --seed and --size.
+    are scattered at random: the same ones for the same --seed and --size.
     """
     ruleset = load_rules(rules, settings)
     if out is not None:

@@ -105,7 +105,7 @@ def command(
 ) -> int:
     """Run a study: a file that names commands and the settings to vary, or a shipped one.
 
-    Writes results.md, results.json and figure.png to its folder. The same call goes on where it stopped, and adds to
+    Writes results.md, results.json and figure.png to its folder. The same call continues where it stopped, and adds to
     what is there. Without STUDY, lists those that come with powderdsl.
     """
     known = commands()

@@ -26,7 +26,7 @@ class CellType(click.ParamType):
             return value
         match = re.fullmatch(r"([0-9]{1,9}),([0-9]{1,9})", str(value))
         if match is None:
-            self.fail(f"`{value}` is no cell: write ROW,COLUMN from 0, such as 3,4", param, ctx)
+            self.fail(f"`{value}` is not a cell: write ROW,COLUMN from 0, such as 3,4", param, ctx)
         return int(match[1]), int(match[2])
 
 

@@ -149,7 +149,7 @@ def train_command(
 ) -> None:
     """Train a network on worlds that nobody touches.
 
-    A run that was stopped goes on when the same command is given again, as if it had not been stopped.
+    A run that was stopped continues when the same command is given again, as if it had not been stopped.
     """
     from powderdsl.cli.task_sheets import knob_values
     from powderdsl.worldmodel.rulesets import Variety
@@ -190,7 +190,7 @@ def train_command(
 @_words("--packs", "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.")
 @_training_options
 def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
-    """Go on from a run's weights, on worlds of other packs' elements alone.
+    """Continue from a run's weights, on worlds of other packs' elements alone.
 
     RUN is a run's folder, or its name in runs/. The new run is one of its own.
     """

@@ -128,8 +128,8 @@ class _StudyCheck:
             if step.command == ("wm", "train"):
                 return
             what = f"the run of {needs}" if needs else "a task"
-            cure = f"write `on: {runs[0]}`" if runs else "write `on:` and its name"
-            self.report(None, step, f"`{command}` works on {what}, and this step has no `on`", helps=(cure,))
+            fix = f"write `on: {runs[0]}`" if runs else "write `on:` and its name"
+            self.report(None, step, f"`{command}` works on {what}, and this step has no `on`", helps=(fix,))
             return
         message, label = "", ""
         helps: tuple[str, ...] = ()

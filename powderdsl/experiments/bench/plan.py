@@ -43,7 +43,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Plan:
-    """All that a measurement hangs on.
+    """All that a measurement depends on.
 
     A sample is as many calls of `Simulator.step` as fit into ``seconds / rounds``, each of up to `steps` steps
     from the same worlds.

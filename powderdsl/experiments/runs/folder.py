@@ -104,7 +104,7 @@ def open_run(
                 "PD621",
                 f"{folder} holds another run",
                 notes=differences,
-                helps=("choose another folder with `--run`, or go on with that run's own settings",),
+                helps=("choose another folder with `--run`, or continue with that run's own settings",),
             )
         return found
     new_folder(folder)
@@ -219,7 +219,7 @@ def does_not_fit(folder: Path, *why: str) -> CompileError:
 
 
 def versions() -> dict[str, str]:
-    """What a run's numbers may hang on: Python, the system, and packages that are installed."""
+    """What a run's numbers may depend on: Python, the system, and packages that are installed."""
     found = {
         "powderdsl": str(sys.modules["powderdsl"].__version__),  # our own package, so it has been imported
         "python": platform.python_version(),
@@ -270,4 +270,4 @@ def _flat(config: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, st
 
 
 def _no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
-    return failure("PD620", f"{folder} is no run that can be used here", notes=(why,), helps=helps)
+    return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)

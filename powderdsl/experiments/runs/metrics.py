@@ -23,7 +23,7 @@ class Metrics:
     """Writes numbers by step. A context manager.
 
     Args:
-        folder: the run's. step: where the run goes on; what was written for later steps is dropped, so that a run that
+        folder: the run's. step: where the run continues; what was written for later steps is dropped, so that a run that
             was killed after its last checkpoint writes nothing twice.
     """
 

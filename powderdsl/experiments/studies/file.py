@@ -297,8 +297,8 @@ class _StudyReader:
             judged = steps[of.text]
             while judged.on_step and not judged.makes_run:
                 judged = steps[str(judged.on)]
-            cure = f"`of: {judged.name}`: what is found is kept with the run" if judged.makes_run else ""
-            helps = (f"write {cure}",) if cure else suggest(of.text, made, "steps")
+            fix = f"`of: {judged.name}`: what is found is kept with the run" if judged.makes_run else ""
+            helps = (f"write {fix}",) if fix else suggest(of.text, made, "steps")
             self.reporter.error("PD806", f"the step `{of.text}` makes no run", of.span, helps=helps)
         elif of.text not in made:
             helps = suggest(of.text, made, "steps")

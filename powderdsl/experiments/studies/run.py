@@ -248,5 +248,5 @@ def value_of(measure: Measure, run: Path, point: Point, size: str) -> float:
             )
         found = found[word]
     if isinstance(found, bool) or not isinstance(found, (int, float)):
-        raise ValueError(f"the measure `{measure.name}` is no number in {run / EVALUATION}")
+        raise ValueError(f"the measure `{measure.name}` is not a number in {run / EVALUATION}")
     return float(found)

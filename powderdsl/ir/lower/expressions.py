@@ -30,7 +30,7 @@ class Planes:
     slots: dict[str, Slot]
 
     def property_of(self, prop: Property, element: Node) -> Node:
-        """A property of given elements; values that are parameters are chosen one by one."""
+        """A property of given elements; values that are parameters are chosen one at a time."""
         build = self.build
         if any(isinstance(v, str) for v in prop.values):
             numbers: list[Node] = []

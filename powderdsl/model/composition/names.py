@@ -195,7 +195,7 @@ class NameBook:
         return other in self.needs[pack] or pack in self.needs[other]
 
     def _twice(self, scalar: Scalar, kind: str, pack: str, other: _Definition) -> None:
-        cure = "rename one of them" + (
+        fix = "rename one of them" + (
             "; to replace an element say `override: yes`" if kind == "element" else ""
         )
         self.reporter.error(
@@ -204,7 +204,7 @@ class NameBook:
             scalar.span,
             f"{a(kind)} of {pack}",
             secondary=[Label(other.scalar.span, f"{a(other.kind)} of {other.pack}")],
-            helps=[cure],
+            helps=[fix],
         )
 
     def _qualified(self, scalar: Scalar, kind: str, pack: str, name: str, first: _Definition) -> None:

@@ -72,9 +72,9 @@ def _compare_discrete(
 ) -> Expr:
     for value, other, place in ((left, right, places[1]), (right, left, places[0])):
         if isinstance(value, Expr) and value.kind in _COMPARABLE:
-            words, cure = _COMPARABLE[value.kind]
+            words, fix = _COMPARABLE[value.kind]
             if not isinstance(other, Expr) or other.kind != value.kind:
-                raise typer.wrong(other, f"{words} to compare with {words}", place, cure)
+                raise typer.wrong(other, f"{words} to compare with {words}", place, fix)
             if op != "eq":
                 raise typer.fail(
                     "PD401",
@@ -127,13 +127,13 @@ def _compare_draw(
         if not draw.kind.lo <= other.value <= draw.kind.hi:
             if (draw.kind.lo, draw.kind.hi) == (0, 1):
                 shown = f"{float(other.value):g}"
-                cure = f"`{shown}%`" if 0 <= other.value <= 100 else "a chance such as `20%`"
+                fix = f"`{shown}%`" if 0 <= other.value <= 100 else "a chance such as `20%`"
                 raise typer.fail(
                     "PD403",
                     f"a draw compared with {shown}",
                     place,
                     "draws lie between 0 and 1",
-                    (f"did you mean {cure}?",),
+                    (f"did you mean {fix}?",),
                 )
             return TRUE if (other.value > draw.kind.hi) == (draw is left) else FALSE
         kind = CHANCE if 0 <= other.value <= 1 else Kind("number")
@@ -226,7 +226,7 @@ def _vector_arithmetic(typer: Typer, op: str, left: Value, right: Value, span: S
             "PD401",
             "a vector adds up with vectors only",
             span,
-            "one side is no vector",
+            "one side is not a vector",
             ("write `vector(rows, columns)`",),
         )
     if (op == "mul" and left_is and right_is) or (op == "div" and right_is):
@@ -272,9 +272,7 @@ def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 def _whole_part(typer: Typer, value: Value, span: Span) -> Expr:
     """An operand of `div`."""
     if isinstance(value, Expr) and value.kind.name == "real":
-        raise typer.wrong(
-            value, "an integer", span, "`div` divides integers; for floats say `/`"
-        )
+        raise typer.wrong(value, "an integer", span, "`div` divides integers; for floats say `/`")
     return typer.whole(value, span)
 
 
@@ -296,7 +294,9 @@ def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         or divisor.value.denominator != 1
         or not 1 <= divisor.value <= MAX_MODULUS
     ):
-        raise typer.fail("PD405", "`mod` takes an integer constant", right.span, f"expected 1 to {MAX_MODULUS}")
+        raise typer.fail(
+            "PD405", "`mod` takes an integer constant", right.span, f"expected 1 to {MAX_MODULUS}"
+        )
     modulus = int(divisor.value)
     value = _coordinate_sum(typer, left, modulus, scope)
     if isinstance(value, Number):

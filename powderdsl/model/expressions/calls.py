@@ -48,7 +48,9 @@ def read_radius(typer: Typer, syntax: Syntax, scope: Scope) -> int:
     """The radius of a kernel: an integer constant."""
     value = typer.evaluate(syntax, scope)
     if not isinstance(value, Number) or value.value.denominator != 1:
-        raise typer.fail("PD405", "a radius is an integer constant", syntax.span, f"expected 1 to {MAX_RADIUS}")
+        raise typer.fail(
+            "PD405", "a radius is an integer constant", syntax.span, f"expected 1 to {MAX_RADIUS}"
+        )
     radius = int(value.value)
     if not 1 <= radius <= MAX_RADIUS:
         label = f"a radius lies in 1..{MAX_RADIUS}"
@@ -114,9 +116,9 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     for child in syntax.children:
         value = typer.evaluate(child, scope)
         if not isinstance(value, Number) or value.value.denominator != 1:
-            cure = "where it varies, loop over the values: `any(… for n in 0..3)`"
+            fix = "where it varies, loop over the values: `any(… for n in 0..3)`"
             raise typer.fail(
-                "PD405", "`at` takes two whole constants", child.span, "not an integer constant", (cure,)
+                "PD405", "`at` takes two whole constants", child.span, "not an integer constant", (fix,)
             )
         steps.append(int(value.value))
     place = Place(typer.offset((steps[0], steps[1]), syntax.span))

@@ -40,9 +40,7 @@ def read_bounds(syntax: Syntax, coercer: Coercer) -> tuple[int, int]:
     for end in syntax.children:
         sign, literal = (-1, end.children[0]) if end.kind == "negate" else (1, end)
         if literal.kind != "integer":
-            raise coercer.fail(
-                "PD405", "a range has integers at its ends", end.span, "not an integer"
-            )
+            raise coercer.fail("PD405", "a range has integers at its ends", end.span, "not an integer")
         bounds.append(sign * int(read_number(literal, coercer)))
     lo, hi = bounds
     if lo > hi:

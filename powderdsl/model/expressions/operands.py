@@ -72,7 +72,7 @@ class Absent:
 
 @dataclass(frozen=True)
 class Broken:
-    """A name whose definition has been reported: using it is no second mistake."""
+    """A name whose definition has been reported: using it is not a second mistake."""
 
 
 Operand = Expr | SetOf | Place | Number | Bounds | Items | Kernel | Absent | Broken
@@ -262,12 +262,12 @@ class Coercer:
             if not 0 <= value.value <= 1:
                 shown = f"{float(value.value * 100):g}%"
                 meant = 1 < value.value <= 100 and "%" not in span.text
-                cure = (
+                fix = (
                     f"did you mean `{float(value.value):g}%`?"
                     if meant
                     else "write a chance from `0%` to `100%`"
                 )
-                raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%", (cure,))
+                raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%", (fix,))
             return Expr("const", CHANCE, value=value.value, span=span)
         if value.kind.name in ("chance", "real"):
             return value

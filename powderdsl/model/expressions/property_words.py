@@ -21,9 +21,9 @@ def not_a_value(prop: Property, syntax: Syntax, typer: Typer) -> None:
             form, example = "a chance", "a chance such as `5%`"
         case _:
             form, example = f"a number in {prop.kind}", f"a number from {prop.kind.lo:g} to {prop.kind.hi:g}"
-    cure = (
+    fix = (
         f"write `{meant}`"
         if meant and prop.kind.name == "flag"
         else f"write {example}, or a parameter of this pack"
     )
-    typer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", (cure,))
+    typer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", (fix,))

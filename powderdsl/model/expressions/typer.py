@@ -72,7 +72,7 @@ class Typer(Coercer):
         self._rule_span: Span | None = None
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
-        """What the syntax stands for. Raises Poisoned after reporting, Asleep if it hangs on an absent name."""
+        """What the syntax stands for. Raises Poisoned after reporting, Asleep if it depends on an absent name."""
         self._work += 1
         if self._work > MAX_WORK + 1:
             raise Poisoned  # that has been said, and is true of all that follows
@@ -159,7 +159,7 @@ class Typer(Coercer):
                 raise Poisoned
             self._sets_too_deep = True
             raise self.fail(
-                "PD508", f"more than {MAX_SET_DEPTH} sets that hang on each other", span, "too many in a row",
+                "PD508", f"more than {MAX_SET_DEPTH} sets that depend on each other", span, "too many in a row",
                 ("list elements or tags",),
             )  # fmt: skip
         pack, syntax = self.set_definitions[name]
@@ -197,8 +197,8 @@ class Typer(Coercer):
             )
         shape = syntax.text in KERNEL_SHAPES and syntax.text not in KERNELS
         if shape and self.find(syntax.text, syntax.span, scope) is None:
-            label, cure = "its radius is missing", (f"write `{syntax.text}(3)`",)
-            raise self.fail("PD406", f"`{syntax.text}` needs a radius", syntax.span, label, cure)
+            label, fix = "its radius is missing", (f"write `{syntax.text}(3)`",)
+            raise self.fail("PD406", f"`{syntax.text}` needs a radius", syntax.span, label, fix)
         if syntax.text in FUNCTIONS:
             raise self.fail(
                 "PD406",
@@ -254,7 +254,7 @@ class Typer(Coercer):
                 text = f"{base_syntax.span.text} is {syntax.text}"
                 raise self.fail(
                     "PD401",
-                    f"`{syntax.text}` is no field or property",
+                    f"`{syntax.text}` is not a field or property",
                     word,
                     f"this is {'an element' if value.name else 'a set of elements'}",
                     helps=(f"write `{text}`",),
@@ -328,8 +328,8 @@ class Typer(Coercer):
         )
         for operand, child in zip(operands, syntax.children, strict=True):
             if places and isinstance(operand, (SetOf, Items)) and getattr(operand, "name", None) is None:
-                cure = "write `is` or `is not` instead of `==` or `!=`"
-                raise self.wrong(operand, "one element to compare with", child.span, cure)
+                fix = "write `is` or `is not` instead of `==` or `!=`"
+                raise self.wrong(operand, "one element to compare with", child.span, fix)
 
     def is_(self, syntax: Syntax, scope: Scope) -> Operand:
         positive = syntax.kind in ("is_", "in_")

@@ -67,11 +67,11 @@ class UnknownNames:
                 "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it",
                 secondary=[Label(span, "and here") for span in others[:MAX_PLACES]],
                 notes=[f"and in {rest} more places"] if rest > 0 else [],
-                helps=self._cure(name, places[first], after_dot),
+                helps=self._fix(name, places[first], after_dot),
             )
         self._places.clear()
 
-    def _cure(self, name: str, known_here: tuple[str, ...], after_dot: bool) -> tuple[str, ...]:
+    def _fix(self, name: str, known_here: tuple[str, ...], after_dot: bool) -> tuple[str, ...]:
         elsewhere = [qualified for qualified in self.symbols.params if qualified.endswith(f".{name}")]
         if elsewhere:
             return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)

@@ -123,9 +123,9 @@ class GridReader:
         if word == ANYTHING:
             if expected:
                 return None
-            cure = (f"write `{DEFAULT}` for what a fresh cell has",)
+            fix = (f"write `{DEFAULT}` for what a fresh cell has",)
             raise self.typer.fail(
-                "PD110", "a start world leaves nothing open", place, FORMS[kind.name][1], cure
+                "PD110", "a start world leaves nothing open", place, FORMS[kind.name][1], fix
             )
         try:
             return read_word(word, kind, self.ids, ranges=expected)

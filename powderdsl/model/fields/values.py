@@ -73,11 +73,11 @@ def unknown_element_key(key: Scalar, context: str, what: str, symbols: Symbols, 
 def _may_have(field: Field, number: int, element: str, key: Scalar, typer: Typer) -> bool:
     """Whether fresh cells of the element can have a value of their own; reports if not."""
     if field.at != "element":
-        label, cure = "a field of a place belongs to no element", "say `at: element`"
+        label, fix = "a field of a place belongs to no element", "say `at: element`"
     elif field.resets:
-        label, cure = "what resets has one default for all", "leave out `resets`, or set it in a pass"
+        label, fix = "what resets has one default for all", "leave out `resets`, or set it in a pass"
     elif field.of is not None and number not in field.of:
-        label, cure = f"`of:` leaves `{element}` out", f"add `{element}` to `of:`"
+        label, fix = f"`of:` leaves `{element}` out", f"add `{element}` to `of:`"
     else:
         return True
     other = (Label(field.span, "declared here"),)
@@ -87,6 +87,6 @@ def _may_have(field: Field, number: int, element: str, key: Scalar, typer: Typer
         key.span,
         label,
         secondary=other,
-        helps=[cure],
+        helps=[fix],
     )
     return False

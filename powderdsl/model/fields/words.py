@@ -30,7 +30,7 @@ Bounds = tuple[float, float]
 
 
 class WordProblem(Exception):
-    """What is wrong with a word: a code, a message, a label, and maybe cures."""
+    """What is wrong with a word: a code, a message, a label, and maybe fixes."""
 
     def __init__(self, code: str, message: str, label: str, *helps: str):
         super().__init__(message)
@@ -101,9 +101,9 @@ def _number(word: str, kind: Kind) -> float | None:
         return None
     value = Fraction(word)
     if not kind.lo <= value <= kind.hi:
-        cure = "write a number in this range, or widen it where it is declared"
+        fix = "write a number in this range, or widen it where it is declared"
         raise WordProblem(
-            "PD402", f"{word} lies outside {kind}", f"the range is {kind.lo:g}..{kind.hi:g}", cure
+            "PD402", f"{word} lies outside {kind}", f"the range is {kind.lo:g}..{kind.hi:g}", fix
         )
     if whole:
         return int(value)

@@ -377,7 +377,7 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
 def _parity(
     conflict: Conflict, question: Sequence[tuple[Expr, Offset]], facts: Facts, lets: dict[str, Expr]
 ) -> Conflict:
-    """The conflict with the cure for rules that alternate by row or column: worlds without a seam keep them apart."""
+    """The conflict with the fix for rules that alternate by row or column: worlds without a seam keep them apart."""
     asked = [*(condition for condition, _ in question), *lets.values()]
     nodes = [node for one in asked for node in one.walk()]
     moduli = [node.value[1] for node in nodes if node.op == "coordinate" and node.value[0] != "step"]
@@ -387,13 +387,13 @@ def _parity(
     seamless = replace(facts, side_multiple=multiple, budget=Budget(MAX_QUESTION))
     if satisfiable(seamless, question, lets):
         return conflict
-    note = f"they meet only at the seam of a world whose sides are no multiples of {multiple}"
-    cure = f"allow only worlds without a seam: `side_multiple: {multiple}`, a key of the pack"
-    return replace(conflict, notes=(*conflict.notes, note), helps=(cure, *conflict.helps[1:]))
+    note = f"they meet only at the seam of a world whose sides are not multiples of {multiple}"
+    fix = f"allow only worlds without a seam: `side_multiple: {multiple}`, a key of the pack"
+    return replace(conflict, notes=(*conflict.notes, note), helps=(fix, *conflict.helps[1:]))
 
 
 def _undecided(conflict: Conflict) -> Conflict:
-    """The conflict of two rules whose conditions are too hard: to say that they must exclude each other is no help."""
+    """The conflict of two rules whose conditions are too hard: to say that they must exclude each other is not a help."""
     note = "their conditions combine too many values to decide whether they can meet"
     helps = ("choose what happens if they do: `conflicts: first_wins`", "or put one of them under `then:`")
     return replace(conflict, notes=(note,), helps=helps)
@@ -402,7 +402,7 @@ def _undecided(conflict: Conflict) -> Conflict:
 def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
     """For each of these properties the ids whose cells may hold their own value: those that some rule assigns it to.
 
-    A value of its own may fulfill the condition of another such rule: this goes on until nothing is added.
+    A value of its own may fulfill the condition of another such rule: this continues until nothing is added.
     """
     found: dict[str, frozenset[int]] = {name: frozenset() for name in names}
     while True:

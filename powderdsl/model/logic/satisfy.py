@@ -51,7 +51,7 @@ class Facts:
 
 
 class _Unknown(Exception):
-    """The value hangs on something free."""
+    """The value depends on something free."""
 
 
 class _Joint(NamedTuple):

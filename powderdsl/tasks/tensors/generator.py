@@ -156,7 +156,7 @@ def _draw_blocks(generator: Generator) -> Iterator[tuple[int, int, int]]:
 
 
 def _shape_number(region: Region, place: int) -> int:
-    """A region's own draws hang on its name and the shape's place."""
+    """A region's own draws depend on its name and the shape's place."""
     return name_number(f"{region.name} {place}")
 
 

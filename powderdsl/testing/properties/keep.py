@@ -107,7 +107,7 @@ def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Sample, int]:
         )
         helps = ("a counterexample is written by `powderdsl test`",)
         raise failure(
-            "PD602", f"{path} is no counterexample for {ruleset.name}", notes=(note,), helps=helps
+            "PD602", f"{path} is not a counterexample for {ruleset.name}", notes=(note,), helps=helps
         ) from None
 
 

@@ -70,7 +70,7 @@ def find_scene(path_or_name: str | Path) -> Scene:
 def _is_file(text: str) -> bool:
     try:
         return Path(text).is_file()
-    except OSError:  # a name longer than the system allows is no file either
+    except OSError:  # a name longer than the system allows is not a file either
         return False
 
 
