@@ -72,7 +72,7 @@ mutation: $(VENV)/.ready  ## judge all mutants of the shipped packs, and write t
 fuzz: $(VENV)/.ready  ## compare all backends on random rules and worlds (ARGS="--seconds 60"; ARGS=--help)
 	@$(BIN)/python -m tests.fuzz $(ARGS)
 
-golden: $(VENV)/.ready  ## write the golden files anew; read the diff before committing it
+golden: $(VENV)/.ready  ## rewrite the golden files; read the diff before committing it
 	@$(BIN)/python -m pytest --quiet -m golden --update-golden $(ARGS)
 	@git status --short tests
 

@@ -1,4 +1,4 @@
-"""Fuzzing at length: many seeds in several processes, what fails made small and saved, and where to go on."""
+"""Fuzzing at length: many seeds in several processes, what fails made small and saved, and where to continue."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Tally:
 
 
 def describe(plan: Plan) -> str:
-    """The plan in a line; a campaign goes on only under the same one."""
+    """The plan in a line; a campaign continues only under the same one."""
     return f"{','.join(plan.backends)} worlds {plan.worlds} steps {plan.steps} {plan.building.level}"
 
 
@@ -90,7 +90,9 @@ def load_tally(folder: Path, plan: Plan) -> Tally:
     except OSError as error:
         raise failure("PD101", f"cannot read {path}", notes=(str(error.strerror),)) from None
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise failure("PD602", f"{path} is no state of `python -m tests.fuzz`", notes=(str(error),)) from None
+        raise failure(
+            "PD602", f"{path} is not a state of `python -m tests.fuzz`", notes=(str(error),)
+        ) from None
     if tally.plan != describe(plan):
         notes = (f"there: {tally.plan}", f"here: {describe(plan)}")
         helps = ("give the options that it began with, or another folder",)

@@ -47,7 +47,7 @@ def read_case(path: Path) -> Case:
     """The case in a file.
 
     Raises:
-        CompileError: it cannot be read (PD1xx), it is no case (PD602), or its rules are refused.
+        CompileError: it cannot be read (PD1xx), it is not a case (PD602), or its rules are refused.
     """
     reporter = Reporter()
     source = read_source(path, reporter)
@@ -79,5 +79,5 @@ def read_case(path: Path) -> Case:
         )
         helps = ("a case is written by `python -m tests.fuzz`",)
         raise failure(
-            "PD602", f"{path} is no case of `python -m tests.fuzz`", notes=(note,), helps=helps
+            "PD602", f"{path} is not a case of `python -m tests.fuzz`", notes=(note,), helps=helps
         ) from None

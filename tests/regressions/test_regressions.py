@@ -1,4 +1,4 @@
-"""Cases that a backend once got wrong, as `python -m tests.fuzz` saved them: all backends run them for ever."""
+"""Cases that a backend once got wrong, as `python -m tests.fuzz` saved them: all backends run them forever."""
 
 from __future__ import annotations
 
