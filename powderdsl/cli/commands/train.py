@@ -27,7 +27,10 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
     "--run", "folder", type=click.Path(path_type=Path), metavar="DIR", help="[default: runs/TASK-seedN]"
 )
 @click.option(
-    "--resume", type=click.Path(path_type=Path), metavar="DIR", help="Go on with a run, as it was asked for."
+    "--resume",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Continue with a run, as it was asked for.",
 )
 @click.option(
     "--preset",
@@ -80,7 +83,7 @@ def command(
 ) -> None:
     """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
 
-    The same command again, or --resume DIR, goes on where a run was interrupted; more --steps go on with one that is
+    The same command again, or --resume DIR, continues where a run was interrupted; more --steps continue with one that is
     done. DIR gets checkpoints, metrics.jsonl and events for TensorBoard.
     """
     asked = {name: value for name, value in given.items() if ctx.get_parameter_source(name) is not _DEFAULT}
