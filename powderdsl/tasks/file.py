@@ -14,7 +14,7 @@ from powderdsl.model.check import resolve_names
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import Reader, first_line
-from powderdsl.model.types import Ruleset
+from powderdsl.model.types import Expr, Ruleset
 from powderdsl.model.world_sides import fits, size_problem
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import parse_scalar
@@ -25,7 +25,7 @@ from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.keys import TASK_KEYS
 from powderdsl.tasks.stamps import read_stamp
 from powderdsl.tasks.statement_lists import BROKEN, read_items, read_lets, text_span
-from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Scalar, Split, Stamp, Task
+from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Stamp, Task
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene.amounts import filled_in
 from powderdsl.worlds.scene.statements import Statement, Word, read_amount, read_statement, reserved_words
@@ -386,7 +386,7 @@ class _TaskReader:
 
     def goal(self, plan: Plan) -> Goal:
         checker = GoalChecker(self.typer, frozenset(plan.regions), frozenset(plan.targets), plan.knobs)
-        found: dict[str, Scalar | None] = {}
+        found: dict[str, Expr | None] = {}
         for section in ("reward", "end"):
             node = self.node(section)
             entries = self.reader.mapping(node, section, f"`{section}`") if node is not None else {}

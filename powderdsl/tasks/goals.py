@@ -1,4 +1,4 @@
-"""Reward and end expressions: syntax -> `Scalar`, cell conditions checked as those of rules are."""
+"""Reward and end expressions: syntax -> `Expr` of whole worlds, cell conditions checked as those of rules are."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from powderdsl.model.expressions.literals import read_number
 from powderdsl.model.expressions.operands import Asleep, Number, Operand, Poisoned, SetOf
 from powderdsl.model.expressions.scope import Scope
 from powderdsl.model.expressions.typer import Typer
-from powderdsl.model.types import FLAG, Expr
+from powderdsl.model.types import FLAG, REAL, Expr
 from powderdsl.syntax.ast import Syntax
-from powderdsl.tasks.task import Measure, Scalar
+from powderdsl.tasks.task import Measure
 
 MEASURES = {
     "count": "count(CELLS in REGION)",
@@ -62,7 +62,7 @@ class GoalChecker:
         names |= {name: Expr("let", FLAG, value=REGION_LET + name) for name in sorted(self.regions)}
         self.scope = Scope("", names)
 
-    def number(self, syntax: Syntax) -> Scalar | None:
+    def number(self, syntax: Syntax) -> Expr | None:
         """A reward, or None after reporting what is wrong with it."""
         found = self._checked(syntax)
         if found is not None and not any(one.op in ("measure", "action") for one in parts_of(found)):
@@ -70,17 +70,17 @@ class GoalChecker:
             self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
         return found
 
-    def condition(self, syntax: Syntax) -> Scalar | None:
+    def condition(self, syntax: Syntax) -> Expr | None:
         """A condition that ends an episode, or None after a report."""
         found = self.number(syntax)
-        if found is not None and not found.is_condition:
+        if found is not None and found.kind != FLAG:
             self.typer.reporter.error(
                 "PD401", "expected a condition, found a number", syntax.span, "compare it: `… > 0`"
             )
             return None
         return found
 
-    def _checked(self, syntax: Syntax) -> Scalar | None:
+    def _checked(self, syntax: Syntax) -> Expr | None:
         self.typer.start_rule(syntax.span)
         try:
             return self.scalar(syntax)
@@ -92,67 +92,64 @@ class GoalChecker:
 
     # Arithmetic on numbers of the whole world
 
-    def scalar(self, syntax: Syntax) -> Scalar:
+    def scalar(self, syntax: Syntax) -> Expr:
         kind, parts = syntax.kind, syntax.children
         if kind in ("integer", "decimal", "percent"):
-            return Scalar("const", value=float(read_number(syntax, self.typer)))
+            return Expr("const", REAL, value=float(read_number(syntax, self.typer)))
         if kind in ("yes", "no"):
-            return Scalar("const", value=float(kind == "yes"), is_condition=True)
+            return Expr("const", FLAG, value=float(kind == "yes"))
         if kind == "name":
             return self.name(syntax)
         if kind == "call":
             return self.call(syntax)
         if kind == "negate":
-            return Scalar("neg", (self.value(parts[0]),))
+            return Expr("neg", REAL, (self.scalar(parts[0]),))
         if kind in _BINARY:
-            first, second = self.value(parts[0]), self.value(parts[1])
+            first, second = self.scalar(parts[0]), self.scalar(parts[1])
             if kind in ("divide", "mod") and _always_zero(second):
                 raise self.typer.fail(
                     "PD402", "division by zero", parts[1].span, "this is 0", ("divide by another number",)
                 )
-            return Scalar(_BINARY[kind], (first, second))
+            return Expr(_BINARY[kind], REAL, (first, second))
         if kind == "choose":
             yes, condition, no = parts
-            return Scalar("choose", (self.truth(condition), self.value(yes), self.value(no)))
+            return Expr("choose", REAL, (self.truth(condition), self.scalar(yes), self.scalar(no)))
         if kind in ("and_", "or_"):
             both = (self.truth(parts[0]), self.truth(parts[1]))
-            return Scalar(kind.rstrip("_"), both, is_condition=True)
+            return Expr(kind.rstrip("_"), FLAG, both)
         if kind == "not_":
-            return Scalar("not", (self.truth(parts[0]),), is_condition=True)
+            return Expr("not", FLAG, (self.truth(parts[0]),))
         if kind == "compare":
             return self.compare(syntax)
         raise self._needs_measure(syntax)
 
-    def value(self, syntax: Syntax) -> Scalar:
-        return self.scalar(syntax)
-
-    def truth(self, syntax: Syntax) -> Scalar:
+    def truth(self, syntax: Syntax) -> Expr:
         found = self.scalar(syntax)
-        if not found.is_condition:
+        if found.kind != FLAG:
             raise self.typer.fail(
                 "PD401", "expected a condition, found a number", syntax.span, "compare it: `… > 0`"
             )
         return found
 
-    def compare(self, syntax: Syntax) -> Scalar:
-        values = [self.value(part) for part in syntax.children]
-        found: Scalar | None = None
+    def compare(self, syntax: Syntax) -> Expr:
+        values = [self.scalar(part) for part in syntax.children]
+        found: Expr | None = None
         for i, sign in enumerate(syntax.text.split()):
             left, right = values[i], values[i + 1]
             if sign in (">", ">="):
                 left, right, sign = right, left, sign.replace(">", "<")
-            one = Scalar(_COMPARE.get(sign, "eq"), (left, right), is_condition=True)
+            one = Expr(_COMPARE.get(sign, "eq"), FLAG, (left, right))
             if sign == "!=":
-                one = Scalar("not", (one,), is_condition=True)
-            found = one if found is None else Scalar("and", (found, one), is_condition=True)
+                one = Expr("not", FLAG, (one,))
+            found = one if found is None else Expr("and", FLAG, (found, one))
         assert found is not None
         return found
 
-    def name(self, syntax: Syntax) -> Scalar:
+    def name(self, syntax: Syntax) -> Expr:
         if syntax.text in self.knobs:
-            return Scalar("const", value=float(self.knobs[syntax.text]))
+            return Expr("const", REAL, value=float(self.knobs[syntax.text]))
         if syntax.text in ACTION_WORDS:
-            return Scalar("action", value=syntax.text, is_condition=False)
+            return Expr("action", REAL, value=syntax.text)
         raise self._needs_measure(syntax)
 
     def _needs_measure(self, syntax: Syntax) -> Poisoned:
@@ -174,7 +171,7 @@ class GoalChecker:
 
     # Numbers of the whole world
 
-    def call(self, syntax: Syntax) -> Scalar:
+    def call(self, syntax: Syntax) -> Expr:
         name, parts = syntax.text, syntax.children
         span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(name))
         if name not in FUNCTIONS:
@@ -187,18 +184,18 @@ class GoalChecker:
             usage = (f"write `{FUNCTIONS[name]}`",)
             raise self.typer.fail("PD406", message, syntax.span, "", usage)
         if name in ARITHMETIC:
-            values = [self.value(part) for part in parts]
+            values = [self.scalar(part) for part in parts]
             if len(values) == 1:
-                return Scalar(name, (values[0],))
-            return reduce(lambda a, b: Scalar(name, (a, b)), values)
+                return Expr(name, REAL, (values[0],))
+            return reduce(lambda a, b: Expr(name, REAL, (a, b)), values)
         if name in MEMORIES:
-            inner = self.value(parts[0])
+            inner = self.scalar(parts[0])
             if any(one.op in ("start", "before", "action") for one in parts_of(inner)):
                 raise self.typer.fail("PD406", f"`{name}` of what is not a number of a world", parts[0].span)
             if name == "start":
-                return Scalar("start", (inner,))
-            return Scalar("sub", (inner, Scalar("before", (inner,))))
-        return Scalar("measure", value=self.measure(name, parts[0]))
+                return Expr("start", REAL, (inner,))
+            return Expr("sub", REAL, (inner, Expr("before", REAL, (inner,))))
+        return Expr("measure", REAL, value=self.measure(name, parts[0]))
 
     def measure(self, how: str, cells: Syntax) -> Measure:
         if how == "match":
@@ -265,12 +262,12 @@ _CONSTANT: dict[str, Callable[..., float]] = {
 }
 
 
-def _always_zero(scalar: Scalar) -> bool:
+def _always_zero(scalar: Expr) -> bool:
     """Whether a number comes to 0 in every world."""
     return _constant(scalar) == 0
 
 
-def _constant(scalar: Scalar) -> float | None:
+def _constant(scalar: Expr) -> float | None:
     """What numbers alone come to; None where the world matters. Divisors are known not to be 0."""
     if scalar.op == "const":
         return float(scalar.value)
@@ -282,8 +279,8 @@ def _constant(scalar: Scalar) -> float | None:
     return _CONSTANT[scalar.op](*args)
 
 
-def parts_of(scalar: Scalar) -> list[Scalar]:
-    """The scalar and everything in it."""
+def parts_of(scalar: Expr) -> list[Expr]:
+    """The expression and everything in it, in the order in which measures are kept."""
     found, stack = [], [scalar]
     while stack:
         one = stack.pop()

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.types import Expr, Ruleset
@@ -159,28 +158,19 @@ class Measure:
 
 
 @dataclass(frozen=True)
-class Scalar:
-    """Arithmetic on measures, one number a world.
+class Goal:
+    """What counts. `each` is given after every action, `final` with the last; conditions end an episode early.
 
-    `op`: ``const`` (value), ``measure`` (value: Measure), ``action`` (value: ``taken``, ``left``, ``painted``,
-    ``blown``, ``placed``), ``start`` and ``before`` (the argument at the start, and after the previous action),
-    ``add sub mul div mod neg abs min max lt le eq and or not choose``. Conditions are 0 or 1; x / 0 is 0.
+    Each is arithmetic on one number a world: the arithmetic, comparisons and logic of `model.types.OPS`, and
+    ``measure`` (value: Measure), ``action`` (value: ``taken``, ``left``, ``painted``, ``blown``, ``placed``), ``start``
+    and ``before`` (the argument at the start, and after the previous action). Conditions are 0 or 1; x / 0 is 0; ``mod``
+    has two arguments.
     """
 
-    op: str
-    args: tuple[Scalar, ...] = ()
-    value: Any = None
-    is_condition: bool = False
-
-
-@dataclass(frozen=True)
-class Goal:
-    """What counts. `each` is given after every action, `final` with the last; conditions end an episode early."""
-
-    each: Scalar | None
-    final: Scalar | None
-    success: Scalar | None
-    failure: Scalar | None
+    each: Expr | None
+    final: Expr | None
+    success: Expr | None
+    failure: Expr | None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from powderdsl.model.types import Expr, Ruleset
 from powderdsl.targets.dense.program import Kernels, PassFunction, compiled
 from powderdsl.targets.dense.source import pass_source
 from powderdsl.tasks.goals import REGION_LET, parts_of
-from powderdsl.tasks.task import Goal, Measure, Scalar
+from powderdsl.tasks.task import Goal, Measure
 from powderdsl.tasks.tensors.generator import NOTHING
 from powderdsl.worlds.raster import Size
 
@@ -29,7 +29,7 @@ _LOOKING = ("look", "count", "sum", "inside", "coordinate")
 """Operations that see more than the cell itself: a window on the world would change them."""
 
 
-def scalars_of(goal: Goal) -> list[Scalar]:
+def scalars_of(goal: Goal) -> list[Expr]:
     """Every part of a goal's expressions."""
     scalars = [one for one in (goal.each, goal.final, goal.success, goal.failure) if one is not None]
     return [part for one in scalars for part in parts_of(one)]
@@ -201,7 +201,7 @@ class Facts:
     action: Mapping[str, Tensor]
 
 
-def scalar_value(scalar: Scalar, facts: Facts) -> Tensor:
+def scalar_value(scalar: Expr, facts: Facts) -> Tensor:
     """float64 [B]; conditions are 0 or 1."""
     match scalar.op:
         case "const":
