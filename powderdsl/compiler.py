@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import re
+import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -33,15 +35,35 @@ if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
 
 BACKENDS = {
-    "auto": "`torch` at once, and `native` once that is compiled; work of seconds starts no compiler",
-    "torch": "packed bit planes on any device; few cells on a device other than the CPU: one tensor element a cell",
-    "dense": "torch, always one tensor element a cell: the readable one",
-    "planes": "torch, always packed bit planes",
+    "auto": "`arrays` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
+    "torch": "torch tensors with one element a cell, on any device: the readable one",
+    "arrays": "bit planes in NumPy arrays, on the CPU: starts at once, needs no compiler",
     "native": "generated C++ for the CPU; compiled once, then kept",
     "cuda": "generated CUDA C++ for a GPU: whole worlds on the chip, all steps of a call in one launch",
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""
+
+RENAMED_BACKENDS = {"dense": "torch", "planes": "arrays"}
+"""Old names, which still work, and what they are called now."""
+
+
+def current_backend(name: str) -> str:
+    """The name of a backend as it is now: an old one is replaced, with a DeprecationWarning at the caller's line."""
+    new = RENAMED_BACKENDS.get(name)
+    if new is None:
+        return name
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("powderdsl."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(f"the backend `{name}` is called `{new}` now", DeprecationWarning, stacklevel=level)
+    return new
+
+
+def starting_backend(device: str) -> str:
+    """What runs rules on a torch device at once, without compiling."""
+    return "arrays" if str(device).partition(":")[0] == "cpu" else "torch"
+
 
 MAX_BASES = 8
 """Rulesets that extend each other, in a row."""

@@ -24,6 +24,7 @@ MOVED = {
     "runs": "experiments.runs",
     "simulator": "simulation.simulator",
     "tasks.shipped_tasks": "tasks.shipped",
+    "targets.dense": "targets.torch",
     "testing.cases": "testing.generators.cases",
     "tracing": "simulation.tracing",
     "tracing.trace_data": "simulation.tracing.data",

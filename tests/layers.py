@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 _FRONT = ("diagnostics", "system", "syntax", "model")
 _COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
-_TARGETS = ("targets", "targets.dense", "targets.arrays", "targets.cpp", "targets.cuda")
+_TARGETS = ("targets", "targets.torch", "targets.arrays", "targets.cpp", "targets.cuda")
 _BACK = (*_COMPILER, "model.reference", *_TARGETS)
 _STEPS = (
     "simulation.draw",
@@ -51,10 +51,10 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir.lower": (*_FRONT, "analysis", "ir"),  # the one door from the model into the IR
     "schedule": ("diagnostics", "ir"),
     "targets": ("diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
-    "targets.dense": ("diagnostics", "system", "ir", "schedule", "targets"),
-    "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.dense"),
-    "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense"),
-    "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.dense", "targets.cpp"),
+    "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
+    "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.torch"),
+    "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch"),
+    "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch", "targets.cpp"),
     "compiler": _COMPILER[:-1],
     "simulation": (),
     "simulation.draw": _FRONT,
@@ -115,7 +115,7 @@ _TORCH = (
     "targets.laps",
     "targets.random",
     "targets.words",
-    "targets.dense.mixed",
+    "targets.torch.mixed",
     "targets.*.program",
     "simulation.native_start",
     "simulation.auto",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from powderdsl.cli.exits import counted
-from powderdsl.compiler import BACKENDS, load_with_diagnostics
+from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS, load_with_diagnostics
 from powderdsl.diagnostics import Severity
 
 if TYPE_CHECKING:
@@ -176,10 +176,28 @@ def _place_of(word: str) -> str:
     return str(Path(word).absolute()) if word.endswith((".yaml", ".yml")) else word
 
 
+class BackendType(click.Choice):
+    """A backend. An old name gives the new one, with a note on stderr."""
+
+    def __init__(self) -> None:
+        super().__init__(list(BACKENDS))
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return super().convert(renamed_backend(value), param, ctx)
+
+
+def renamed_backend(name: str) -> str:
+    """The name of a backend as it is now; an old one is noted on stderr."""
+    new = RENAMED_BACKENDS.get(name, name)
+    if new != name:
+        click.echo(f"note: the backend `{name}` is called `{new}` now", err=True)
+    return new
+
+
 def backend_option(default: str, about: str = "What runs the rules.") -> Callable[[Decorated], Decorated]:
     return click.option(
         "--backend",
-        type=click.Choice(list(BACKENDS)),
+        type=BackendType(),
         default=default,
         show_default=True,
         help=about,

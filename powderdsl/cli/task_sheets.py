@@ -124,7 +124,7 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
     from powderdsl.simulation.media import write_png
     from powderdsl.tasks.episodes import compile_task
 
-    program = compile_task(task, split=split, backend="dense")
+    program = compile_task(task, split=split, backend="torch")
     episodes = program.start(torch.arange(seeds))
     start, elements = episodes.world, task.ruleset.elements
     fields = {ramp.field: start[ramp.field].numpy() for ramp in ramps(elements)}

@@ -20,7 +20,7 @@ MAX_GATES = 1 << 14
 
 
 class NotBits(Exception):
-    """Something that planes cannot carry; the dense backend can. `place` is the rule's file and line."""
+    """Something that planes cannot carry; torch tensors can. `place` is the rule's file and line."""
 
     def __init__(self, why: str, place: str = ""):
         super().__init__(why)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
 
-from powderdsl.compiler import BACKENDS
+from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
 from powderdsl.system.settings import out_of_bounds, setting
 
@@ -109,7 +109,10 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
     """Settings as `TrainConfig.as_json` gives them; what is missing is as usual. Raises CompileError (PD640)."""
-    return preset("paper", **{"task": "", **values})
+    backend = values.get("backend", "auto")
+    if isinstance(backend, str):  # of runs from before its name changed
+        backend = RENAMED_BACKENDS.get(backend, backend)
+    return preset("paper", **{"task": "", **values, "backend": backend})
 
 
 def check_config(config: TrainConfig) -> TrainConfig:
@@ -127,7 +130,7 @@ def _mistakes(config: TrainConfig) -> list[Diagnostic]:
         if not isinstance(value, str) or not value:
             found.append(_wrong(f"`{name}` is {value!r}: it takes a name"))
     for name, choices in (("network", NETWORKS), ("backend", tuple(BACKENDS))):
-        if getattr(config, name) not in choices:
+        if getattr(config, name) not in (*choices, *(RENAMED_BACKENDS if name == "backend" else ())):
             found.append(_no_choice(name, getattr(config, name), choices))
     takes = OBSERVATIONS.get(str(config.network), KINDS)
     if config.observation not in takes:

@@ -127,7 +127,7 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
         raise does_not_fit(run.path, *other)
     if tuple(run.config.get("channels", ())) == tuple(env.observation.channels):
         return env
-    program = compile_task(task_of(run), split=config.split, backend="dense", device=str(env.device))
+    program = compile_task(task_of(run), split=config.split, backend="torch", device=str(env.device))
     return TensorEnv(program, 1, observation=config.observation)
 
 

@@ -1,6 +1,6 @@
-"""The backend `auto`: torch at once, native code as soon as it is there. Both give the same worlds, bit for bit.
+"""The backend `auto` on the CPU: arrays at once, native code as soon as it is there. Both give the same worlds, bit for bit.
 
-Code that was compiled before is loaded when the program is made. Otherwise torch runs, and once the work done and asked
+Code that was compiled before is loaded when the program is made. Otherwise arrays run, and once the work done and asked
 for is worth it, a thread compiles in the background. The change comes between two steps: long calls are cut into slices
 for it. Short scripts never start a compiler.
 """
@@ -16,16 +16,16 @@ from dataclasses import replace
 from torch import Tensor
 
 from powderdsl.targets.cpp.compilers import CURE, NoCompiler
-from powderdsl.targets.dense.mixed import Part
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import profile_of
+from powderdsl.targets.torch.mixed import Part
 
 WORTH = 2.0
-"""Seconds of torch, done or still to come in the call that runs, from which native code is compiled. Compiling takes
+"""Seconds of arrays, done or still to come in the call that runs, from which native code is compiled. Compiling takes
 longer than that, but on a processor of its own, and only once: what comes out is kept."""
 
 SLICE = 0.25
-"""Seconds of torch between two looks at whether native code is there."""
+"""Seconds of arrays between two looks at whether native code is there."""
 
 
 class Build:
@@ -45,7 +45,7 @@ class Build:
             self.program = self._make()
         except NoCompiler as error:
             self.problem = str(error)
-        except Exception as error:  # torch continues; `--backend native` shows what is wrong
+        except Exception as error:  # arrays continue; `--backend native` shows what is wrong
             self.problem = f"{type(error).__name__}: {error}"
         self._took = time.perf_counter() - self._began
 
@@ -61,36 +61,36 @@ class Build:
 
 
 class AutoProgram:
-    """Torch until native code is there.
+    """Arrays until native code is there.
 
     Args:
-        torch_program: gives the program on torch, the same at each call.
+        arrays: gives the program on arrays, the same at each call.
         ready: native code that was compiled before, or None; raises NoCompiler if none could be made.
         make: native code, compiled; raises NoCompiler.
     """
 
     def __init__(
-        self, torch_program: Callable[[], Part], ready: Callable[[], Part | None], make: Callable[[], Part]
+        self, arrays: Callable[[], Part], ready: Callable[[], Part | None], make: Callable[[], Part]
     ):
-        self._torch, self._make = torch_program, make
+        self._arrays, self._make = arrays, make
         self._build: Build | None = None
         self._native: Part | None = None
         self._problem = ""
         self._beginning = threading.Lock()
         self._spent = 0.0
-        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on torch
-        self._steps = {"torch": 0, "native": 0, "asked": 0}
+        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on arrays
+        self._steps = {"arrays": 0, "native": 0, "asked": 0}
         try:
             self._native = ready()
         except NoCompiler as error:
             self._problem = str(error)
         if self._native is None:
-            torch_program()
+            arrays()
 
     @property
     def running(self) -> str:
-        """What the next step runs on: ``torch`` or ``native``."""
-        return "torch" if self._arrived() is None else "native"
+        """What the next step runs on: ``arrays`` or ``native``."""
+        return "arrays" if self._arrived() is None else "native"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -101,27 +101,27 @@ class AutoProgram:
             found.append("native: it was compiled before")
         elif native is not None and build is not None:
             found.append(
-                f"torch for {steps['torch']} steps while native was made ready ({build.seconds:.0f} s), "
+                f"arrays for {steps['arrays']} steps while native was made ready ({build.seconds:.0f} s), "
                 f"then native for {steps['native']}"
             )
         elif self._problem:
-            found.append(f"torch: {self._problem}")
+            found.append(f"arrays: {self._problem}")
             found.append(f"native code is faster: {CURE}")
         elif build is not None and not build.lost:
             found.append(
-                f"torch for {steps['torch']} steps; native is being made ready ({build.seconds:.0f} s)"
+                f"arrays for {steps['arrays']} steps; native is being made ready ({build.seconds:.0f} s)"
             )
         else:
-            found.append(f"torch: native is compiled from {WORTH:g} s of work, or by --backend native")
+            found.append(f"arrays: native is compiled from {WORTH:g} s of work, or by --backend native")
         if steps["asked"]:
-            found.append(f"torch for {steps['asked']} steps with given draws or chosen passes")
+            found.append(f"arrays for {steps['asked']} steps with given draws or chosen passes")
         return tuple(found)
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
         if job.draws or job.passes is not None:
             self._steps["asked"] += job.steps
-            return self._torch().run(job)
+            return self._arrays().run(job)
         seed, index, start = job.clock
         state, done = job.state, 0
         while True:
@@ -132,7 +132,7 @@ class AutoProgram:
                 return native.run(replace(part, steps=job.steps - done))
             count = self._slice(job, job.steps - done)
             began = time.perf_counter()
-            state = self._torch().run(replace(part, steps=count))
+            state = self._arrays().run(replace(part, steps=count))
             done += count
             self._account(job, count, job.steps - done, time.perf_counter() - began)
             if done == job.steps:
@@ -140,10 +140,10 @@ class AutoProgram:
 
     def profile(self, job: Job) -> Mapping[str, float]:
         """Seconds by pass over `job.steps`, of what runs now."""
-        return profile_of(self._arrived() or self._torch(), job)
+        return profile_of(self._arrived() or self._arrays(), job)
 
     def _slice(self, job: Job, left: int) -> int:
-        """How many steps to make on torch before looking again: one while nobody knows how long they take."""
+        """How many steps to make on arrays before looking again: one while nobody knows how long they take."""
         if self._problem:
             return left
         cells = job.state["element"].numel()
@@ -152,10 +152,10 @@ class AutoProgram:
         return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
 
     def _account(self, job: Job, count: int, left: int, seconds: float) -> None:
-        """Take note of steps made on torch, and begin to compile if that has become worth it."""
+        """Take note of steps made on arrays, and begin to compile if that has become worth it."""
         if count == 0:
             return
-        self._steps["torch"] += count
+        self._steps["arrays"] += count
         self._spent += seconds
         cells = job.state["element"].numel()
         # The first step makes what later ones use again: how long it takes says nothing of them.

@@ -23,7 +23,7 @@ from powderdsl.targets.cpp.build import cache_key, current
 from powderdsl.targets.cpp.code import NativeCode, compile_program, recall, remember
 from powderdsl.targets.cpp.compilers import find_compiler, flags_for
 from powderdsl.targets.cpp.program import NativeProgram
-from powderdsl.targets.dense.mixed import Part, mixed_program
+from powderdsl.targets.torch.mixed import Part, mixed_program
 
 Lowered = Callable[[], Program]
 """Gives a ruleset in IR; the work is done when it is first called."""

@@ -10,6 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from powderdsl.compiler import lower, starting_backend
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.ir.ops import Program
 from powderdsl.model import reference
@@ -78,14 +79,13 @@ def find_device(name: str | torch.device) -> torch.device:
     return device
 
 
-class TorchProgram:
-    """What runs without a compiler: bit planes in NumPy's arrays on the CPU, tensors of cells on other devices."""
-
-    running = "torch"
+class StartingProgram:
+    """What runs at once, without a compiler: `arrays` on the CPU, `torch` on other devices. Made when first needed."""
 
     def __init__(self, program: Program, device: torch.device):
         self.program = program
         self.device = device
+        self.running = starting_backend(device.type)
         self._made: Runnable | None = None
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
@@ -97,21 +97,15 @@ class TorchProgram:
         return profile_of(self.made(), job)
 
     def made(self) -> Runnable:
-        """The program, made when first needed; passes that planes cannot carry run on cells."""
+        """The program."""
         if self._made is None:
-            from powderdsl.targets.arrays.program import ArrayProgram
-            from powderdsl.targets.dense.mixed import packed_program
-            from powderdsl.targets.dense.program import DenseProgram
-
-            if self.device.type == "cpu":
-                self._made = packed_program(self.program, self.device, ArrayProgram)
-            else:
-                self._made = DenseProgram(self.program, self.device)
+            make = _array_program if self.running == "arrays" else _torch_program
+            self._made = make(self.program, self.device)
         return self._made
 
 
 class CompiledProgram:
-    """Native code or kernels for whole steps; torch where draws are given or passes chosen."""
+    """Native code or kernels for whole steps; what starts at once where draws are given or passes chosen."""
 
     def __init__(self, native: Runnable, rest: Callable[[], Runnable], running: str = "native"):
         self._native, self._rest, self.running = native, rest, running
@@ -134,48 +128,67 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
     """
     if backend == "reference":
         return ReferenceProgram(ruleset)
-    from powderdsl.compiler import lower
-    from powderdsl.targets.dense.program import DenseProgram
-
     # Both are made when first needed: code that was compiled before needs neither.
     lowered = cache(lambda: lower(ruleset))
-    torch_program = cache(lambda: TorchProgram(lowered(), device))
-    if backend == "dense":
-        return DenseProgram(lowered(), device)
-    if backend == "planes":
-        return torch_program().made()
+    starting = cache(lambda: StartingProgram(lowered(), device))
+    if backend == "torch":
+        return _torch_program(lowered(), device)
+    if backend == "arrays":
+        return _array_program(lowered(), device)
     if backend == "native":
-        return CompiledProgram(_native(ruleset, lowered, device, threads), torch_program)
+        return CompiledProgram(_native(ruleset, lowered, device, threads), starting)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
         from powderdsl.targets.cuda.program import cuda_program
 
         with suppress(CompileError) if backend == "auto" else nullcontext():
-            return CompiledProgram(cuda_program(lowered(), device), torch_program, "cuda")
+            return CompiledProgram(cuda_program(lowered(), device), starting, "cuda")
     if backend == "auto" and device.type == "cpu":
         from powderdsl.simulation.auto import AutoProgram
         from powderdsl.simulation.native_start import native_program, ready_program
 
         return AutoProgram(
-            torch_program,
+            starting,
             lambda: ready_program(ruleset, lowered, threads),
             lambda: native_program(ruleset, lowered, threads),
         )
-    return torch_program()
+    return starting()
+
+
+def _torch_program(program: Program, device: torch.device) -> Runnable:
+    from powderdsl.targets.torch.program import TorchProgram
+
+    return TorchProgram(program, device)
+
+
+def _array_program(program: Program, device: torch.device) -> Runnable:
+    """On the CPU only; passes that planes cannot carry run on torch tensors."""
+    from powderdsl.targets.arrays.program import ArrayProgram
+    from powderdsl.targets.torch.mixed import packed_program
+
+    if device.type != "cpu":
+        helps = [f"run on the device `cpu`, or on the backend `torch` or `auto` on `{device}`"]
+        raise _refusal("arrays", "NumPy's arrays are in the memory of the CPU", helps)
+    return packed_program(program, device, ArrayProgram)
 
 
 def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
     from powderdsl.simulation.native_start import native_program
     from powderdsl.targets.cpp.compilers import CURE, NoCompiler
 
-    problem = "native code runs on the CPU" if device.type != "cpu" else ""
-    try:
-        if not problem:
+    if device.type == "cpu":
+        try:
             return native_program(ruleset, lowered, threads)
-    except NoCompiler as error:
-        problem = str(error)
+        except NoCompiler as error:
+            problem = str(error)
+        helps = [f"run on the backend `arrays`, or {CURE}"]
+    else:
+        problem = "native code runs on the CPU"
+        helps = [f"run on the device `cpu`, or on the backend `torch` or `auto` on `{device}`"]
+    raise _refusal("native", problem, helps)
+
+
+def _refusal(backend: str, problem: str, helps: list[str]) -> CompileError:
     reporter = Reporter()
-    helps = [f"run on the backend `torch`, or {CURE}"]
-    reporter.error(
-        "PD701", "the native backend is not available", None, notes=problem.splitlines(), helps=helps
-    )
-    raise CompileError(reporter.diagnostics)
+    message = f"the {backend} backend is not available"
+    reporter.error("PD701", message, None, notes=problem.splitlines(), helps=helps)
+    return CompileError(reporter.diagnostics)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import BACKENDS, load
+from powderdsl.compiler import BACKENDS, current_backend, load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.state import Slot
 from powderdsl.model.types import Ruleset
@@ -103,7 +103,7 @@ class Simulator:
 
     @property
     def running(self) -> str:
-        """The backend that the next step runs on: for ``auto``, ``torch`` or ``native``."""
+        """The backend that the next step runs on: for ``auto`` on the CPU, ``arrays`` or ``native``."""
         return str(getattr(self._program, "running", self.backend))
 
     @property
@@ -461,6 +461,7 @@ def compile(
     model = load(ruleset) if isinstance(ruleset, str) else ruleset
     if not isinstance(model, Ruleset):
         raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
+    backend = current_backend(backend)
     if backend not in BACKENDS:
         reporter = Reporter()
         reporter.error("PD701", f"no backend `{backend}`", None, helps=["backends: " + ", ".join(BACKENDS)])

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import read, set_params
+from powderdsl.compiler import read, set_params, starting_backend
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
 from powderdsl.model.composition.palette import Palette
@@ -220,8 +220,8 @@ class VariedWorlds:
 
     Args:
         task: under the source's own rules. only: as `DataConfig` has it.
-        backend, device, threads: those of `powderdsl.compile`. ``auto`` takes ``torch``, which starts at once: compiling
-            many rulesets to native code would take longer than running them.
+        backend, device, threads: those of `powderdsl.compile`. ``auto`` takes what starts at once: compiling many
+            rulesets would take longer than running them.
 
     Raises:
         CompileError: PD604 if worlds need an element that the rules do not have.
@@ -245,7 +245,7 @@ class VariedWorlds:
         self.rules = source.base
         self._task = task
         self._machine: dict[str, Any] = {
-            "backend": "torch" if backend == "auto" else backend,
+            "backend": starting_backend(device) if backend == "auto" else backend,
             "device": device,
             "threads": threads,
         }

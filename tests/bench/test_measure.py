@@ -32,7 +32,7 @@ def rules():
 
 def test_a_plan_is_a_cross_product_without_repeats(rules):
     plan = make_plan(
-        rules, backends=["torch", "dense"], batches=[1, 4, 1], sizes=[(8, 8), (4, 6)], elements=[2, 3]
+        rules, backends=["arrays", "torch"], batches=[1, 4, 1], sizes=[(8, 8), (4, 6)], elements=[2, 3]
     )
     assert len(plan.cells) == len(set(plan.cells)) == 16
     assert {cell.elements for cell in plan.cells} == {("empty", "wall"), ("empty", "wall", "sand")}
@@ -77,7 +77,7 @@ def test_too_many_cells_are_refused(rules):
 
 def worlds(rules, workload, **options):
     plan = make_plan(rules, workload=workload, **{"batches": [3], "sizes": [(40, 50)], **options})
-    return start_worlds(powderdsl.compile(rules, "dense"), plan.cells[0], workload, seed=1)
+    return start_worlds(powderdsl.compile(rules, "torch"), plan.cells[0], workload, seed=1)
 
 
 @pytest.mark.parametrize("workload", ["gusts", "shapes", "noise", "few"])
@@ -139,14 +139,14 @@ def test_rounds_are_interleaved():
 
 
 def test_all_cells_are_ready_before_the_first_round_and_costs_come_last(rules, torch):
-    plan = make_plan(rules, backends=["dense", "planes"], profile=True, **TINY)
+    plan = make_plan(rules, backends=["torch", "arrays"], profile=True, **TINY)
     kinds = [type(event) for event in measure_events(plan)]
     assert kinds == [Started, Ready] * 4 + [Sample] * 8 + [Started, Costs] * 4
 
 
 def test_torch_has_its_threads_back(rules, torch):
     before = torch.get_num_threads()
-    events = measure_events(make_plan(rules, backends=["dense"], threads=[before + 1], **TINY))
+    events = measure_events(make_plan(rules, backends=["torch"], threads=[before + 1], **TINY))
     next(event for event in events if isinstance(event, Ready))
     assert torch.get_num_threads() == before + 1
     events.close()
@@ -158,7 +158,7 @@ def test_torch_has_its_threads_back(rules, torch):
 
 @pytest.fixture(scope="module")
 def report(rules):
-    plan = make_plan(rules, backends=["reference", "torch"], elements=[2, 4], profile=True, **TINY)
+    plan = make_plan(rules, backends=["reference", "arrays"], elements=[2, 4], profile=True, **TINY)
     return measure(plan)
 
 
@@ -244,7 +244,7 @@ def test_peak_memory_sees_what_was_freed():
 # What passes cost
 
 
-@pytest.mark.parametrize("backend", ["reference", "dense", "planes", "torch", "native"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native"])
 def test_every_backend_profiles_every_pass(backend, tmp_path, torch):
     rules = powderdsl.load("core+sand")  # little to compile
     with building(Building("-O0", tmp_path)):
@@ -257,7 +257,7 @@ def test_every_backend_profiles_every_pass(backend, tmp_path, torch):
 
 def test_profiling_runs_what_running_runs(rules, torch):
     """The watched program is the program: the same worlds come out of it."""
-    sim = powderdsl.compile(rules, "dense")
+    sim = powderdsl.compile(rules, "torch")
     world = start_worlds(sim, make_plan(rules, **TINY).cells[1], "gusts", 0)
     seen = []
     program = sim._program

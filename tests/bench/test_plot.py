@@ -18,7 +18,7 @@ MACHINE = Machine("Linux", "some processor", 4, "cpu", "3", "2", "none", "0", lo
 
 
 def a_report(sizes):
-    plan = make_plan(powderdsl.load("life"), backends=["torch", "native"], batches=[1, 32], sizes=sizes)
+    plan = make_plan(powderdsl.load("life"), backends=["arrays", "native"], batches=[1, 32], sizes=sizes)
     events = [Ready(cell, 1.0, 1.0, Memory(0, "not at all"), 100, 2, 5) for cell in plan.cells]
     samples = [Sample(cell, number, 1.0 + number, 1.0) for number in range(2) for cell in plan.cells]
     return make_report(plan, MACHINE, [*events, *samples])

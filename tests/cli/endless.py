@@ -30,7 +30,7 @@ about: Two runs that are ended.
 seeds: 2
 vary: {batch: [12]}
 steps:
-  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: dense, steps: 900000000, seed: $seed, checkpoint-every: 0}
+  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: torch, steps: 900000000, seed: $seed, checkpoint-every: 0}
   tested: {command: evaluate, on: trained}
 measures:
   reward: {of: trained, value: splits/test/trained/mean}
@@ -44,7 +44,7 @@ sleep 1000 & wait
 """
 """A compiler that works in another process, as compilers do, and never ends; or fails."""
 
-TINY = ("--envs", "4", "--rollout", "3", "--batch", "12", "--backend", "dense")
+TINY = ("--envs", "4", "--rollout", "3", "--batch", "12", "--backend", "torch")
 SMALL = ("--backend", "reference", "--size", "8x8")
 
 
@@ -71,7 +71,7 @@ COMMANDS = {
         2,  # by then the compiler fails
     ),
     "record": Endless(
-        ("record", "dig.yaml", "--out", "data", "--episodes", "150000", "--shard", "3", "--backend", "dense"),
+        ("record", "dig.yaml", "--out", "data", "--episodes", "150000", "--shard", "3", "--backend", "torch"),
         "data/shard-*",
         ("run", "life", *SMALL, "--steps", "3", "--out", "data/x.npz"),
     ),
@@ -87,16 +87,16 @@ COMMANDS = {
     "wm train": Endless(
         (
             *("wm", "train", "--task", "dig.yaml", "--width", "4", "--batch", "4", "--buffer", "32"),
-            *("--refresh", "2", "--states", "100", "--backend", "dense", "--run", "model"),
+            *("--refresh", "2", "--states", "100", "--backend", "torch", "--run", "model"),
             *("--iterations", "900000000", "--store", "disk", "--save-every", "1"),
         ),
         "model/checkpoints/[0-9]*.pt",
     ),
-    "bench": Endless(("bench", "life", "--backend", "torch", "--seconds", "3600", "--out", "x.json"), ""),
+    "bench": Endless(("bench", "life", "--backend", "arrays", "--seconds", "3600", "--out", "x.json"), ""),
     "fuzz": Endless(
-        ("fuzz", "--jobs", "2", "--seeds", "0..900000", "--backends", "dense,native", "--save", "found"),
+        ("fuzz", "--jobs", "2", "--seeds", "0..900000", "--backends", "torch,native", "--save", "found"),
         "tmp/.powderdsl-*/*",
-        ("fuzz", "--jobs", "1", "--seeds", "0..1", "--backends", "dense", "--save", "found"),
+        ("fuzz", "--jobs", "1", "--seeds", "0..1", "--backends", "torch", "--save", "found"),
     ),
     "test": Endless(
         ("test", "core+sand", "--examples", "9000000", "--seconds", "86400", "--no-keep"),

@@ -13,7 +13,7 @@ from powderdsl.experiments.bench.measure import measure_events
 from tests.cli.commands import powderdsl
 
 QUICK = ("bench", "life", "--size", "6x8", "--rounds", "2", "--seconds", "0.001", "--steps", "2")
-DENSE = (*QUICK, "--backend", "dense", "--batch", "2")
+TORCH = (*QUICK, "--backend", "torch", "--batch", "2")
 
 
 @pytest.fixture(autouse=True)
@@ -22,13 +22,13 @@ def _folder(tmp_path, monkeypatch):
 
 
 def test_all_combinations_are_measured(tmp_path):
-    result = powderdsl(*DENSE, "--backend", "reference", "--batch", "3", "--out", "x.json", "--profile")
+    result = powderdsl(*TORCH, "--backend", "reference", "--batch", "3", "--out", "x.json", "--profile")
     assert result.exit_code == 0
     data = json.loads((tmp_path / "x.json").read_text())
     measured = [(cell["backend"], cell["batch"]) for cell in data["cells"]]
-    assert measured == [("dense", 2), ("dense", 3), ("reference", 2), ("reference", 3)]
+    assert measured == [("torch", 2), ("torch", 3), ("reference", 2), ("reference", 3)]
     lines = result.stdout.splitlines()
-    assert [tuple(line.split()[:3]) for line in lines if line.startswith(("dense", "reference"))] == [
+    assert [tuple(line.split()[:3]) for line in lines if line.startswith(("torch", "reference"))] == [
         (backend, str(batch), "6×8") for backend, batch in measured
     ]
     passes = [one["name"] for one in data["cells"][0]["passes"]]
@@ -38,7 +38,7 @@ def test_all_combinations_are_measured(tmp_path):
 
 
 def test_parameters_can_be_set():
-    assert powderdsl(*DENSE, "--set", "life.nonsense=3").exit_code == exits.BAD_INPUT
+    assert powderdsl(*TORCH, "--set", "life.nonsense=3").exit_code == exits.BAD_INPUT
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_without_matplotlib_nothing_is_measured(monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    result = powderdsl(*DENSE, "--plot", "x.png")
+    result = powderdsl(*TORCH, "--plot", "x.png")
     assert result.exit_code == exits.BAD_INPUT
     assert "PD612" in result.stderr
     assert "powderdsl[plot]" in result.stderr
@@ -80,7 +80,7 @@ def test_without_matplotlib_nothing_is_measured(monkeypatch):
 
 def test_a_plot_is_written(tmp_path):
     pytest.importorskip("matplotlib")
-    assert powderdsl(*DENSE, "--plot", "x.png").exit_code == 0
+    assert powderdsl(*TORCH, "--plot", "x.png").exit_code == 0
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -92,7 +92,7 @@ def test_ctrl_c_reports_what_was_measured(monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_command, "measure_events", interrupted)
-    result = powderdsl(*DENSE, "--out", "x.json")
+    result = powderdsl(*TORCH, "--out", "x.json")
     assert result.exit_code == exits.INTERRUPTED
     assert "interrupted: 1 of 2 rounds" in result.stdout
     data = json.loads((tmp_path / "x.json").read_text())
@@ -105,12 +105,12 @@ def test_ctrl_c_before_anything_was_measured(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_command, "measure_events", interrupted)
-    result = powderdsl(*DENSE, "--plot", "x.png")
+    result = powderdsl(*TORCH, "--plot", "x.png")
     assert result.exit_code == exits.INTERRUPTED
     assert "interrupted: 0 of 2 rounds" in result.stdout
 
 
-def test_without_a_compiler_torch_is_measured(monkeypatch):
+def test_without_a_compiler_arrays_are_measured(monkeypatch):
     def none():
         raise bench_command.NoCompiler("no C++ compiler found")
 
@@ -118,7 +118,7 @@ def test_without_a_compiler_torch_is_measured(monkeypatch):
     result = powderdsl(*QUICK, "--batch", "1")
     assert result.exit_code == 0
     assert "no C++ compiler found" in result.stderr
-    assert "\ntorch " in result.stdout
+    assert "\narrays " in result.stdout
     assert "\nnative " not in result.stdout
 
 

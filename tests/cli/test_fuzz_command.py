@@ -12,9 +12,14 @@ import pytest
 
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.build import Building
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.cli.commands import command_line, environment_with, powderdsl, process
+from tests.compilers import skip_without_compiler
 from tests.fuzz import differential
 from tests.fuzz.case_files import read_case, write_case
+from tests.fuzz.cases import Case
+from tests.fuzz.differential import seeded_starts
 from tests.fuzz.reducer import reduce_case
 from tests.processes import started, waited
 
@@ -22,24 +27,66 @@ from tests.processes import started, waited
 @pytest.mark.slow
 def test_a_run_reports_saves_its_state_and_goes_on(tmp_path: Path) -> None:
     options = ("fuzz", "--jobs", 1, "--worlds", 2, "--steps", 1, "--save", tmp_path / "found")
+    options += ("--backends", "torch,arrays")
     first = process(*options, "--seeds", "0..2")
     assert first.returncode == 0, first.stderr
     assert "2 rulesets" in first.stdout
-    assert "dense and planes against the reference" in first.stdout
+    assert "torch and arrays against the reference" in first.stdout
     assert "no differences found" in first.stdout
     assert "bit planes" in first.stdout
     second = process(*options, "--seeds", "0..3", "--resume")
     assert second.returncode == 0, second.stderr
     assert json.loads((tmp_path / "found" / "state.json").read_text())["next"] == 3
     assert "3 rulesets" in second.stdout
-    other = powderdsl(*options, "--resume", "--backends", "dense")
+    other = powderdsl(*options[:-1], "torch", "--resume")
     assert other.exit_code == 2
     assert "PD602" in other.stderr
 
 
 @pytest.mark.slow
+def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
+    skip_without_compiler()
+    given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
+    every = process(*given)
+    assert every.returncode == 0, every.stderr
+    assert "torch, arrays, native and cuda-emulated against the reference" in every.stdout
+    some = process(*given, "--backends", "reference,cuda-emulated")
+    assert some.returncode == 0, some.stderr
+    assert ": cuda-emulated against the reference" in some.stdout
+
+
+def test_without_a_compiler_the_others_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "no-such")
+    given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
+    usual = powderdsl(*given)
+    assert usual.exit_code == 0
+    assert "without `native` and `cuda-emulated`: no C++ compiler" in usual.stderr
+    assert ": torch and arrays against the reference" in usual.stdout
+    asked = powderdsl(*given, "--backends", "arrays,cuda-emulated")
+    assert asked.exit_code == 2
+    assert "leave `cuda-emulated` out of --backends" in asked.stderr
+
+
+def test_a_run_and_a_case_with_old_names_go_on(tmp_path: Path) -> None:
+    """What was saved when `torch` was `dense` and `arrays` was `planes`."""
+    given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path)
+    assert powderdsl(*given, "--seeds", "0..1", "--backends", "torch,arrays").exit_code == 0
+    state = tmp_path / "state.json"
+    state.write_text(state.read_text().replace("torch,arrays", "dense,planes"))
+    again = powderdsl(*given, "--seeds", "0..1", "--backends", "dense,planes", "--resume")
+    assert again.exit_code == 0, again.stderr
+    assert "note: the backend `planes` is called `arrays` now" in again.stderr
+    text = random_ruleset_text(0)
+    start = next(seeded_starts(load_text(text), 0, 1))
+    write_case(tmp_path / "case.yaml", Case(text, start, 1, "planes"))
+    assert read_case(tmp_path / "case.yaml").backend == "arrays"
+
+
+@pytest.mark.slow
 def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
-    line = command_line("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path)
+    line = command_line(
+        "fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path, "--backends", "arrays"
+    )
     state = tmp_path / "state.json"
     with started([*line, "--seeds", "0..100000"], env=environment_with(), stdout=subprocess.PIPE) as running:
         assert waited(lambda: state.exists() or running.poll() is not None)  # it is written every ten seconds
@@ -55,8 +102,11 @@ def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--seeds", "5..2"), "no range of seeds"),
-        (("--backends", "dense,sparse"), "no backend `sparse`"),
+        (("--seeds", "5..2"), "is not a range of seeds"),
+        (("--backends", "torch,sparse"), "no backend `sparse`"),
+        (("--backends", "torch,arrays,torch"), "`torch` is named twice: nothing is compared with itself"),
+        (("--backends", "dense,torch"), "`torch` is named twice: nothing is compared with itself"),
+        (("--backends", "reference"), "the reference is not compared with itself"),
         (("--seeds", "0..2", "--seconds", "3"), "not both"),
         (("--replay", "nowhere.yaml"), "cannot read `nowhere.yaml`"),
         (("--resume", "--save", "nowhere"), "cannot read nowhere/state.json"),
@@ -85,7 +135,7 @@ def test_a_wrong_backend_is_found_reduced_and_replayed(
 
     def wrong(ruleset: Any, backend: str, how: Building, threads: int) -> Simulator:
         simulator = compiled(ruleset, backend, how, threads)
-        if backend == "planes":
+        if backend == "arrays":
             step = simulator.step
 
             def broken(world: Any, *args: Any, **options: Any) -> Any:
@@ -99,7 +149,7 @@ def test_a_wrong_backend_is_found_reduced_and_replayed(
         return simulator
 
     monkeypatch.setattr(differential, "_compiled", wrong)
-    plan = differential.Plan(("planes",), worlds=2, steps=2)
+    plan = differential.Plan(("arrays",), worlds=2, steps=2)
     outcomes = (differential.run_seed(seed, plan) for seed in range(20))
     finding = next(found for outcome in outcomes for found in outcome.findings)
     small = reduce_case(finding.case, differential.still_fails(finding, plan.building))
@@ -110,10 +160,10 @@ def test_a_wrong_backend_is_found_reduced_and_replayed(
     assert "fields" not in (tmp_path / "case.yaml").read_text() or small.start.fields
     replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
     assert replayed.exit_code == 1
-    assert "planes differs after step 1: `element`" in replayed.stdout
+    assert "arrays differs after step 1: `element`" in replayed.stdout
     monkeypatch.setattr(differential, "_compiled", compiled)
     differential._simulator.cache_clear()
     replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
     assert replayed.exit_code == 0
-    assert "planes and the reference agree" in replayed.stdout
+    assert "arrays and the reference agree" in replayed.stdout
     assert read_case(tmp_path / "case.yaml").text == small.text

@@ -199,7 +199,7 @@ JSON = {
         "bench",
         "life",
         "--backend",
-        "torch",
+        "arrays",
         "--seconds",
         "0.01",
         "--rounds",

@@ -177,7 +177,7 @@ def test_numbers_that_there_are_not(recorded: Dataset) -> None:
 def test_data_of_another_meaning_is_refused(recorded: Dataset, small: TaskProgram) -> None:
     recorded.require(TensorEnv(small, 1), same_rules=True)
     with pytest.raises(CompileError) as caught:
-        recorded.require(TensorEnv("ice-bridge", 1, observation="compact", backend="dense"))
+        recorded.require(TensorEnv("ice-bridge", 1, observation="compact", backend="torch"))
     (found,) = caught.value.diagnostics
     assert found.code == "PD631"
     names = {note.split(":")[0].split(".")[0] for note in found.notes}
@@ -190,7 +190,7 @@ def test_data_of_another_meaning_is_refused(recorded: Dataset, small: TaskProgra
                 params=tuple(replace(one, default=1) for one in small.task.ruleset.params),
             ),
         ),
-        backend="dense",
+        backend="torch",
     )
     recorded.require(TensorEnv(melting, 1))
     with pytest.raises(CompileError, match="PD631"):

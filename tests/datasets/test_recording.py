@@ -178,7 +178,7 @@ def test_doing_nothing_is_one_action(small: TaskProgram, tmp_path: Path) -> None
     }
     assert data.recipe.choices == ("sand.sand", "blow")
     with pytest.raises(ValueError, match="may neither `blow` nor do `nothing`"):
-        record("destroying", "nothing", tmp_path / "other", episodes=1, backend="dense")
+        record("destroying", "nothing", tmp_path / "other", episodes=1, backend="torch")
 
 
 def test_another_recipe_is_refused(small: TaskProgram, recorded: Dataset) -> None:

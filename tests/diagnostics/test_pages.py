@@ -253,7 +253,7 @@ def record_with_another_seed() -> None:
     from powderdsl.datasets import record
 
     for seed in (0, 1):
-        record("herd-gas", "nothing", "recorded", episodes=1, seed=seed, max_episode_steps=1, backend="dense")
+        record("herd-gas", "nothing", "recorded", episodes=1, seed=seed, max_episode_steps=1, backend="torch")
 
 
 def open_a_run_of_another_seed() -> None:

@@ -42,7 +42,7 @@ def test_both_checkers_pass_without_a_warning(name: str, simulators: dict[str, S
     task = load_task(name)
     simulator = simulators.get(task.ruleset.name)
     if simulator is None or simulator.ruleset != task.ruleset:
-        simulator = simulators[task.ruleset.name] = compile_rules(task.ruleset, "planes")
+        simulator = simulators[task.ruleset.name] = compile_rules(task.ruleset, "arrays")
     program = TaskProgram(task, "train", simulator)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -57,7 +57,7 @@ def test_the_checkers_look_at_rendering_and_specs_too() -> None:
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make("powderdsl/SandPushing-v0", backend="planes", render_mode="ansi")
+        env = gymnasium.make("powderdsl/SandPushing-v0", backend="arrays", render_mode="ansi")
         check_gymnasium(env.unwrapped)
         check_sb3(env.unwrapped, skip_render_check=False)
 
@@ -216,5 +216,5 @@ def test_one_world_is_refused_a_batch(small: TaskProgram) -> None:
 
 
 def test_one_world_can_be_pickled(task_file: Path) -> None:
-    env = pickle.loads(pickle.dumps(PowderEnv(str(task_file), observation="rgb", backend="dense")))
+    env = pickle.loads(pickle.dumps(PowderEnv(str(task_file), observation="rgb", backend="torch")))
     assert env.reset(seed=0)[0].shape == (16, 16, 3)

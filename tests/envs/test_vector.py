@@ -183,7 +183,7 @@ def test_options_choose_worlds_and_parameters(small: TaskProgram) -> None:
 
 def test_a_task_file_takes_splits_knobs_and_parameters(task_file: Path) -> None:
     env = TensorEnv(
-        task_file, 2, split="test", knobs={"disks": 1}, params={"water.melt": 0.5}, backend="dense"
+        task_file, 2, split="test", knobs={"disks": 1}, params={"water.melt": 0.5}, backend="torch"
     )
     observed, _ = env.reset(seed=0)
     assert observed[:, 0, 1:-1, 1:-1].sum() == 0  # the test split is an empty box
@@ -281,7 +281,7 @@ def test_running_out_of_actions(tmp_path: Path, reward: str, last_action: str, t
         "task: short\nrules: core+sand\nsize: [8, 8]\nfill: sand\ngenerate: [frame wall]\n"
         f"agent: {{may: [sand], bins: 2, brush: 2, actions: 2}}\nreward: {reward}\n"
     )
-    env = TensorEnv(path, 2, last_action=last_action, backend="dense")
+    env = TensorEnv(path, 2, last_action=last_action, backend="torch")
     env.reset(seed=0)
     nothing = torch.zeros(2, 5, dtype=torch.int64)
     assert not torch.stack(env.step(nothing)[2:4]).any()
@@ -332,7 +332,7 @@ def test_every_shipped_task_is_registered_and_batched() -> None:
     from powderdsl.tasks.names import shipped_tasks
 
     assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())
-    env = gymnasium.make_vec("powderdsl/SandPushing-v0", num_envs=3, backend="dense", observation="compact")
+    env = gymnasium.make_vec("powderdsl/SandPushing-v0", num_envs=3, backend="torch", observation="compact")
     assert isinstance(env.unwrapped, PowderVectorEnv)
     assert env.metadata["autoreset_mode"] is env.unwrapped.autoreset_mode is AutoresetMode.SAME_STEP
     observed, _ = env.reset(seed=0)
@@ -355,7 +355,7 @@ def test_gymnasiums_own_statistics_agree(small: TaskProgram) -> None:
 
 
 def test_programs_are_shared(task_file: Path) -> None:
-    program = compile_task(load_task(task_file), backend="dense")
+    program = compile_task(load_task(task_file), backend="torch")
     assert TensorEnv(program).program is TensorEnv(program, 2).program is program
     with pytest.raises(ValueError, match="load_task"):
         TensorEnv(program.task, knobs={"disks": 1})

@@ -15,6 +15,7 @@ from tempfile import gettempdir
 
 import torch
 
+from powderdsl.compiler import RENAMED_BACKENDS
 from powderdsl.system.crew import Done, Lost, Tell, work_through
 from powderdsl.system.reading import parse_json, read_bytes
 from powderdsl.system.scratch import scratch_folder
@@ -93,6 +94,8 @@ def load_tally(folder: Path, plan: Plan) -> Tally:
         raise failure(
             "PD602", f"{path} is not a state of `python -m tests.fuzz`", notes=(str(error),)
         ) from None
+    backends, _, rest = tally.plan.partition(" ")
+    tally.plan = ",".join(RENAMED_BACKENDS.get(name, name) for name in backends.split(",")) + f" {rest}"
     if tally.plan != describe(plan):
         notes = (f"there: {tally.plan}", f"here: {describe(plan)}")
         helps = ("give the options that it began with, or another folder",)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from powderdsl.compiler import RENAMED_BACKENDS
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.state import slots
 from powderdsl.syntax.sources import read_source
@@ -70,7 +71,8 @@ def read_case(path: Path) -> Case:
             params,
             int(line_of(tree["step"])),
         )
-        return Case(text, start, int(line_of(tree["steps"])), line_of(tree["backend"]))
+        backend = line_of(tree["backend"])
+        return Case(text, start, int(line_of(tree["steps"])), RENAMED_BACKENDS.get(backend, backend))
     except CompileError:
         raise
     except (AssertionError, KeyError, ValueError, TypeError, OverflowError) as error:

@@ -12,7 +12,7 @@ import click
 
 from powderdsl.cli.dispatch import GuardedCommand
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
-from powderdsl.cli.options import WholeType
+from powderdsl.cli.options import WholeType, renamed_backend
 from powderdsl.cli.progress import progress
 from powderdsl.system.interrupts import Terminated
 
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-COMPARED = ("dense", "planes", "native", "torch")
+NAMES = ("reference", "torch", "arrays", "native", "cuda-emulated")
+COMPILED = ("native", "cuda-emulated")
 MAX_SEED = 1 << 40
 LEVELS = ("0", "1", "2", "3")
 
@@ -40,18 +41,25 @@ class SeedsType(click.ParamType):
 
 
 class BackendsType(click.ParamType):
-    """`dense,planes`: backends, joined by commas."""
+    """`torch,arrays`: what is compared with the reference, each once, joined by commas. The reference may be among them."""
 
     name = "NAMES"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        names = tuple(dict.fromkeys(str(value).replace(" ", "").split(",")))
-        unknown = [name for name in names if name not in COMPARED]
-        if unknown:
-            self.fail(f"no backend `{unknown[0]}` to compare: {', '.join(COMPARED)}", param, ctx)
-        return names
+        if isinstance(value, tuple):
+            return value
+        names = [renamed_backend(name) for name in value.replace(" ", "").split(",")]
+        for number, name in enumerate(names):
+            if name not in NAMES:
+                self.fail(f"no backend `{name}` to compare: {', '.join(NAMES)}", param, ctx)
+            if name in names[:number]:
+                self.fail(f"`{name}` is named twice: nothing is compared with itself", param, ctx)
+        others = tuple(name for name in names if name != "reference")
+        if not others:
+            self.fail("the reference is not compared with itself: name another backend too", param, ctx)
+        return others
 
 
 @click.command("fuzz", cls=GuardedCommand, context_settings={"help_option_names": ["-h", "--help"]})
@@ -60,9 +68,7 @@ class BackendsType(click.ParamType):
 @click.option(
     "--backends",
     type=BackendsType(),
-    default="dense,planes",
-    show_default=True,
-    help="What is compared with the reference: dense, planes, native, torch.",
+    help=f"What is compared: {', '.join(NAMES)}.  [default: all; those that need a C++ compiler if there is one]",
 )
 @click.option("--worlds", type=WholeType(1, 100), default=4, show_default=True, help="Worlds of a ruleset.")
 @click.option("--steps", type=WholeType(1, 10_000), default=3, show_default=True, help="Steps of a world.")
@@ -93,7 +99,7 @@ class BackendsType(click.ParamType):
 def command(
     seeds: range | None,
     seconds: int | None,
-    backends: tuple[str, ...],
+    backends: tuple[str, ...] | None,
     worlds: int,
     steps: int,
     level: str,
@@ -105,12 +111,14 @@ def command(
 ) -> int:
     """Compare all backends with the reference on random rules and worlds.
 
+    cuda-emulated: the kernels of the backend cuda, compiled for the CPU. It and native take seconds a ruleset.
+
     What differs is made small and saved as a file that `--replay` runs again. Ctrl-C ends a run with its report;
     `--resume` continues. Exit code: 0 if all agree, 1 if something was found.
 
     \b
         python -m tests.fuzz --seconds 60
-        python -m tests.fuzz --seeds 0..5000 --backends dense,planes,native
+        python -m tests.fuzz --seeds 0..5000 --backends torch,arrays,native
         python -m tests.fuzz --replay fuzz/seed7-native.yaml
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
@@ -124,23 +132,30 @@ def command(
     building = Building(f"-O{level}")
     if replay is not None:
         return _replay(replay, building)
-    plan = Plan(backends, worlds, steps, building)
-    if "native" in backends:
-        _check_compiler()
+    plan = Plan(_there(backends), worlds, steps, building)
     return _campaign(plan, seeds, seconds, folder, resume, jobs or os.cpu_count() or 1)
 
 
-def _check_compiler() -> None:
+def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
+    """The backends asked for, by default all that are there. Raises CompileError (PD701) if one is not."""
     from powderdsl.system.writing import failure
-    from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
+    from powderdsl.targets.cpp.compilers import CURE, NoCompiler, find_compiler
+    from tests.fuzz.differential import COMPARED
 
+    wanted = asked or COMPARED
+    compiled = [name for name in wanted if name in COMPILED]
     try:
-        find_compiler()
+        if compiled:
+            find_compiler()
     except NoCompiler as error:
-        helps = ("leave `native` out of --backends, or install g++, clang++ or `pip install ziglang`",)
-        raise failure(
-            "PD701", "the native backend is not available", notes=(str(error),), helps=helps
-        ) from None
+        names = " and ".join(f"`{name}`" for name in compiled)
+        if asked is None:
+            click.echo(f"without {names}: {error}", err=True)
+            return tuple(name for name in COMPARED if name not in COMPILED)
+        helps = (f"leave {names} out of --backends, or {CURE}",)
+        problem = f"{names} cannot be compared here"
+        raise failure("PD701", problem, notes=(str(error),), helps=helps) from None
+    return wanted
 
 
 def _replay(path: Path, building: Any) -> int:
@@ -152,8 +167,10 @@ def _replay(path: Path, building: Any) -> int:
     from tests.fuzz.differential import check_case
 
     case = read_case(path)
-    if case.backend not in (*COMPARED, "reference"):
+    if case.backend not in NAMES:
         raise BadInput(f"{path}: no backend `{case.backend}`")
+    if case.backend in COMPILED:
+        _there((case.backend,))
     with scratch_folder(Path(gettempdir())) as scratch:
         found = check_case(case, replace(building, folder=scratch))
     if found is None:
@@ -197,7 +214,7 @@ def _campaign(
 def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted: bool) -> None:
     from tests.fuzz.exercised import ON_CELLS, coverage_table
 
-    names = " and ".join(plan.backends)
+    names = " and ".join(filter(None, (", ".join(plan.backends[:-1]), plan.backends[-1])))
     if interrupted:
         click.echo(f"interrupted; `--resume` continues from seed {tally.next}")
     click.echo(

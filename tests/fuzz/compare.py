@@ -11,12 +11,13 @@ import numpy as np
 from powderdsl.model.types import Moment, Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import Start, load_text
+from tests.fuzz.cuda_emulation import EmulatedSimulator
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
 
-BACKENDS = ("reference", "dense", "planes")
-"""What random rulesets are compared on: native code takes seconds to compile, `torch` is one of the last two."""
+BACKENDS = ("reference", "torch", "arrays")
+"""What random rulesets are compared on: native code and emulated kernels take seconds to compile."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,11 @@ def _run_until(
     cut = replace(rules, passes=tuple(passes))
     states = []
     for sim, world in zip(sims, before, strict=True):
-        part = compile_ruleset(cut, backend=sim.backend, device=str(sim.device))
+        part = (
+            sim.like(cut)
+            if isinstance(sim, EmulatedSimulator)
+            else compile_ruleset(cut, backend=sim.backend, device=str(sim.device))
+        )
         states.append(part.step(replace(world, sim=part), **options).state)
     return next((d for state in states[1:] if (d := find_difference(states[0], state)) is not None), None)
 

@@ -12,11 +12,13 @@ from pathlib import Path
 from powderdsl.compiler import lower
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator
-from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.compilers import find_compiler
 from powderdsl.targets.cuda.program import Arguments, Compile, CudaProgram, Launch, worlds_of
 from powderdsl.targets.cuda.source import KernelSource
-from powderdsl.targets.dense.mixed import packed_program
+from powderdsl.targets.torch.mixed import packed_program
+
+EMULATED = "cuda-emulated"
+"""The name of the CUDA target where its kernels run on the CPU."""
 
 FLAGS = ("-std=c++17", "-O0", "-ffp-contract=off", "-fno-strict-aliasing", "-shared", "-fPIC", "-w")
 
@@ -53,9 +55,7 @@ def compiler_for(folder: Path, order: int) -> Compile:
     return compile
 
 
-def emulated_simulator(
-    ruleset: Ruleset, folder: Path, order: int = 0, shared_limit: int = 232_448
-) -> Simulator:
+class EmulatedSimulator(Simulator):
     """A simulator whose steps run the generated kernels on the CPU.
 
     Args:
@@ -63,12 +63,18 @@ def emulated_simulator(
         order: 0 or 1: which of the fibers between two barriers runs first.
         shared_limit: bytes of shared memory that a block may have.
     """
-    simulator = compile_ruleset(ruleset, backend="dense")
-    compile = compiler_for(folder, order)
-    program = packed_program(
-        lower(ruleset),
-        simulator.device,
-        lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit),
-    )
-    simulator._program = program
-    return simulator
+
+    def __init__(self, ruleset: Ruleset, folder: Path, order: int = 0, shared_limit: int = 232_448):
+        super().__init__(ruleset, "reference", "cpu")
+        self.backend = EMULATED
+        self._how = folder, order, shared_limit
+        compile = compiler_for(folder, order)
+        self._program = packed_program(
+            lower(ruleset),
+            self.device,
+            lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit),
+        )
+
+    def like(self, ruleset: Ruleset) -> EmulatedSimulator:
+        """Another ruleset, emulated in the same way."""
+        return EmulatedSimulator(ruleset, *self._how)

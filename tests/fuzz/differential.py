@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
+from weakref import finalize
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
@@ -21,6 +23,7 @@ from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.cases import Case, fitted
 from tests.fuzz.compare import find_difference
+from tests.fuzz.cuda_emulation import EMULATED, EmulatedSimulator
 from tests.fuzz.exercised import Used, constructs, operations
 
 if TYPE_CHECKING:
@@ -29,6 +32,9 @@ if TYPE_CHECKING:
 State = Mapping[str, Any]
 
 ORACLE = "reference"
+
+COMPARED = ("torch", "arrays", "native", EMULATED)
+"""Every target but CUDA on a GPU. The last two need a C++ compiler, and seconds a ruleset."""
 
 WIDTHS = (7, 31, 32, 33, 63, 64, 65, 97, 130)
 """Columns of wide worlds: the borders of words of 32 and 64 columns, and more words than one."""
@@ -41,7 +47,7 @@ MANY = 9
 class Plan:
     """What is compared for a seed: backends, the worlds of a ruleset, steps, and how native code is built."""
 
-    backends: tuple[str, ...] = ("dense", "planes")
+    backends: tuple[str, ...] = ("torch", "arrays")
     worlds: int = 4
     steps: int = 3
     building: Building = field(default_factory=lambda: Building("-O0"))
@@ -161,10 +167,20 @@ def _simulator(text: str, backend: str, how: Building) -> Simulator:
 
 
 def _compiled(ruleset: Ruleset, backend: str, how: Building, threads: int) -> Simulator:
+    if backend == EMULATED:
+        return _emulated(ruleset, how.folder, order=threads % 2)
     with building(how):
         simulator = compile_ruleset(ruleset, backend=backend, threads=threads if backend == "native" else 1)
     if how.folder is not None:
         _forget(how.folder)
+    return simulator
+
+
+def _emulated(ruleset: Ruleset, folder: Path | None, order: int) -> Simulator:
+    """Kernels are compiled when worlds of a new size come; they stay in a folder of their own until they are not needed."""
+    kernels = Path(mkdtemp(prefix="powderdsl-kernels-", dir=folder))
+    simulator = EmulatedSimulator(ruleset, kernels, order)
+    finalize(simulator, shutil.rmtree, kernels, ignore_errors=True)
     return simulator
 
 

@@ -384,8 +384,8 @@ def make_valid(folder: Path, run: Callable[..., None]) -> None:
     (folder / "study.yaml").write_text(STUDY)
     run("run", "core+sand", "--size", "8", "--steps", "1", "--backend", "reference", "--out", "world.npz")
     run("render", "scene.yaml", "--rules", "core+sand", "--scale", "1", "--out", "world.png")
-    run("record", "dig.yaml", "--out", "data", "--episodes", "4", "--shard", "2", "--backend", "dense")
-    tiny = ("--backend", "dense", "--preset", "small")
+    run("record", "dig.yaml", "--out", "data", "--episodes", "4", "--shard", "2", "--backend", "torch")
+    tiny = ("--backend", "torch", "--preset", "small")
     run("train", "dig.yaml", *tiny, "--envs", "4", "--rollout", "3", "--batch", "12", "--steps", "12", "--features", "8", "--run", "ppo")  # fmt: skip
     run("wm", "train", "--task", "dig.yaml", *tiny, "--iterations", "2", "--batch", "2", "--width", "2", "--states", "4", "--buffer", "8", "--refresh", "2", "--run", "wm")  # fmt: skip
     for run_folder in ("ppo", "wm"):

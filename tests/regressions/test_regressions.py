@@ -10,7 +10,7 @@ import pytest
 from powderdsl.targets.cpp.build import Building
 from tests.compilers import skip_without_compiler
 from tests.fuzz.case_files import read_case
-from tests.fuzz.differential import check_case
+from tests.fuzz.differential import COMPARED, check_case
 
 FOLDER = Path(__file__).parent
 FILES = sorted(FOLDER.glob("*.yaml"))
@@ -19,7 +19,7 @@ FILES = sorted(FOLDER.glob("*.yaml"))
 def cases() -> list:
     found = []
     for path in FILES:
-        for backend in ("dense", "planes", "native"):
+        for backend in COMPARED:
             found.append(pytest.param(path, backend, id=f"{path.stem}-{backend}"))
     return found
 

@@ -32,7 +32,7 @@ def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_world_finds_its_elements_under_other_ids() -> None:
-    sim = powderdsl.compile(powderdsl.load("powderworld", "beetle.yaml"), "dense")
+    sim = powderdsl.compile(powderdsl.load("powderworld", "beetle.yaml"), "torch")
     world = load_world("world.npz", sim)
     with np.load("world.npz", allow_pickle=False) as saved:
         palette = json.loads(str(saved["about"]))["palette"]
@@ -46,7 +46,7 @@ def test_a_dataset_is_read_and_fits_its_task() -> None:
     dataset = Dataset.open("data")
     dataset.check()
     assert len(dataset) == 4
-    dataset.require(TensorEnv(load_task("meadow.yaml"), 1, backend="dense"), same_rules=True)
+    dataset.require(TensorEnv(load_task("meadow.yaml"), 1, backend="torch"), same_rules=True)
 
 
 @pytest.mark.parametrize(("name", "slots"), [("wm", 14), ("wm21", 33)])
@@ -74,7 +74,7 @@ def test_an_old_world_model_learns_a_new_pack() -> None:
 def test_an_agent_is_read_and_continues() -> None:
     run = find_run("agent")
     assert recorded_palette(run) is None
-    env = TensorEnv(task_of(run), 1, observation="ids", backend="dense")
+    env = TensorEnv(task_of(run), 1, observation="ids", backend="torch")
     assert load_policy(run, env).step == 16
     config = config_of(run)
     assert config.packs == ()

@@ -20,7 +20,7 @@ def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:
     return powderdsl.compile(rules, backend=backend)
 
 
-@pytest.mark.parametrize("backend", ["dense", "planes", "native"])
+@pytest.mark.parametrize("backend", ["torch", "arrays", "native"])
 @pytest.mark.parametrize("name", RULESETS)
 def test_same_worlds(name: str, backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     rules = powderdsl.load(name)
@@ -53,7 +53,7 @@ def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyp
     rates = torch.tensor([0.0, 0.3, 1.0], dtype=torch.float64)
     ids = torch.randint(14, (3, 8, 40), generator=torch.Generator().manual_seed(1))
     oracle = powderdsl.compile(rules, backend="reference")
-    for backend in ("dense", "planes", "native"):
+    for backend in ("torch", "arrays", "native"):
         sim = compiled(rules, backend)
         together = sim.step(sim.world(ids, seed=4), 3, params={"water.melt": rates, "fire.spread": rates})
         for i, rate in enumerate(rates.tolist()):
@@ -76,7 +76,7 @@ def test_what_is_skipped_changes_nothing(seed: int, torch, monkeypatch) -> None:
     monkeypatch.setattr(kernels, "PIECE", 100)
     monkeypatch.setattr(program, "CHUNK", 64 * 30 * 2)
     rules = powderdsl.load("powderworld")
-    oracle, other = powderdsl.compile(rules, backend="dense"), powderdsl.compile(rules, backend="planes")
+    oracle, other = powderdsl.compile(rules, backend="torch"), powderdsl.compile(rules, backend="arrays")
     generator = torch.Generator().manual_seed(seed)
     ids = torch.randint(14, (5, 30, 64), generator=generator)
     ids[torch.rand(ids.shape, generator=generator) < (0.2, 0.2, 0.9, 0.9)[seed]] = 0

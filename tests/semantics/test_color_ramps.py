@@ -21,7 +21,7 @@ from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import powderdsl as run_command
 from tests.compilers import skip_without_compiler
 
-BACKENDS = ["reference", "dense", "planes", "native"]
+BACKENDS = ["reference", "torch", "arrays", "native"]
 SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
 
 KILN = """\
@@ -94,9 +94,9 @@ def test_large_worlds_in_strips(backend: str, torch) -> None:  # type: ignore[no
     """Packed worlds that lie in strips are drawn as those that do not."""
     skip_without_compiler(backend)
     ruleset = kiln()
-    native, dense = (powderdsl.compile(ruleset, backend=one) for one in (backend, "dense"))
+    native, plain = (powderdsl.compile(ruleset, backend=one) for one in (backend, "torch"))
     start = random_start(ruleset, Choices.seeded(1), (1, 128, 256))
-    assert torch.equal(native.step(start.world(native)).rgb(), dense.step(start.world(dense)).rgb())
+    assert torch.equal(native.step(start.world(native)).rgb(), plain.step(start.world(plain)).rgb())
 
 
 @pytest.mark.parametrize("kind", ["array", "tensor"])
@@ -218,7 +218,7 @@ def test_pictures_of_commands(stove: Path) -> None:
         "--steps",
         "3",
         "--backend",
-        "dense",
+        "torch",
         "--out",
         "a.png",
         "--scale",
@@ -239,7 +239,7 @@ def test_pictures_of_commands(stove: Path) -> None:
             "--steps",
             "3",
             "--backend",
-            "dense",
+            "torch",
             "--out",
             "a.npz",
         ).exit_code
@@ -256,7 +256,7 @@ def test_pictures_of_commands(stove: Path) -> None:
         "--steps",
         "3",
         "--backend",
-        "dense",
+        "torch",
         "--out",
         "a.gif",
         "--scale",

@@ -20,7 +20,7 @@ from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.compare import assert_same
-from tests.fuzz.cuda_emulation import emulated_simulator
+from tests.fuzz.cuda_emulation import EmulatedSimulator
 
 PACKS_ALONE = {"acid", "cloner", "core", "fire", "gas", "lava", "plant", "sand", "stone", "water", "wind"}
 LARGE = "powderworld"
@@ -60,7 +60,7 @@ def test_emulated_kernels_give_the_same_worlds(name: str, folder: Path) -> None:
     ruleset = load(name)
     simulators = [
         compile_ruleset(ruleset, backend="reference"),
-        *(emulated_simulator(ruleset, folder, order) for order in (0, 1)),
+        *(EmulatedSimulator(ruleset, folder, order) for order in (0, 1)),
     ]
     for seed, shape in enumerate(SIZES):
         start = random_start(ruleset, Choices.seeded(seed), shape)
@@ -77,7 +77,7 @@ def test_random_rulesets(seed: int, folder: Path) -> None:
     limits = (H200, source.shared - 4, 300)
     simulators = [
         compile_ruleset(ruleset, backend="reference"),
-        *(emulated_simulator(ruleset, folder, n % 2, limit) for n, limit in enumerate(limits)),
+        *(EmulatedSimulator(ruleset, folder, n % 2, limit) for n, limit in enumerate(limits)),
     ]
     assert_same(ruleset, random_start(ruleset, Choices.seeded(seed), shape), steps=2, simulators=simulators)
 
@@ -86,7 +86,7 @@ def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch:
     """Then nothing is held back in registers: planes that neighbors read are never written in place."""
     monkeypatch.setattr("powderdsl.targets.cuda.source.HELD", 0)
     ruleset = load("core+sand+water")
-    simulators = [compile_ruleset(ruleset, backend="reference"), emulated_simulator(ruleset, folder)]
+    simulators = [compile_ruleset(ruleset, backend="reference"), EmulatedSimulator(ruleset, folder)]
     start = random_start(ruleset, Choices.seeded(2), (2, 9, 40))
     assert_same(ruleset, start, steps=3, simulators=simulators)
     assert " o_p" in (text := kernels(ruleset, 9, 40)[0].text)
@@ -95,7 +95,7 @@ def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch:
 
 def test_many_steps_a_launch(folder: Path, torch) -> None:  # type: ignore[no-untyped-def]
     """Twenty steps in one launch are twenty launches, and the state stays packed in between."""
-    simulator = emulated_simulator(load("core+sand+water"), folder)
+    simulator = EmulatedSimulator(load("core+sand+water"), folder)
     ids = torch.randint(4, (3, 9, 40), generator=torch.Generator().manual_seed(1))
     world = simulator.world(ids)
     one_by_one = world
@@ -119,10 +119,10 @@ def test_a_missing_barrier_would_be_seen(folder: Path, monkeypatch: pytest.Monke
     ruleset = load("core+sand+water")
     oracle = compile_ruleset(ruleset, backend="reference")
     start = random_start(ruleset, Choices.seeded(2), (2, 9, 40))
-    assert_same(ruleset, start, steps=3, simulators=[oracle, emulated_simulator(ruleset, folder)])
+    assert_same(ruleset, start, steps=3, simulators=[oracle, EmulatedSimulator(ruleset, folder)])
     monkeypatch.setattr(torch_cuda, "cuda_source", careless)
     with pytest.raises(AssertionError, match="differ in step"):
-        assert_same(ruleset, start, steps=3, simulators=[oracle, emulated_simulator(ruleset, folder)])
+        assert_same(ruleset, start, steps=3, simulators=[oracle, EmulatedSimulator(ruleset, folder)])
 
 
 def test_what_does_not_fit_leaves_the_chip() -> None:
@@ -185,7 +185,7 @@ def test_same_worlds_on_a_gpu(name: str, gpu: str) -> None:
     ruleset = load(name)
     simulators = [
         compile_ruleset(ruleset, backend="reference"),
-        *(compile_ruleset(ruleset, backend=backend, device=gpu) for backend in ("cuda", "planes")),
+        *(compile_ruleset(ruleset, backend=backend, device=gpu) for backend in ("cuda", "torch")),
     ]
     for seed, shape in enumerate([*SIZES, (5, 64, 64), (1, 130, 200)]):
         start = random_start(ruleset, Choices.seeded(seed), shape)
@@ -210,14 +210,14 @@ def test_random_rulesets_on_a_gpu(seed: int, gpu: str) -> None:
 
 @pytest.mark.cuda
 def test_thousands_of_worlds_and_steps_on_a_gpu(gpu: str, torch) -> None:  # type: ignore[no-untyped-def]
-    """A thousand steps in one launch, on every multiprocessor; `planes` on the same device is the other side."""
+    """A thousand steps in one launch, on every multiprocessor; `torch` on the same device is the other side."""
     ruleset = load(LARGE)
     ids = torch.tensor([element.id for element in ruleset.elements])
     start = ids[torch.randint(len(ids), (600, 64, 64), generator=torch.Generator().manual_seed(3))]
     kernel = compile_ruleset(ruleset, backend="cuda", device=gpu)
-    planes = compile_ruleset(ruleset, backend="planes", device=gpu)
+    plain = compile_ruleset(ruleset, backend="torch", device=gpu)
     after = kernel.step(kernel.world(start, seed=4), 1000)
-    expected = planes.step(planes.world(start, seed=4), 1000)
+    expected = plain.step(plain.world(start, seed=4), 1000)
     for slot in kernel.slots:
         assert torch.equal(after.state[slot.name], expected.state[slot.name]), slot.name
     assert torch.equal(after.ids, kernel.step(kernel.step(kernel.world(start, seed=4), 300), 700).ids)

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from powderdsl.compiler import BACKENDS as powderdsl_backends
 from powderdsl.compiler import load, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
@@ -28,12 +29,15 @@ from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from powderdsl.testing.strategies import rulesets, worlds
 from tests.compilers import skip_without_compiler
+from tests.fuzz import differential
+from tests.fuzz.command import NAMES as fuzz_names
 from tests.fuzz.compare import assert_same, find_difference
-from tests.fuzz.differential import Outcome, Plan, run_seed
+from tests.fuzz.differential import COMPARED, Outcome, Plan, run_seed
 from tests.fuzz.exercised import constructs, missing, operations
 from tests.tiers import tiered
 
-BACKENDS = ("reference", "dense", "planes")
+BACKENDS = ("reference", "torch", "arrays")
+"""What needs no compiler; the two that do are compared on fewer seeds."""
 FIRST, LAST = (int(seed) for seed in os.environ.get("POWDERDSL_SEEDS", "0..1000").split(".."))
 CHUNK = 25
 CHUNKS = range(FIRST, LAST, CHUNK)
@@ -119,6 +123,32 @@ def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path
     assert agreed(run_seed(seed, plan) for seed in seeds) >= 4
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "seeds",
+    [range(60, 63), *(pytest.param(range(a, a + 10), marks=pytest.mark.campaign) for a in (63, 73, 83))],
+)
+def test_random_rulesets_as_emulated_kernels(seeds: range, tmp_path: Path) -> None:
+    """The kernels of `cuda`, compiled for the CPU."""
+    skip_without_compiler()
+    plan = Plan(("cuda-emulated",), worlds=4, steps=3, building=Building("-O0", tmp_path))
+    assert agreed(run_seed(seed, plan) for seed in seeds) >= 4
+
+
+def test_every_target_is_compared_once() -> None:
+    """Each backend but `auto`, which runs one of the others, and CUDA as what runs on this machine."""
+    targets = set(powderdsl_backends) - {"auto", "cuda"}
+    assert set(BACKENDS) < {"reference", *COMPARED} == targets | {"cuda-emulated"}
+    assert len(set(COMPARED)) == len(COMPARED)
+    assert fuzz_names == ("reference", *COMPARED)
+    skip_without_compiler()
+    programs = {
+        name: type(differential._compiled(load("life"), name, Building("-O0"), 1)._program)
+        for name in COMPARED
+    }
+    assert len(set(programs.values())) == len(COMPARED), programs
+
+
 @settings(
     max_examples=25, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck)
 )
@@ -195,7 +225,7 @@ def test_a_difference_is_found_and_located() -> None:
         "passes:\n  first: {do: f += 1}\n  second: {do: f += step mod 2}\n"
     )
     start = Start(np.zeros((2, 3, 4), np.uint8))
-    right, wrong = compile_ruleset(ruleset, backend="reference"), compile_ruleset(ruleset, backend="dense")
+    right, wrong = compile_ruleset(ruleset, backend="reference"), compile_ruleset(ruleset, backend="torch")
     assert_same(ruleset, start, simulators=[right, wrong], steps=3)
     step = wrong.step
 

@@ -136,7 +136,7 @@ def claimed(rules: str, most: int):
         except (Invalid, CompileError):
             continue
         if meaning(ruleset) != original.meaning and proven_equal(original.ruleset, ruleset):
-            sim = compile(ruleset, backend="planes")
+            sim = compile(ruleset, backend="arrays")
             wrong = any(
                 differing(batch.states, run_sample(sim, batch.sample, batch.steps)[0]).any()
                 for batch in original.batches()

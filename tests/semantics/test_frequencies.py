@@ -12,7 +12,7 @@ from powderdsl.testing.properties.samples import Sample, single
 from powderdsl.testing.properties.search import COPIES, Plan, Search
 from tests.compilers import skip_without_compiler
 
-BACKENDS = ["reference", "dense", "planes", "native"]
+BACKENDS = ["reference", "torch", "arrays", "native"]
 
 DRIFT = """pack: drift
 elements:
@@ -57,7 +57,7 @@ def test_backends_see_the_same_frequencies(left: str, differs: bool) -> None:
     """The worlds are the same bit for bit, so the verdict on each cell is; one in a hundred is too little to tell."""
     start: Sample = single([[0, 0, 1, 0, 0], [0, 1, 0, 0, 0]], seed=3)
     found = []
-    for backend in ("reference", "dense", "planes"):
+    for backend in ("reference", "torch", "arrays"):
         verdict = breaks(Alike("mirrored", COPIES), Runner(drift(left), backend), start, 1)
         found.append((bool(verdict.first[0]), verdict.cell[0].tolist()))
     assert found == [found[0]] * 3

@@ -174,7 +174,7 @@ def test_channels_of_a_ruleset_stay_in_place() -> None:
     one, two = powderdsl.load("powderworld", far), powderdsl.load("powderworld", far, more)
     assert [channel.name for channel in one.matrix] == [*names, "glow", "heat"]
     assert [channel.name for channel in two.matrix] == [*names, "glow", "heat", "mist"]
-    compact = [powderdsl.compile(rules, "dense").observer.compact_names for rules in (paper, one, two)]
+    compact = [powderdsl.compile(rules, "torch").observer.compact_names for rules in (paper, one, two)]
     assert compact[1][: len(compact[0])] == compact[0]
     assert compact[2][: len(compact[1])] == compact[1]
 
@@ -185,13 +185,13 @@ def test_channels_of_packs_without_a_ruleset_stay_in_place_too() -> None:
         few, more = (powderdsl.load(*names[:n]) for n in (count, count + 1))
         here, there = ([channel.name for channel in rules.matrix] for rules in (few, more))
         assert there[: len(here)] == here
-        old, new = (powderdsl.compile(rules, "dense").observer.compact_names for rules in (few, more))
+        old, new = (powderdsl.compile(rules, "torch").observer.compact_names for rules in (few, more))
         assert new[: len(old)] == old
 
 
 def test_worlds_carry_their_palette_to_other_ids() -> None:
-    here = powderdsl.compile(powderdsl.load("core", "one.yaml", "two.yaml"), "dense")
-    there = powderdsl.compile(powderdsl.load("core", "two.yaml", "one.yaml"), "dense")
+    here = powderdsl.compile(powderdsl.load("core", "one.yaml", "two.yaml"), "torch")
+    there = powderdsl.compile(powderdsl.load("core", "two.yaml", "one.yaml"), "torch")
     ids = np.array(
         [[[here.ruleset.element(name).id for name in ("one.slime", "two.slime", "wall")]]], np.uint8
     )
@@ -217,7 +217,7 @@ def test_a_recorded_palette_decides_ids_but_not_what_happens() -> None:
         .choice([element.id for element in plain.elements], (2, 20, 20))
         .astype(np.uint8)
     )
-    one, two = powderdsl.compile(plain, "reference"), powderdsl.compile(other, "planes")
+    one, two = powderdsl.compile(plain, "reference"), powderdsl.compile(other, "arrays")
     first, second = one.step(one.world(ids), steps=8), two.step(two.world(to[ids]), steps=8)
     assert (to[first.ids.numpy()] == second.ids.numpy()).all()
     assert (first["velocity"] == second["velocity"]).all()

@@ -13,7 +13,7 @@ from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 from tests.fuzz.compare import assert_same
-from tests.fuzz.cuda_emulation import emulated_simulator
+from tests.fuzz.cuda_emulation import EmulatedSimulator
 from tests.tiers import tiered
 
 DIVISION = """\
@@ -186,7 +186,7 @@ PACKS = {
     "together": TOGETHER,
     "headings": HEADINGS,
 }
-TORCH = ("dense", "planes", "torch")
+TORCH = ("torch", "arrays")
 SIZES = ((3, 4, 5), (2, 9, 33), (1, 3, 64), (1, 17, 70))
 """Worlds smaller than the kernels, rows that end within a word, of one word and of three."""
 
@@ -204,7 +204,7 @@ def compare(ruleset: Ruleset, simulators: list[Simulator], sizes: tuple[tuple[in
         assert_same(ruleset, start, steps=4, simulators=[oracle, *simulators])
 
 
-@pytest.mark.parametrize("backend", tiered([*TORCH, "native"], ["planes"]))
+@pytest.mark.parametrize("backend", tiered([*TORCH, "native"], ["arrays"]))
 @pytest.mark.parametrize("name", PACKS)
 def test_worlds_of_a_backend(name: str, backend: str) -> None:
     skip_without_compiler(backend)
@@ -218,6 +218,6 @@ def test_emulated_kernels(name: str, folder: Path) -> None:
     skip_without_compiler()
     ruleset = load_text(PACKS[name])
     simulators = [
-        emulated_simulator(ruleset, folder, n % 2, limit) for n, limit in enumerate((232_448, 232_448, 300))
+        EmulatedSimulator(ruleset, folder, n % 2, limit) for n, limit in enumerate((232_448, 232_448, 300))
     ]
     compare(ruleset, simulators, SIZES)

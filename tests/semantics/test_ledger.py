@@ -240,14 +240,14 @@ def sampled(ruleset: Ruleset, batches: int, worlds: int, side: int, steps: int, 
 def test_random_worlds_do_not_contradict_the_ledger_of_shipped_rules(name: str) -> None:
     ruleset = load(name)
     batches = 10 if name == "powderworld" else 1
-    assert sampled(ruleset, batches, worlds=100, side=16, steps=3, backend="planes") == []
+    assert sampled(ruleset, batches, worlds=100, side=16, steps=3, backend="arrays") == []
     assert watched(ruleset, range(6)).denied == []
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", compositions())
 def test_thousands_of_worlds_do_not_contradict_the_ledger_of_shipped_rules(name: str) -> None:
-    assert sampled(load(name), WORLDS // 100, worlds=100, side=16, steps=3, backend="planes") == []
+    assert sampled(load(name), WORLDS // 100, worlds=100, side=16, steps=3, backend="arrays") == []
 
 
 def test_every_line_of_the_ledger_of_powderworld_is_seen() -> None:
@@ -300,7 +300,7 @@ def test_contradictions_are_seen() -> None:
     ruleset = load("core+water")
     book = ledger(ruleset)
     hopeful = replace(book, rules=tuple(replace(entry, changes=(), moves=()) for entry in book.rules))
-    simulator = compile_ruleset(ruleset, backend="dense")
+    simulator = compile_ruleset(ruleset, backend="torch")
     before = random_start(ruleset, Choices.seeded(1), (4, 16, 16)).world(simulator)
     after = simulator.step(before, 4)
     found = contradictions(hopeful, ruleset, before, after)

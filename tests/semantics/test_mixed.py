@@ -13,7 +13,7 @@ from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.arrays.program import ArrayProgram
-from powderdsl.targets.dense.mixed import MixedProgram, mixed_program
+from powderdsl.targets.torch.mixed import MixedProgram, mixed_program
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
@@ -76,12 +76,12 @@ def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
     assert [any(slot.resets for slot in part.program.slots) for part in parts] == [True, False, False]
 
 
-@pytest.mark.parametrize("backend", ["planes", "native"])
+@pytest.mark.parametrize("backend", ["arrays", "native"])
 def test_the_oracles_worlds(backend: str) -> None:
     """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one at a time."""
     rules = spread("heavy")
     skip_without_compiler(backend)
-    sims = [powderdsl.compile(rules, backend=name) for name in ("reference", "dense", backend)]
+    sims = [powderdsl.compile(rules, backend=name) for name in ("reference", "torch", backend)]
     for number, shape in enumerate([(2, 3, 5), (9, 4, 33), (1, 2, 65)]):
         assert_same(rules, random_start(rules, Choices.seeded(number), shape), steps=3, simulators=sims)
 
@@ -92,7 +92,7 @@ def test_any_passes_on_cells(name: str, torch) -> None:  # type: ignore[no-untyp
     rules = spread(name)
     program = lower(rules)
     choices = Choices.seeded(11)
-    oracle = powderdsl.compile(rules, backend="dense")
+    oracle = powderdsl.compile(rules, backend="torch")
     names = [pass_.name for pass_ in program.passes]
     for number, refused in enumerate((names[0::2], names[1::2], names[-1:])):
         sim = with_refused(rules, program, refused)
@@ -126,7 +126,7 @@ def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simula
         found = carry(program, pass_)
         return Carried(pass_, None, "refused here") if pass_.name in refused else found
 
-    sim = powderdsl.compile(rules, backend="dense")
+    sim = powderdsl.compile(rules, backend="torch")
     sim._program = mixed_program(segments(program, choose), sim.device, ArrayProgram)
     assert isinstance(sim._program, MixedProgram)
     return sim
@@ -136,7 +136,7 @@ def test_rules_without_passes(torch) -> None:  # type: ignore[no-untyped-def]
     """Nothing happens, except that fields which reset do so."""
     rules = load_text(HEAVY.split("streams:")[0])
     worlds: list[World] = []
-    for backend in ("reference", "planes"):
+    for backend in ("reference", "arrays"):
         sim = powderdsl.compile(rules, backend=backend)
         world = sim.replace(sim.world(torch.ones(1, 2, 3, dtype=torch.uint8)), marks=7)
         worlds.append(sim.step(world, 2))

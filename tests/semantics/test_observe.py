@@ -16,7 +16,7 @@ from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 
-BACKENDS = ["reference", "dense", "planes", "native"]
+BACKENDS = ["reference", "torch", "arrays", "native"]
 SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
 
 KINDS = """\
@@ -110,7 +110,7 @@ def test_worlds_may_lie_apart(backend: str, torch) -> None:  # type: ignore[no-u
 
 def test_meaning(torch) -> None:  # type: ignore[no-untyped-def]
     """What the numbers are: palette colors, one-hot channels in the declared order, columns from the lowest bit."""
-    sim = simulator("kinds", "dense")
+    sim = simulator("kinds", "torch")
     world = random_start(sim.ruleset, Choices.seeded(5), (2, 3, 70)).world(sim)
     assert np.array_equal(world.rgb().numpy(), rgb(world.ids.numpy(), palette(sim.ruleset.elements)))
     matrix, at = world.matrix(), sim.ruleset.slots
@@ -141,7 +141,7 @@ def test_meaning(torch) -> None:  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("name", ["kinds", "powderworld"])
 def test_bytes_stand_for_all_that_lasts(name: str, torch) -> None:  # type: ignore[no-untyped-def]
     """Exactly where 256 numbers suffice, else within a sixteenth of the value, and the matrix follows from them."""
-    sim = simulator(name, "dense")
+    sim = simulator(name, "torch")
     world = sim.step(random_start(sim.ruleset, Choices.seeded(8), (2, 16, 70)).world(sim), 1)
     codes, values = world.compact(), sim.observer.compact_values
     assert codes.shape[1] == len(sim.observer.compact_names)
@@ -164,7 +164,7 @@ def test_bytes_stand_for_all_that_lasts(name: str, torch) -> None:  # type: igno
     assert torch.equal(matrix[:, : sim.ruleset.slots], wanted[:, : sim.ruleset.slots])
 
 
-@pytest.mark.parametrize("backend", ["dense", "native"])
+@pytest.mark.parametrize("backend", ["torch", "native"])
 def test_buffers_that_do_not_fit(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     sim = simulator_or_skip("kinds", backend)
     world = sim.step(random_start(sim.ruleset, Choices.seeded(5), (2, 3, 70)).world(sim))
@@ -178,7 +178,7 @@ def test_buffers_that_do_not_fit(backend: str, torch) -> None:  # type: ignore[n
             r"must be contiguous": good.repeat_interleave(2, -1)[..., ::2],
             r"worlds apart": good[:1].expand(good.shape),
         }
-        if backend == "dense" and way.startswith("read"):
+        if backend == "torch" and way.startswith("read"):
             bad[r"must be contiguous.*strides"] = good.mT.contiguous().mT
         for message, out in bad.items():
             with pytest.raises(ValueError, match=message):
@@ -191,7 +191,7 @@ def test_buffers_that_do_not_fit(backend: str, torch) -> None:  # type: ignore[n
 
 def test_no_value_is_asked_for(torch) -> None:  # type: ignore[no-untyped-def]
     """Tensors of the device `meta` have shapes and no values: whoever waits for one of them fails."""
-    sim = simulator("powderworld", "dense")
+    sim = simulator("powderworld", "torch")
     observer = Observer(sim.ruleset, torch.device("meta"))
     world = sim.world(torch.zeros(2, 3, 70, dtype=torch.uint8))
     state = {name: value.to("meta") for name, value in world.state.items()}

@@ -18,7 +18,7 @@ from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import compositions, seeded_ruleset
 
 SHAPES = ((2, 5, 33), (1, 2, 2))
-BACKENDS = ("reference", "dense", "planes")
+BACKENDS = ("reference", "torch", "arrays")
 
 
 def recorded(ruleset: Ruleset, start: Start, backend: str, steps: int) -> Provenance:
@@ -62,7 +62,7 @@ def test_shipped_rules_on_all_backends(name):
 def test_random_rules_on_all_backends(first):
     rulesets = [one for seed in range(first, first + 8) if (one := seeded_ruleset(seed)) is not None]
     assert (
-        sum(assert_alike(one, ((2, 3, 33), (1, 1, 2)), first, ("reference", "dense")) for one in rulesets)
+        sum(assert_alike(one, ((2, 3, 33), (1, 1, 2)), first, ("reference", "torch")) for one in rulesets)
         > 100
     )
 
@@ -84,7 +84,7 @@ def assert_traced_alike(ruleset: Ruleset) -> None:
     """The last writer of every cell is the one that the account of its writes ends with."""
     for shape in ((2, 4, 5), (1, 1, 2)):
         world = replace(random_start(ruleset, Choices.seeded(7), shape), params={}).world(
-            compile(ruleset, backend="dense")
+            compile(ruleset, backend="torch")
         )
         found = writers(world)
         changed = found.world.ids != world.ids
@@ -97,7 +97,7 @@ def assert_traced_alike(ruleset: Ruleset) -> None:
 
 
 def test_only_the_last_step_counts_and_no_step_writes_nothing():
-    sim = compile(load("life"), backend="dense")
+    sim = compile(load("life"), backend="torch")
     ids = np.zeros((1, 5, 5), np.int64)
     ids[0, 2, 1:4] = 1
     world = sim.world(ids)
@@ -117,6 +117,6 @@ def test_only_the_last_step_counts_and_no_step_writes_nothing():
 
 
 def test_worlds_of_other_rules_are_refused():
-    one, other = (compile(load(name), backend="dense") for name in ("life", "cyclic"))
+    one, other = (compile(load(name), backend="torch") for name in ("life", "cyclic"))
     with pytest.raises(ValueError, match="this world belongs to cyclic"):
         Recorder(one).step(other.world(np.zeros((2, 2), np.int64)))

@@ -32,7 +32,7 @@ def needs_compiler() -> None:
 def test_shipped_rulesets_in_strips(name: str) -> None:
     """With edges that wrap and with nothing outside, parities of rows, floats, draws, and parameters by world."""
     ruleset = load(name)
-    simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("dense", "native")]
+    simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("torch", "native")]
     for seed, shape in enumerate(STRIPS):
         assert_same(
             ruleset, random_start(ruleset, Choices.seeded(seed), shape), steps=3, simulators=simulators
@@ -47,7 +47,7 @@ def test_random_rulesets_in_strips(tmp_path: Path) -> None:
         except CompileError:
             continue
         with building(Building("-O0", tmp_path)):
-            simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("dense", "native")]
+            simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("torch", "native")]
         choices = Choices.seeded(seed)
         for height in (8, 16):
             shape = (choices.whole(1, 4), height, choices.pick((1, 5, 33, 64, 70, 130)))

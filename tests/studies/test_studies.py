@@ -244,7 +244,7 @@ about: Nothing much.
 seeds: 1
 vary: {steps: [12, 24]}
 steps:
-  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: dense, steps: $steps, seed: $seed}
+  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: torch, steps: $steps, seed: $seed}
   tested: {command: evaluate, on: trained, episodes: 4}
 measures:
   reward: {of: trained, value: splits/test/trained/mean, expect: rises}

@@ -31,7 +31,7 @@ class Played:
 def simulator():  # type: ignore[no-untyped-def]
     import powderdsl
 
-    return powderdsl.compile(RULES, backend="torch")
+    return powderdsl.compile(RULES, backend="arrays")
 
 
 def play(name: str, split: str) -> dict[str, Played]:

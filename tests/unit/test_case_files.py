@@ -20,7 +20,7 @@ from tests.fuzz.differential import seeded_starts
 def test_a_case_survives_being_written(seed: int, tmp_path: Path) -> None:
     text = random_ruleset_text(seed)
     for number, start in enumerate(seeded_starts(load_text(text), seed, 3)):
-        case = Case(text, start, number + 1, "planes")
+        case = Case(text, start, number + 1, "arrays")
         write_case(tmp_path / "case.yaml", case, "differs: here\nand there")
         again = read_case(tmp_path / "case.yaml")
         assert (again.text, again.steps, again.backend) == (case.text, case.steps, case.backend)
@@ -31,7 +31,7 @@ def test_a_case_survives_being_written(seed: int, tmp_path: Path) -> None:
 
 
 GOOD = """\
-backend: dense
+backend: torch
 steps: 1
 seed: 0
 step: 0
@@ -50,14 +50,14 @@ rules: |
         ("seed: 0\n", "", "PD602"),
         ("- - 0 0", "- - 0 900", "PD602"),
         ("- - 0 0", "- - 0 0\n    - 0", "PD602"),
-        ("backend: dense", "- dense", "PD101"),
+        ("backend: torch", "- dense", "PD101"),
         ("pack: p", "pack: [", "PD101"),
     ],
 )
 def test_what_is_no_case_is_refused(old: str, new: str, code: str, tmp_path: Path) -> None:
     path = tmp_path / "case.yaml"
     path.write_text(GOOD, encoding="utf-8")
-    assert read_case(path).backend == "dense"
+    assert read_case(path).backend == "torch"
     path.write_text(GOOD.replace(old, new), encoding="utf-8")
     with pytest.raises(CompileError) as found:
         read_case(path)

@@ -177,7 +177,7 @@ def test_commands_say_what_is_loaded() -> None:
 
 
 def test_recordings_from_before_names_said_what_is_loaded_go_on() -> None:
-    record("herd-gas", "nothing", "recorded", episodes=1, max_episode_steps=1, backend="dense")
+    record("herd-gas", "nothing", "recorded", episodes=1, max_episode_steps=1, backend="torch")
     recipe = read_manifest(Path("recorded")).recipe
     assert differences(replace(recipe, ruleset="another name"), recipe) == []
     assert len(differences(replace(recipe, ruleset="another name", seed=3), recipe)) == 2

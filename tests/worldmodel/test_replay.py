@@ -15,14 +15,14 @@ from powderdsl.worldmodel.pairs import TEST_SEEDS
 
 
 def worlds_of(config: DataConfig) -> TaskWorlds:
-    return task_worlds(config, backend="dense")
+    return task_worlds(config, backend="torch")
 
 
 def by_hand(task: str, seed: int, config: DataConfig) -> list[tuple[Tensor, Tensor]]:
     """The pairs of one world, alone, one step at a time."""
-    program = compile_task(task, backend="dense")
+    program = compile_task(task, backend="torch")
     ids = program.start(torch.tensor([seed])).world.ids
-    sim = compile_rules(program.task.ruleset, backend="dense")
+    sim = compile_rules(program.task.ruleset, backend="torch")
     world, found = sim.world(ids, seed=[seed]), []
     for _ in range(config.pairs):
         start = world.ids[0].clone()

@@ -94,7 +94,7 @@ def test_packs_that_others_need_stay() -> None:
 
 def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[no-untyped-def]
     source = RulesetSource(RULES, MANY)
-    worlds = VariedWorlds(task, "train", source, 3, backend="dense")
+    worlds = VariedWorlds(task, "train", source, 3, backend="torch")
     seeds = torch.tensor([5, 0, 1, 3, 2, 4])
     start = worlds.start(seeds)
     end = worlds.later(worlds.later(start, 8), 8)
@@ -102,7 +102,7 @@ def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[n
     for place, seed in enumerate(seeds.tolist()):
         drawn = worlds.drawn[seed % 3]
         model = source.model(drawn)
-        alone = powderdsl.compile(model.with_params(dict(drawn.params)), backend="dense")
+        alone = powderdsl.compile(model.with_params(dict(drawn.params)), backend="torch")
         world = worlds.start(torch.tensor([seed]))
         assert torch.equal(world.ids[0], start.ids[place])
         # The same start under this ruleset alone, with its chances as defaults.
@@ -115,12 +115,12 @@ def test_training_and_tests_draw_different_rulesets(dunes: str, tmp_path: Path) 
     data = DataConfig(
         task=dunes, states=12, steps=2, pairs=2, rulesets=3, variety=MANY, capacity=24, refresh=1
     )
-    machine = Machine(backend="dense")
+    machine = Machine(backend="torch")
     config = TrainConfig(data, width=4, iterations=3, batch=4)
     run = train(config, tmp_path / "run", machine=machine)
     trained = load_trained(run)
     assert trained.config == config  # variety and all, through run.json
-    worlds = task_worlds(data, backend="dense")
+    worlds = task_worlds(data, backend="torch")
     assert isinstance(worlds, VariedWorlds)
     assert [one.number for one in worlds.drawn] == [0, 1, 2]
     unseen = unseen_worlds(trained, split="train", rulesets=5, machine=machine)
@@ -146,7 +146,7 @@ def test_unknown_properties_and_bad_numbers_are_refused() -> None:
 def test_seeds_may_have_rulesets_of_their_own(task) -> None:  # type: ignore[no-untyped-def]
     source = RulesetSource(RULES, MANY)
     first, other = (
-        VariedWorlds(task, "train", source, 2, first=number, backend="dense") for number in (0, 1)
+        VariedWorlds(task, "train", source, 2, first=number, backend="torch") for number in (0, 1)
     )
     assert [one.number for one in other.drawn] == [1, 2]
     assert other.drawn[0] == first.drawn[1]

@@ -21,7 +21,7 @@ from powderdsl.worldmodel.scores import unseen_worlds
 from powderdsl.worldmodel.training import Moment
 from tests.processes import started, waited
 
-HERE = Machine(backend="dense")
+HERE = Machine(backend="torch")
 
 
 @pytest.fixture(autouse=True)
@@ -91,7 +91,7 @@ import json, sys, time, torch
 from powderdsl.worldmodel import Machine, TrainConfig, train
 torch.set_num_threads(1)
 config = TrainConfig.of(json.loads(sys.argv[1]))
-train(config, sys.argv[2], machine=Machine(backend="dense"), save_seconds=0.1, tell=lambda now: time.sleep(0.01))
+train(config, sys.argv[2], machine=Machine(backend="torch"), save_seconds=0.1, tell=lambda now: time.sleep(0.01))
 """
 
 

@@ -18,7 +18,7 @@ from tests.cli.commands import ROOT
 from tests.cli.commands import powderdsl as run
 from tests.processes import started, waited
 
-QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 100, "--backend", "dense")
+QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 100, "--backend", "torch")
 
 
 def begin(task: str, folder: Path, *more: object) -> tuple[object, ...]:
@@ -36,7 +36,7 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert about["versions"]["torch"]
     assert (folder / "metrics.jsonl").read_text().count("loss/train") == 1
 
-    told = run("wm", "eval", folder, "--split", "two", "--worlds", 1, "--backend", "dense")
+    told = run("wm", "eval", folder, "--split", "two", "--worlds", 1, "--backend", "torch")
     assert told.exit_code == 0, told.output
     assert "falling" in told.stdout
     assert "left out: lying, which needs stone" in told.stdout
@@ -55,7 +55,7 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
             "--run",
             tuned,
             "--backend",
-            "dense",
+            "torch",
         )
     )
     assert result.exit_code == 0, result.output
@@ -64,14 +64,14 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert about["config"]["parent"] in {path.name for path in (folder / "checkpoints").iterdir()}
     assert about["parent"] == {"path": str(folder), "iterations": 5}
     found = run(
-        *("wm", "eval", tuned, "--split", "train", "--worlds", 2, "--format", "json", "--backend", "dense")
+        *("wm", "eval", tuned, "--split", "train", "--worlds", 2, "--format", "json", "--backend", "torch")
     )
     data = json.loads(found.stdout)
     assert (data["only"], data["iterations"]) == (["stone"], 3)
     assert set(data["mean"]) == {"model", "nothing changes", "most frequent outcome"}
 
     out = tmp_path / "strips.png"
-    shown = run("wm", "show", tuned, "--split", "two", "--steps", 16, "--out", out, "--backend", "dense")
+    shown = run("wm", "show", tuned, "--split", "two", "--steps", 16, "--out", out, "--backend", "torch")
     assert shown.exit_code == 0, shown.output
     assert [line.split(":")[0] for line in shown.stdout.splitlines()] == ["1  falling", "2  lying"]
     # Two strips of four pictures of 14×18 cells, two pixels a cell, four between and around.

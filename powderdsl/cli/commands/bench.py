@@ -8,9 +8,8 @@ from pathlib import Path
 import click
 
 from powderdsl.cli.exits import OK, user_values
-from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules, set_option
+from powderdsl.cli.options import BackendType, SizeType, WholeType, check_writable, load_rules, set_option
 from powderdsl.cli.progress import progress
-from powderdsl.compiler import BACKENDS
 from powderdsl.experiments.bench.figures import Event, Report, Started, make_report, report_data
 from powderdsl.experiments.bench.machine import load_average, this_machine
 from powderdsl.experiments.bench.measure import measure_events
@@ -36,9 +35,9 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @click.option(
     "--backend",
     "backends",
-    type=click.Choice(list(BACKENDS)),
+    type=BackendType(),
     multiple=True,
-    help="What runs the rules.  [default: torch, and native or cuda where they run]",
+    help="What runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
 )
 @click.option(
     "--batch",
@@ -160,15 +159,15 @@ def command(
 
 
 def _usual_backends(device: str) -> tuple[str, ...]:
-    """What runs here without asking: torch, and the fastest code for the device, if it can be compiled."""
+    """What runs here without asking: what starts at once, and the fastest code for the device, if it can be compiled."""
     if device != "cpu":
         return ("torch", "cuda") if device.startswith("cuda") else ("torch",)
     try:
         find_compiler()
     except NoCompiler as error:
         click.echo(f"without the backend `native`: {error}", err=True)
-        return ("torch",)
-    return ("torch", "native")
+        return ("arrays",)
+    return ("arrays", "native")
 
 
 def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:

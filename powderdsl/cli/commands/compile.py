@@ -107,7 +107,7 @@ def _schedules(program: Program, backend: str, after: str | None, pass_name: str
     from powderdsl.schedule.text import print_schedule
 
     planners = {"cuda": CUDA, "native": CPP}
-    if backend in ("reference", "dense"):
+    if backend in ("reference", "torch"):
         raise BadInput(f"the {backend} backend has no schedule: it computes pass by pass what the IR says")
     stages = planners.get(backend, ARRAYS)
     names = ["lower", *(stage.name for stage in stages)]
@@ -130,12 +130,12 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
     """The generated source of a backend: part by part, where planes cannot carry all passes."""
     from powderdsl.ir.segments import segments
     from powderdsl.targets.arrays.source import kernel_source as array_source
-    from powderdsl.targets.dense.program import kernel_source
+    from powderdsl.targets.torch.program import kernel_source
 
     match backend:
         case "reference":
             raise BadInput("the reference backend runs the checked model: it has no kernels")
-        case "dense":
+        case "torch":
             return kernel_source(program, pass_name)
         case "native" | "cuda" if pass_name is not None:
             raise BadInput(f"{backend} source is one text: --pass does not go with it")

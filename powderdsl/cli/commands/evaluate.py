@@ -10,6 +10,7 @@ import click
 
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import (
+    BackendType,
     ManyWords,
     WholeType,
     check_writable,
@@ -19,7 +20,6 @@ from powderdsl.cli.options import (
 )
 from powderdsl.cli.plain_table import table
 from powderdsl.cli.task_sheets import knob_values
-from powderdsl.compiler import BACKENDS
 from powderdsl.tasks.names import is_task
 
 if TYPE_CHECKING:
@@ -58,9 +58,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
 @set_option
 @packs_option
-@click.option(
-    "--backend", type=click.Choice(list(BACKENDS)), help="What runs the rules.  [default: the run's]"
-)
+@click.option("--backend", type=BackendType(), help="What runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @layout_options("One JSON object instead of a table.")
 @click.option(

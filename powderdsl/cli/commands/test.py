@@ -26,7 +26,7 @@ MAX_SECONDS = 24 * 3600
 
 @click.command("test")
 @click.argument("rules", nargs=-1, metavar="[RULES]...")
-@backend_option("planes")
+@backend_option("arrays")
 @set_option
 @click.option("--examples", type=WholeType(0, 10_000_000), default=1000, show_default=True,
               help="Random worlds that each invariant is tried on.")  # fmt: skip

@@ -7,10 +7,9 @@ from pathlib import Path
 import click
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import ManyWords, WholeType, check_writable, packs_option, set_option
+from powderdsl.cli.options import BackendType, ManyWords, WholeType, check_writable, packs_option, set_option
 from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.cli.task_sheets import knob_values
-from powderdsl.compiler import BACKENDS
 from powderdsl.tasks.names import is_task
 
 SUFFIXES = (".gif", ".mp4")
@@ -45,9 +44,7 @@ SUFFIXES = (".gif", ".mp4")
 )
 @click.option("--fps", type=WholeType(1, 240), default=15, show_default=True, help="Frames a second.")
 @click.option("--scale", type=WholeType(1, 32), default=4, show_default=True, help="Pixels a cell.")
-@click.option(
-    "--backend", type=click.Choice(list(BACKENDS)), help="What runs the rules.  [default: the run's]"
-)
+@click.option("--backend", type=BackendType(), help="What runs the rules.  [default: the run's]")
 def command(
     run: str,
     split: str | None,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from powderdsl.analysis.reactions import moved_ids
-from powderdsl.compiler import BACKENDS
+from powderdsl.compiler import BACKENDS, current_backend
 from powderdsl.diagnostics import suggest
 from powderdsl.model.types import Ruleset
 from powderdsl.model.world_sides import check_sides
@@ -63,7 +63,7 @@ class Plan:
 def make_plan(
     ruleset: Ruleset,
     *,
-    backends: Sequence[str] = ("torch",),
+    backends: Sequence[str] = ("arrays",),
     batches: Sequence[int] = (1, 32),
     sizes: Sequence[Size] = ((64, 64),),
     elements: Sequence[int] = (),
@@ -93,6 +93,7 @@ def make_plan(
     """
     if workload not in WORKLOADS:
         raise KeyError(f"no workload `{workload}`; {'; '.join(suggest(workload, WORKLOADS, 'workloads'))}")
+    backends = [current_backend(backend) for backend in backends]
     for backend in backends:
         if backend not in BACKENDS:
             raise KeyError(f"no backend `{backend}`; {'; '.join(suggest(backend, BACKENDS, 'backends'))}")

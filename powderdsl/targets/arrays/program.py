@@ -14,9 +14,9 @@ from powderdsl.targets.arrays.kernels import ArrayKernels
 from powderdsl.targets.arrays.source import pass_source
 from powderdsl.targets.arrays.words import Array, pack, unpack
 from powderdsl.targets.codec import pieces
-from powderdsl.targets.dense.source import load_source
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import Laps, unwatched
+from powderdsl.targets.torch.source import load_source
 
 State = dict[str, Array]
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from powderdsl.ir.ops import REAL, Node, PassGraph, Program
 from powderdsl.schedule.stages import ARRAYS, plan
 from powderdsl.schedule.types import Compute, Guard, Out, Release, Schedule, Statement
-from powderdsl.targets.dense.source import comment
+from powderdsl.targets.torch.source import comment
 
 _INFIX = {
     "and": "&", "or": "|", "xor": "^", "add": "+", "sub": "-", "mul": "*", "eq": "==", "lt": "<", "le": "<=",

@@ -14,8 +14,8 @@ from powderdsl.targets import words as torch_words
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda import build
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
-from powderdsl.targets.dense.mixed import Part, packed_program
 from powderdsl.targets.job import Job
+from powderdsl.targets.torch.mixed import Part, packed_program
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def cuda_program(program: Program, device: torch.device) -> Part:
 def refusal(problem: str) -> CompileError:
     """What a user reads where the backend cannot be had."""
     reporter = Reporter()
-    helps = ["run on the device `cuda`, or on the backend `native` or `torch`"]
+    helps = ["run on the device `cuda`, or on the backend `torch`, or on `native` on the CPU"]
     reporter.error(
         "PD701", "the cuda backend is not available", None, notes=problem.splitlines(), helps=helps
     )

@@ -15,8 +15,8 @@ from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, component
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
-from powderdsl.targets.dense.program import Kernels, PassFunction, compiled
-from powderdsl.targets.dense.source import pass_source
+from powderdsl.targets.torch.program import Kernels, PassFunction, compiled
+from powderdsl.targets.torch.source import pass_source
 from powderdsl.tasks.goals import REGION_LET, parts_of
 from powderdsl.tasks.task import Goal, Measure
 from powderdsl.tasks.tensors.generator import NOTHING

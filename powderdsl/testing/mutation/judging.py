@@ -57,7 +57,7 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
         return Verdict("killed", "check", min(new))
     if meaning(ruleset) == original.meaning:
         return Verdict("equivalent", "the same model")
-    sim = compile(ruleset, backend="planes")
+    sim = compile(ruleset, backend="arrays")
     differs = True
     failed = failed_test(original, sim, mutant.pack, quick=True)
     if failed is None:

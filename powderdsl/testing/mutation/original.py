@@ -96,7 +96,7 @@ class Original:
 
     @cached_property
     def sim(self) -> Simulator:
-        return compile(self.ruleset, backend="planes")
+        return compile(self.ruleset, backend="arrays")
 
     @cached_property
     def failing(self) -> frozenset[str]:

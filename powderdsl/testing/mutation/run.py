@@ -100,7 +100,7 @@ def work(task: Task, tell: Callable[[Any], None]) -> Outcome:
         return Outcome(task.number, verdict)
     ruleset, _ = original.mutated(mutant)
     focus = focused(original, mutant)
-    found = distinguish(original.sim, compile(ruleset, backend="planes"), focus, task.seed)
+    found = distinguish(original.sim, compile(ruleset, backend="arrays"), focus, task.seed)
     if found is None:
         return Outcome(task.number, verdict)
     rows, columns = found.sample.shape

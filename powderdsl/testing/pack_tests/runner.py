@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference
 from powderdsl.model.restrict import restricted, without
@@ -66,7 +67,7 @@ class ExampleResult:
 
 def run_examples(
     ruleset: Ruleset,
-    backend: str = "planes",
+    backend: str | None = None,
     device: str = "cpu",
     *,
     sim: Simulator | None = None,
@@ -80,10 +81,11 @@ def run_examples(
     the packs of its scope alone, if more are loaded.
 
     Args:
+        backend, device: those of `powderdsl.compile`; unless given, a backend that starts at once.
         sim: what runs them, instead of a new simulator of this ruleset.
         seen: called with the worlds of each batch at its end.
     """
-    sim = sim or compile(ruleset, backend=backend, device=device)
+    sim = sim or compile(ruleset, backend or starting_backend(device), device)
     sizes: dict[tuple[int, int], list[int]] = {}
     for number, example in enumerate(ruleset.tests):
         sizes.setdefault((len(example.given), len(example.given[0])), []).append(number)

@@ -26,7 +26,7 @@ MARK = "happened "
 class Runner:
     """Runs a ruleset on one backend. `happened` collects the lines of rules that changed or claimed some cell."""
 
-    def __init__(self, ruleset: Ruleset, backend: str = "planes"):
+    def __init__(self, ruleset: Ruleset, backend: str = "arrays"):
         self.ruleset = ruleset
         self.backend = backend
         self.lines = rule_spans(ruleset)

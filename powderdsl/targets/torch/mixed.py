@@ -1,4 +1,4 @@
-"""Programs in several forms, one after the other within each step: packed where planes can carry a pass, else dense."""
+"""Programs in several forms, one after the other within each step: packed where planes can carry a pass, else on torch tensors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
-from powderdsl.targets.dense.program import DenseProgram
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import profile_of
+from powderdsl.targets.torch.program import TorchProgram
 
 
 class Part(Protocol):
@@ -65,7 +65,7 @@ def packed_program(program: Program, device: torch.device, make: MakePacked) -> 
 def mixed_program(found: Sequence[Segment], device: torch.device, make: MakePacked) -> Part:
     """The program of some segments; that of a single one as it is."""
     parts = [
-        DenseProgram(one.program, device) if one.planes is None else make(one.program, one.planes)
+        TorchProgram(one.program, device) if one.planes is None else make(one.program, one.planes)
         for one in found
     ]
     return parts[0] if len(parts) == 1 else MixedProgram(parts)

@@ -17,9 +17,9 @@ from powderdsl.ir.ops import Program, Threshold
 from powderdsl.system.random import base_keys
 from powderdsl.targets import random
 from powderdsl.targets.codec import limits, pieces
-from powderdsl.targets.dense.source import load_source, pass_source
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import Laps, unwatched
+from powderdsl.targets.torch.source import load_source, pass_source
 
 SNAP = 2.0**-20
 
@@ -165,7 +165,7 @@ def kernel_source(program: Program, only: str | None = None) -> str:
     )
 
 
-class DenseProgram:
+class TorchProgram:
     """A program whose passes are generated torch functions."""
 
     def __init__(self, program: Program, device: torch.device):

@@ -1,4 +1,4 @@
-"""IR -> the Python source of one pass for the dense torch backend."""
+"""IR -> the Python source of one pass for the backend `torch`."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class _Writer:
                 return (
                     f"torch.where({self.roll(args[1], -dy, -dx)}, {self.roll(args[0], -dy, -dx)}, {args[2]})"
                 )
-        raise AssertionError(f"no dense kernel for {node.op}")
+        raise AssertionError(f"no torch kernel for {node.op}")
 
     def below(self, node: Node, limit: str) -> str:
         """A draw below a limit. Constant limits need only the bits down to their last one."""
