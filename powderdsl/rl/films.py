@@ -28,7 +28,7 @@ PAPER = (30, 30, 30)
 
 
 @dataclass(frozen=True)
-class Scene:
+class FilmScene:
     """One substep of all worlds: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None, `fields` [B, H, W] each,
     those that colors follow; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns` float64
     [B] before them; `over` bool [B]."""
@@ -41,12 +41,12 @@ class Scene:
     over: Tensor
 
 
-class Recorder:
+class FilmRecorder:
     """Keeps the scenes of `play`."""
 
     def __init__(self, count: int) -> None:
         self.regions: dict[str, NDArray[np.bool_]] = {}
-        self.scenes: list[Scene] = []
+        self.scenes: list[FilmScene] = []
         self._pending: list[tuple[Any, Any, Any]] = []
         self._returns = torch.zeros(count, dtype=torch.float64)
         self._over = torch.zeros(count, dtype=torch.bool)
@@ -71,7 +71,7 @@ class Recorder:
             last = number == len(self._pending) - 1
             now = (returns, over) if last else (self._returns, self._over)
             self.scenes.append(
-                Scene(ids, motion, fields, actions, now[0].cpu().clone(), now[1].cpu().clone())
+                FilmScene(ids, motion, fields, actions, now[0].cpu().clone(), now[1].cpu().clone())
             )
         self._pending.clear()
         self._returns, self._over = returns.clone(), over.clone()
@@ -91,7 +91,7 @@ def film(
     There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
     episode is over stand still.
     """
-    recorder = Recorder(len(worlds))
+    recorder = FilmRecorder(len(worlds))
     played = play(
         program,
         policy,
@@ -105,7 +105,7 @@ def film(
     return played, _pictures(program.task, recorder, factor)
 
 
-def _pictures(task: Task, recorder: Recorder, factor: int) -> Iterator[NDArray[np.uint8]]:
+def _pictures(task: Task, recorder: FilmRecorder, factor: int) -> Iterator[NDArray[np.uint8]]:
     colors, font = palette(task.ruleset.elements), ImageFont.load_default()
     still: dict[int, NDArray[np.uint8]] = {}
     columns = min(4, len(recorder.scenes[0].ids))
@@ -122,7 +122,7 @@ def _pictures(task: Task, recorder: Recorder, factor: int) -> Iterator[NDArray[n
 
 
 def _tile(
-    task: Task, recorder: Recorder, scene: Scene, world: int, colors: Any, factor: int, font: Any
+    task: Task, recorder: FilmRecorder, scene: FilmScene, world: int, colors: Any, factor: int, font: Any
 ) -> NDArray[np.uint8]:
     """One world, uint8 [H·factor + LINE, W·factor, 3]."""
     motion = None if scene.motion is None else scene.motion[world]

@@ -19,7 +19,7 @@ MAX_DRAWINGS = 4_096
 
 
 @dataclass(frozen=True)
-class Plan:
+class DrawingPlan:
     """What a generator is made of, as written: sections of a file, with the changes of a split on top."""
 
     name: str
@@ -39,7 +39,7 @@ class Plan:
 class Drawer:
     """Checks one plan. What is wrong goes to the reporter; the generator is of use only if nothing was."""
 
-    plan: Plan
+    plan: DrawingPlan
     ruleset: Ruleset
     size: Size
     reporter: Reporter

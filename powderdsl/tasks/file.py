@@ -20,7 +20,7 @@ from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.parse import reserved_words as rule_words
 from powderdsl.tasks.agents import read_agent
-from powderdsl.tasks.drawings import Drawer, Plan, element_ids
+from powderdsl.tasks.drawings import Drawer, DrawingPlan, element_ids
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.keys import TASK_KEYS
 from powderdsl.tasks.stamps import read_stamp
@@ -138,7 +138,7 @@ class _TaskReader:
         fill = self.fill()
         knobs = self.knobs()
         values = {knob.name: knob.value for knob in knobs}
-        plan = Plan(
+        plan = DrawingPlan(
             "train",
             fill,
             values,
@@ -294,10 +294,10 @@ class _TaskReader:
 
     # Splits
 
-    def splits(self, plan: Plan, size: Size) -> tuple[tuple[Split, ...], set[str]]:
+    def splits(self, plan: DrawingPlan, size: Size) -> tuple[tuple[Split, ...], set[str]]:
         """All splits, and the parts that any of them uses."""
         about = self.reader.text(self.entries, "about")
-        plans: list[tuple[str, str, list[Plan]]] = [("train", about, [plan])]
+        plans: list[tuple[str, str, list[DrawingPlan]]] = [("train", about, [plan])]
         for key, node in self.reader.named(self.node("splits"), "a split"):
             entries = self.reader.mapping(node, "split", "a split")
             base = self.varied(plan, entries, key.text)
@@ -320,7 +320,7 @@ class _TaskReader:
             splits.append(Split(name, told, tuple(generators)))
         return tuple(splits), used
 
-    def stands(self, base: Plan, node: yaml_tree.Node) -> list[Plan]:
+    def stands(self, base: DrawingPlan, node: yaml_tree.Node) -> list[DrawingPlan]:
         if not isinstance(node, yaml_tree.Sequence) or not node.items:
             self.reader.shape(node, "a list of stands", "each starts with `- stand: NAME`")
             return [base]
@@ -335,7 +335,7 @@ class _TaskReader:
             found.append(self.varied(base, entries, name.text if name else "?"))
         return found
 
-    def varied(self, plan: Plan, entries: Entries, name: str) -> Plan:
+    def varied(self, plan: DrawingPlan, entries: Entries, name: str) -> DrawingPlan:
         """The plan with what a split or stand changes."""
         changes: dict[str, Any] = {"name": name}
         if "knobs" in entries:
@@ -374,7 +374,7 @@ class _TaskReader:
                 "PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps
             )
 
-    def unused(self, plan: Plan, used: set[str]) -> None:
+    def unused(self, plan: DrawingPlan, used: set[str]) -> None:
         """Warn of parts that nothing uses."""
         node = self.node("parts")
         for key, _ in node.entries if isinstance(node, yaml_tree.Mapping) else ():
@@ -384,7 +384,7 @@ class _TaskReader:
 
     # What counts
 
-    def goal(self, plan: Plan) -> Goal:
+    def goal(self, plan: DrawingPlan) -> Goal:
         checker = GoalChecker(self.typer, frozenset(plan.regions), frozenset(plan.targets), plan.knobs)
         found: dict[str, Expr | None] = {}
         for section in ("reward", "end"):

@@ -16,7 +16,7 @@ import pytest
 
 if TYPE_CHECKING:
     from powderdsl.model.types import Example, Invariant, Ruleset
-    from powderdsl.testing.properties.search import Search
+    from powderdsl.testing.properties.search import InvariantSearch
 
 HEAD = re.compile(r"^pack:[ \t]*[A-Za-z_]\w*[ \t]*$|^ruleset:[ \t]*[A-Za-z_]\w*[ \t]*$", re.MULTILINE)
 LISTED = re.compile(r"^packs:[ \t]*\[?(.*)$", re.MULTILINE)
@@ -88,16 +88,16 @@ def loaded(rules: str, stamp: float) -> Ruleset:
     return load(rules)
 
 
-_SEARCHES: dict[int, tuple[Ruleset, Search]] = {}
+_SEARCHES: dict[int, tuple[Ruleset, InvariantSearch]] = {}
 
 
-def search_of(ruleset: Ruleset, worlds: int) -> Search:
+def search_of(ruleset: Ruleset, worlds: int) -> InvariantSearch:
     """What proves and tries a ruleset's invariants, made once: the ledger takes a second."""
     from powderdsl.testing.properties.running import Runner
-    from powderdsl.testing.properties.search import Plan, Search
+    from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 
     if id(ruleset) not in _SEARCHES:
-        _SEARCHES[id(ruleset)] = ruleset, Search.of(Runner(ruleset), Plan(worlds))
+        _SEARCHES[id(ruleset)] = ruleset, InvariantSearch.of(Runner(ruleset), SearchPlan(worlds))
     return _SEARCHES[id(ruleset)][1]
 
 

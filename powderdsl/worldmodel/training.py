@@ -105,7 +105,7 @@ HERE = Machine()
 
 
 @dataclass(frozen=True)
-class Moment:
+class TrainingProgress:
     """What training says of itself, after each iteration: how many are done, and the last loss that was logged."""
 
     done: int
@@ -125,7 +125,7 @@ def train(
     network: nn.Module | None = None,
     parent: Checkpoint | None = None,
     note: Mapping[str, Any] | None = None,
-    tell: Callable[[Moment], None] | None = None,
+    tell: Callable[[TrainingProgress], None] | None = None,
     save_seconds: float = 60,
 ) -> RunFolder:
     """Train a network until `config.iterations`, or continue with the run that is in the folder.
@@ -231,7 +231,7 @@ class _Trainer:
         self.forward: Network = torch.compile(model) if machine.compiled else model
         self.cuda = torch.device(machine.device).type == "cuda"
 
-    def go(self, tell: Callable[[Moment], None], save_seconds: float) -> None:
+    def go(self, tell: Callable[[TrainingProgress], None], save_seconds: float) -> None:
         """To the end. A signal is raised once a checkpoint is written, a second one at once."""
         total, loss, simulated = self.config.iterations, None, 0.0
         saved = since = time.monotonic()
@@ -256,7 +256,7 @@ class _Trainer:
                     speed = {"time/pairs_a_second": LOG_EVERY * self.config.batch / took}
                     metrics.write(self.done, {"loss/train": loss, **speed, "time/simulation": simulated})
                     since, making = time.monotonic(), 0.0
-                tell(Moment(self.done, total, loss, simulated))
+                tell(TrainingProgress(self.done, total, loss, simulated))
                 if time.monotonic() - saved > save_seconds:
                     self.save()
                     saved = time.monotonic()

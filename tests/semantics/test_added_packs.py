@@ -20,7 +20,7 @@ from powderdsl.testing.properties.outcomes import Result
 from powderdsl.testing.properties.refute import refuted
 from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.samples import single
-from powderdsl.testing.properties.search import Plan, Search
+from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 from tests.cli.commands import ROOT, powderdsl
 
 KERNEL = ", ".join(
@@ -255,7 +255,7 @@ def test_of_two_added_packs_the_one_that_matters_is_named() -> None:
 
 def tried(ruleset: library.Ruleset, cells: list[list[int]]) -> list[Result]:
     """What comes of a world of these elements with many seeds."""
-    search = Search.of(Runner(ruleset, "reference"), Plan(0), declared_only=True)
+    search = InvariantSearch.of(Runner(ruleset, "reference"), SearchPlan(0), declared_only=True)
     search.try_sample(replace(single(cells).repeated(512), seeds=np.arange(512)), 3)
     return search.finish()
 

@@ -9,7 +9,7 @@ from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.properties.breaks import Alike, breaks
 from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.samples import Sample, single
-from powderdsl.testing.properties.search import COPIES, Plan, Search
+from powderdsl.testing.properties.search import COPIES, InvariantSearch, SearchPlan
 from tests.compilers import skip_without_compiler
 
 BACKENDS = ["reference", "torch", "arrays", "native"]
@@ -36,7 +36,7 @@ def drift(left: str) -> Ruleset:
 
 def searched(ruleset: Ruleset, backend: str) -> tuple[str, str]:
     skip_without_compiler(backend)
-    search = Search.of(Runner(ruleset, backend), Plan(examples=256), declared_only=True)
+    search = InvariantSearch.of(Runner(ruleset, backend), SearchPlan(examples=256), declared_only=True)
     search.try_random()
     (result,) = search.finish()
     return result.status, result.reason

@@ -18,7 +18,7 @@ from powderdsl.experiments.runs import RunFolder
 from powderdsl.experiments.runs.metrics import read_metrics
 from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, finetuned, load_trained, train
 from powderdsl.worldmodel.scores import unseen_worlds
-from powderdsl.worldmodel.training import Moment
+from powderdsl.worldmodel.training import TrainingProgress
 from tests.processes import started, waited
 
 HERE = Machine(backend="torch")
@@ -73,7 +73,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(dunes: str, tmp_path:
 
     for stop in (7, 13, 14):
 
-        def interrupt(now: Moment, stop: int = stop) -> None:
+        def interrupt(now: TrainingProgress, stop: int = stop) -> None:
             if now.done == stop:
                 signal.raise_signal(signal.SIGINT)
 

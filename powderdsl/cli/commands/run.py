@@ -34,7 +34,7 @@ SMALL_BATCH = 1 << 20
 
 
 @dataclass(frozen=True)
-class Plan:
+class Playback:
     """How a run goes: what is shown and written, and how often."""
 
     steps: int
@@ -113,7 +113,7 @@ def command(
 
         check_saved(out, start.shape)
     used = _set_threads(threads, start)
-    plan = Plan(steps, every, fps, scale, out, watch)
+    plan = Playback(steps, every, fps, scale, out, watch)
     began = time.perf_counter()
     end = _Run(sim, start, plan).go()
     took = time.perf_counter() - began
@@ -155,7 +155,7 @@ def _populations(start: World, end: World) -> str:
 class _Run:
     """One run: a stream of worlds, shown and written as the plan says."""
 
-    def __init__(self, sim: Simulator, start: World, plan: Plan):
+    def __init__(self, sim: Simulator, start: World, plan: Playback):
         self.sim, self.plan = sim, plan
         self.start = self.world = start
 

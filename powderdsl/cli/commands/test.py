@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
     from powderdsl.testing.pack_tests.runner import ExampleResult
     from powderdsl.testing.properties.outcomes import Result
-    from powderdsl.testing.properties.search import Plan
+    from powderdsl.testing.properties.search import SearchPlan
 
 MAX_SECONDS = 24 * 3600
 
@@ -100,9 +100,9 @@ def command(
     if replay is not None and len(rules) != 1:
         raise BadInput("--replay takes the one RULES that the counterexample breaks")
     from powderdsl.testing.properties.keep import is_kept
-    from powderdsl.testing.properties.search import Plan
+    from powderdsl.testing.properties.search import SearchPlan
 
-    plan = Plan(examples, float(seconds), seed)
+    plan = SearchPlan(examples, float(seconds), seed)
     session = _Session(backend, plan, drawn, is_kept() if keep is None else keep, picture, as_json)
     for name in rules or shipped_tests():
         ruleset = load_rules(name, settings)
@@ -118,7 +118,9 @@ def command(
 class _Session:
     """One call of the command: what is asked, and what came of it so far."""
 
-    def __init__(self, backend: str, plan: Plan, drawn: int, keep: bool, picture: Path | None, as_json: bool):
+    def __init__(
+        self, backend: str, plan: SearchPlan, drawn: int, keep: bool, picture: Path | None, as_json: bool
+    ):
         self.backend, self.plan, self.drawn, self.keep = backend, plan, drawn, keep
         self.picture, self.as_json = picture, as_json
         self.failed = False
@@ -171,9 +173,9 @@ class _Session:
     def _properties(self, name: str, runner: Any) -> list[Result]:
         from powderdsl.testing.properties.drawn import has_hypothesis, try_drawn
         from powderdsl.testing.properties.keep import file_of, kept_examples, write_example
-        from powderdsl.testing.properties.search import Search
+        from powderdsl.testing.properties.search import InvariantSearch
 
-        search = Search.of(runner, self.plan)
+        search = InvariantSearch.of(runner, self.plan)
         properties = {trial.prop.text: trial.prop for trial in search.trials}
         if self.keep:
             for prop, sample, steps in kept_examples(runner.ruleset, properties, name):

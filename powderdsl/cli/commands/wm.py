@@ -25,7 +25,7 @@ from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.scores import Tested
-    from powderdsl.worldmodel.training import Machine, Moment, TrainConfig
+    from powderdsl.worldmodel.training import Machine, TrainConfig, TrainingProgress
 
 
 def _words(name: str, about: str) -> Callable[[Decorated], Decorated]:
@@ -366,7 +366,7 @@ def _run(config: TrainConfig, folder: Path, values: Mapping[str, Any], **more: A
     began = time.monotonic()
     with progress("wm", config.iterations, lines=True) as show:
 
-        def tell(now: Moment) -> None:
+        def tell(now: TrainingProgress) -> None:
             show(now.done, "" if now.loss is None else f"loss {now.loss:.4f}")
 
         try:

@@ -16,7 +16,7 @@ from powderdsl.cli.study.places import Places, Values, Word
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
-from powderdsl.experiments.studies.study import Step, Study
+from powderdsl.experiments.studies.study import Study, StudyStep
 from powderdsl.tasks.names import is_task
 from powderdsl.tasks.shipped import check_split, load_task
 
@@ -100,7 +100,7 @@ class _StudyCheck:
         self.done.add(question)
         return False
 
-    def step(self, step: Step) -> None:
+    def step(self, step: StudyStep) -> None:
         """All mistakes of a step."""
         self.works_on(step)
         used = self.places.names_of(step)
@@ -119,7 +119,7 @@ class _StudyCheck:
             else:
                 self.on_world_model(step, words, values)
 
-    def works_on(self, step: Step) -> None:
+    def works_on(self, step: StudyStep) -> None:
         """Whether a step works on what its command takes."""
         command = " ".join(step.command)
         needs = NEEDS.get(step.command)
@@ -149,7 +149,7 @@ class _StudyCheck:
             place = self.places.place("on", step.name)
             self.reporter.error("PD806", message, place, label, helps=helps)
 
-    def converted(self, step: Step, words: Words) -> dict[str, Any]:
+    def converted(self, step: StudyStep, words: Words) -> dict[str, Any]:
         """The values of a step's options by the names of the command's parameters; those that cannot be are reported."""
         command = self.find(step.command)
         params: dict[str, click.Option] = {
@@ -187,7 +187,7 @@ class _StudyCheck:
 
     # What commands ask for
 
-    def device(self, step: Step, words: Words) -> None:
+    def device(self, step: StudyStep, words: Words) -> None:
         """Whether the machine has the device of a step, which all of its runs would need."""
         from powderdsl.simulation.programs import find_device
 
@@ -196,14 +196,14 @@ class _StudyCheck:
             with self.told(word, step):
                 find_device(word.filled)
 
-    def task(self, step: Step, word: Word | None, text: str) -> Task | None:
+    def task(self, step: StudyStep, word: Word | None, text: str) -> Task | None:
         """The task of some words; None after reporting that there is none."""
         found: Task | None = None
         with self.told(word, step):
             found = _task(text)
         return found
 
-    def knobs_and_params(self, step: Step, words: Words, name: str, task: Task) -> None:
+    def knobs_and_params(self, step: StudyStep, words: Words, name: str, task: Task) -> None:
         """Knobs of a task, and parameters of its rules, each alone."""
         known = {one.name: one for one in task.knobs}
         short = KNOBS.get(step.command, {})
@@ -222,13 +222,13 @@ class _StudyCheck:
                         if knob not in known or not known[knob].lo <= number <= known[knob].hi:
                             _task(name, ((knob, number),))
 
-    def split(self, step: Step, words: Words, task: Task) -> None:
+    def split(self, step: StudyStep, words: Words, task: Task) -> None:
         """The split of a step, or the usual one."""
         word = _first(words, "split")
         with self.told(word, step):
             check_split(task, DEFAULT_SPLITS[step.command] if word is None else word.filled)
 
-    def run(self, step: Step, word: Word) -> None:
+    def run(self, step: StudyStep, word: Word) -> None:
         """Whether there is a run that `on` names, which is not a step before."""
         from powderdsl.experiments.runs import find_run
 
@@ -247,7 +247,7 @@ class _StudyCheck:
 
     # Agents
 
-    def train(self, step: Step, words: Words, given: Mapping[str, Any]) -> None:
+    def train(self, step: StudyStep, words: Words, given: Mapping[str, Any]) -> None:
         from powderdsl.rl.config import PRESETS, TrainConfig, preset
 
         on = _first(words, "on")
@@ -270,7 +270,7 @@ class _StudyCheck:
             with self.told(None, step):
                 preset(start, "task", **asked)
 
-    def evaluate(self, step: Step, words: Words, values: Values) -> None:
+    def evaluate(self, step: StudyStep, words: Words, values: Values) -> None:
         on, task = _first(words, "on"), self.task_of(step, values)
         if on is not None and not is_task(on.filled):
             self.run(step, on)
@@ -294,7 +294,7 @@ class _StudyCheck:
                     helps = suggest(policy.strip(), policies, "policies")
                     self.report(word, step, f"there is no policy `{policy.strip()}`", helps=helps)
 
-    def task_of(self, step: Step, values: Values) -> Task | None:
+    def task_of(self, step: StudyStep, values: Values) -> Task | None:
         """The task that `evaluate` plays; None if it is not known, or wrong where it is first named."""
         step = self.places.maker(step) if step.on_step else step
         on = _first(self.places.words(step, values), "on")
@@ -307,7 +307,7 @@ class _StudyCheck:
 
     # World models
 
-    def world_model(self, step: Step, words: Words, given: Mapping[str, Any]) -> None:
+    def world_model(self, step: StudyStep, words: Words, given: Mapping[str, Any]) -> None:
         word = _first(words, "task")
         name = DEFAULT_TASK if word is None else word.filled
         task = self.task(step, word, name)
@@ -339,7 +339,7 @@ class _StudyCheck:
                 with self.told(word, step):
                     Variety(**{VARIETY[word.option]: value})
 
-    def on_world_model(self, step: Step, words: Words, values: Values) -> None:
+    def on_world_model(self, step: StudyStep, words: Words, values: Values) -> None:
         if step.command == ("wm", "finetune") and not words.get("packs"):
             self.report(None, step, "`wm finetune` needs `packs`: what is to be learned")
         if not step.on_step:
@@ -371,7 +371,7 @@ class _StudyCheck:
             self.knobs_and_params(step, words, name if word is None else word.filled, task)
             self.split(step, words, task)
 
-    def only(self, step: Step, words: Words, packs: Sequence[str]) -> None:
+    def only(self, step: StudyStep, words: Words, packs: Sequence[str]) -> None:
         """Whether worlds can draw elements of some packs alone. Packs from files are not asked for their names."""
         if any("." in pack for pack in packs):
             return
@@ -381,7 +381,7 @@ class _StudyCheck:
                 message = f"the rules have no pack `{word.filled}`"
                 self.report(word, step, message, code="PD304", helps=helps)
 
-    def rules(self, step: Step, words: Words, task: str, base: str | None = None) -> None:
+    def rules(self, step: StudyStep, words: Words, task: str, base: str | None = None) -> None:
         """The rules of a step, and packs that are added or left out. `base`: those that a network was trained on."""
         named = _first(words, "rules")
         if named is not None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from powderdsl.cli.study.places import Places, Values, Word, names_in
 from powderdsl.diagnostics import suggest
-from powderdsl.experiments.studies.study import SEED, Measure, Step
+from powderdsl.experiments.studies.study import SEED, Measure, StudyStep
 from powderdsl.tasks.task import Task
 
 LEADS_TO = "*"
@@ -24,7 +24,9 @@ BASELINES = ("random", "nothing")
 PREDICTORS = ("model", "nothing changes", "most frequent outcome")
 
 
-def check_measure(places: Places, measure: Measure, task_of: Callable[[Step, Values], Task | None]) -> None:
+def check_measure(
+    places: Places, measure: Measure, task_of: Callable[[StudyStep, Values], Task | None]
+) -> None:
     """Report a measure whose keys do not lead to a number in what is evaluated last.
 
     Args:
@@ -62,7 +64,7 @@ def check_measure(places: Places, measure: Measure, task_of: Callable[[Step, Val
 
 
 def _evaluation(
-    step: Step, words: Mapping[str, Sequence[Word]], task: Task | None
+    step: StudyStep, words: Mapping[str, Sequence[Word]], task: Task | None
 ) -> Mapping[str, Any] | None:
     """What is in the evaluation.json that a step writes; None if that is not known."""
     if step.command == ("wm", "eval"):

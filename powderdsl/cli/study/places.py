@@ -13,7 +13,7 @@ import click
 
 from powderdsl.diagnostics import CompileError, Label, Reporter, Span
 from powderdsl.experiments.studies.paths import TEXT, confined
-from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, Step, Study
+from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, Study, StudyStep
 
 Values = Mapping[str, str]
 """What each name stands for."""
@@ -70,7 +70,7 @@ class Places:
                     seen.add(key)
                     yield found
 
-    def words(self, step: Step, values: Values) -> dict[str, list[Word]]:
+    def words(self, step: StudyStep, values: Values) -> dict[str, list[Word]]:
         """The words of a step's options, and of ``on`` where that is not a step."""
         texts = dict(step.options)
         if step.on is not None and not step.on_step:
@@ -80,19 +80,19 @@ class Places:
             for option, words in texts.items()
         }
 
-    def _word(self, step: Step, option: str, number: int, text: str, values: Values) -> Word:
+    def _word(self, step: StudyStep, option: str, number: int, text: str, values: Values) -> Word:
         written, folder = Template(text).safe_substitute(values), self.study.folder
         filled = confined(step.means.get(option, TEXT), written, folder, folder)
         return Word(step.name, option, number, text, written, filled)
 
-    def maker(self, step: Step) -> Step:
+    def maker(self, step: StudyStep) -> StudyStep:
         """The step whose run is meant by a step's ``on``."""
         found = self.steps[step.on or ""]
         while not found.makes_run and found.on_step:
             found = self.steps[found.on or ""]
         return found
 
-    def names_of(self, step: Step) -> set[str]:
+    def names_of(self, step: StudyStep) -> set[str]:
         """The names that a step uses, and what it works on."""
         found = names_in([step.on or "", *(word for _, words in step.options for word in words)])
         return found | (self.names_of(self.steps[step.on or ""]) if step.on_step else set())
@@ -103,7 +103,7 @@ class Places:
     def report(
         self,
         word: Word | None,
-        step: Step,
+        step: StudyStep,
         message: str,
         label: str = "",
         *,
@@ -143,7 +143,7 @@ class Places:
         return None
 
     @contextmanager
-    def told(self, word: Word | None, step: Step, *, here: bool = False) -> Iterator[list[Exception]]:
+    def told(self, word: Word | None, step: StudyStep, *, here: bool = False) -> Iterator[list[Exception]]:
         """Report what the block raises, which the list then holds.
 
         Args:

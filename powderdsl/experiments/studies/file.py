@@ -18,8 +18,8 @@ from powderdsl.experiments.studies.study import (
     SIZES,
     Axis,
     Measure,
-    Step,
     Study,
+    StudyStep,
     filled,
 )
 from powderdsl.model.schema import Key, Reader
@@ -112,7 +112,7 @@ class _StudyReader:
         self.reader, self.reporter, self.commands = reader, reader.reporter, commands
         self.axes: list[Axis] = []
         self.set_names: list[str] = []
-        self.steps: list[Step] = []
+        self.steps: list[StudyStep] = []
         self.words: list[tuple[str, str, Span]] = []
         """What a word of a command is, the word, and where it stands."""
         self.places: dict[tuple[str, ...], Span] = {}
@@ -237,7 +237,7 @@ class _StudyReader:
                 self.reader.shape(word, "a word")
         return found
 
-    def step(self, key: yaml_tree.Scalar, node: yaml_tree.Node) -> Step | None:
+    def step(self, key: yaml_tree.Scalar, node: yaml_tree.Node) -> StudyStep | None:
         if not isinstance(node, yaml_tree.Mapping):
             self.reader.shape(node, "a mapping", "write `command:`, and options of that command")
             return None
@@ -282,7 +282,7 @@ class _StudyReader:
         on_step = target in [step.name for step in self.steps]
         if isinstance(on, yaml_tree.Scalar) and not on_step:
             self.words.append((options.get("on", TEXT), on.text, on.span))
-        return Step(key.text, command, target, on_step, tuple(found), "run" in options, options)
+        return StudyStep(key.text, command, target, on_step, tuple(found), "run" in options, options)
 
     def measure(self, key: yaml_tree.Scalar, node: yaml_tree.Node) -> Measure | None:
         entries = self.reader.mapping(node, "measure", "a measure")

@@ -19,7 +19,7 @@ from typing import Any
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, write_json
 from powderdsl.experiments.studies.paths import FLAG, TEXT, confined
-from powderdsl.experiments.studies.study import Measure, Point, Step, Study, filled
+from powderdsl.experiments.studies.study import Measure, Point, Study, StudyStep, filled
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
@@ -154,7 +154,7 @@ class StudyRun:
             return Outcome(point, {}, str(error) or "stopped")
         return Outcome(point, values)
 
-    def command(self, step: Step, point: Point, place: Path) -> list[str]:
+    def command(self, step: StudyStep, point: Point, place: Path) -> list[str]:
         """The words of a step's command for a point whose runs lie in `place`."""
         words = list(step.command)
         if step.on is not None:
@@ -170,7 +170,7 @@ class StudyRun:
                     words.append(f"--{name}")
         return [*words, "--run", str(place / step.name)] if step.makes_run else words
 
-    def _word(self, step: Step, name: str, text: str, point: Point) -> str:
+    def _word(self, step: StudyStep, name: str, text: str, point: Point) -> str:
         """A word of a command. Raises CompileError (PD112) if it names a path elsewhere."""
         word, place = filled(text, point, self.size), self.folder / "runs" / point.name
         try:
@@ -187,7 +187,7 @@ class StudyRun:
             step = steps[step.on]
         return step.name
 
-    def _step(self, step: Step, point: Point, place: Path) -> str | None:
+    def _step(self, step: StudyStep, point: Point, place: Path) -> str | None:
         """Run a step; what went wrong, if something did."""
         if step.makes_run:
             self._wait_for_last_call(place / step.name)
@@ -231,7 +231,7 @@ class StudyRun:
                 continue
 
 
-def _decides(step: Step) -> dict[str, Any]:
+def _decides(step: StudyStep) -> dict[str, Any]:
     """What decides what a step does: not what its words mean, which follows from the command."""
     return {name: value for name, value in asdict(step).items() if name != "means"}
 

@@ -17,7 +17,7 @@ SEED, SIZE = "seed", "size"
 
 
 @dataclass(frozen=True)
-class Step:
+class StudyStep:
     """A call of a command: what it works on, and its options as text, in which ``$NAME`` stands for a value.
 
     `on` is the argument of the command: a step before it, whose run is meant, or text. `means` says what the argument
@@ -83,7 +83,7 @@ class Study:
     about: str
     seeds: int
     axes: tuple[Axis, ...]
-    steps: tuple[Step, ...]
+    steps: tuple[StudyStep, ...]
     measures: tuple[Measure, ...]
     text: str
     folder: Path = Path()

@@ -13,7 +13,7 @@ from powderdsl.model import reference
 from powderdsl.model.expressions.operands import look
 from powderdsl.model.text import element_name, show_expr, show_offset, show_value
 from powderdsl.model.types import FLAG, Expr, Kind, Offset, Ruleset
-from powderdsl.simulation.tracing.scenes import Cell, Scene, value_at
+from powderdsl.simulation.tracing.scenes import Cell, RecordedSubstep, value_at
 
 HERE: Offset = (0, 0)
 _LEAVES = ("element", "property", "field", "let", "draw", "coordinate", "param", "inside", "count", "sum")
@@ -66,12 +66,12 @@ class Question:
         return self.expr.op == "member" and self.expr.args[0].op == "element"
 
 
-def questions(expr: Expr, scene: Scene) -> Iterator[Question]:
+def questions(expr: Expr, scene: RecordedSubstep) -> Iterator[Question]:
     """A condition taken apart at its `and`s; flags fixed by `let` are taken apart too, as they were fixed."""
     yield from _apart(expr, scene.at, scene, "")
 
 
-def _apart(expr: Expr, at: reference.Context, scene: Scene, of: str) -> Iterator[Question]:
+def _apart(expr: Expr, at: reference.Context, scene: RecordedSubstep, of: str) -> Iterator[Question]:
     if expr.op == "and":
         for arg in expr.args:
             yield from _apart(arg, at, scene, of)
@@ -82,7 +82,7 @@ def _apart(expr: Expr, at: reference.Context, scene: Scene, of: str) -> Iterator
         yield Question(expr, at, of)
 
 
-def answer(question: Question, cell: Cell, scene: Scene) -> Part:
+def answer(question: Question, cell: Cell, scene: RecordedSubstep) -> Part:
     """A part of a condition in one cell, with everything it read."""
     reads: dict[str, Read] = {}
     for read in _reads(question.expr, question.at, cell, HERE, scene):
@@ -102,7 +102,9 @@ def _written(name: str) -> str:
     return name.partition("#")[0]
 
 
-def _reads(expr: Expr, at: reference.Context, cell: Cell, offset: Offset, scene: Scene) -> Iterator[Read]:
+def _reads(
+    expr: Expr, at: reference.Context, cell: Cell, offset: Offset, scene: RecordedSubstep
+) -> Iterator[Read]:
     if expr.op == "look":
         dy, dx = expr.value
         yield from _reads(expr.args[0], at, cell, (offset[0] + dy, offset[1] + dx), scene)
@@ -117,7 +119,7 @@ def _reads(expr: Expr, at: reference.Context, cell: Cell, offset: Offset, scene:
             yield from _reads(let.value, found, cell, offset, scene)
 
 
-def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, scene: Scene) -> Read:
+def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, scene: RecordedSubstep) -> Read:
     ruleset = scene.ruleset
     value = value_at(expr, at, place)
     if expr.op == "element" and offset != HERE:
@@ -139,7 +141,7 @@ def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, scene:
 _ELEMENT = Expr("element", Kind("element"))
 
 
-def _counted(expr: Expr, at: reference.Context, place: Cell, scene: Scene) -> Iterator[Cell]:
+def _counted(expr: Expr, at: reference.Context, place: Cell, scene: RecordedSubstep) -> Iterator[Cell]:
     """The neighbors that a count found: those with a weight where its argument holds."""
     holds = reference.evaluate(expr.args[0], at)
     kernel = expr.value

@@ -23,7 +23,7 @@ _PARAMS = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.f
 
 
 @dataclass(frozen=True)
-class Scene:
+class RecordedSubstep:
     """A substep of the step: what it found and left, and its rules. Arrays have a batch of one."""
 
     ruleset: Ruleset
@@ -53,7 +53,7 @@ class Scene:
 
 
 @dataclass
-class Step:
+class RecordedStep:
     """The substeps of a step in order, the state that it began with, and the one that it left.
 
     States are the reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
@@ -62,10 +62,10 @@ class Step:
     ruleset: Ruleset
     begin: reference.State
     end: reference.State = field(default_factory=dict)
-    scenes: list[Scene] = field(default_factory=list)
+    scenes: list[RecordedSubstep] = field(default_factory=list)
 
 
-def record_step(world: World, number: int = 0) -> Step:
+def record_step(world: World, number: int = 0) -> RecordedStep:
     """The next step of one world of a batch, with default parameters, watched."""
     one = world.select([number])
     ruleset = world.sim.ruleset
@@ -75,7 +75,7 @@ def record_step(world: World, number: int = 0) -> Step:
     params: dict[str, Array] = {
         p.name: np.full(1, float(p.default), _PARAMS[p.kind.name]) for p in ruleset.params
     }
-    step = Step(ruleset, _widened(state, table))
+    step = RecordedStep(ruleset, _widened(state, table))
     rules = _rules_by_moment(ruleset)
     lets: dict[str, tuple[Let, reference.Context]] = {}
 
@@ -88,7 +88,9 @@ def record_step(world: World, number: int = 0) -> Step:
         scratch = {f.name: scratch_slot(f.name, pass_) for f in pass_.scratch}
         masks = reference.masks_of(moment, found)
         step.scenes.append(
-            Scene(ruleset, pass_, moment, own, found, after, {**table, **scratch}, dict(lets), masks)
+            RecordedSubstep(
+                ruleset, pass_, moment, own, found, after, {**table, **scratch}, dict(lets), masks
+            )
         )
 
     step.end = _widened(reference.step(ruleset, state, clock, params, seen=seen), table)

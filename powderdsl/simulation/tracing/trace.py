@@ -12,7 +12,14 @@ from powderdsl.model.types import Expr, Rule, Ruleset
 from powderdsl.simulation.provenance import NumberedRule
 from powderdsl.simulation.simulator import World
 from powderdsl.simulation.tracing.parts import Part, answer, questions
-from powderdsl.simulation.tracing.scenes import Cell, Scene, Step, pick, record_step, scratch_slot
+from powderdsl.simulation.tracing.scenes import (
+    Cell,
+    RecordedStep,
+    RecordedSubstep,
+    pick,
+    record_step,
+    scratch_slot,
+)
 from powderdsl.simulation.tracing.writes import Write, anchors, writes_of
 
 
@@ -130,7 +137,7 @@ def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
     return found
 
 
-def _condition(rule: Rule, scene: Scene, cell: Cell) -> tuple[Part, ...]:
+def _condition(rule: Rule, scene: RecordedSubstep, cell: Cell) -> tuple[Part, ...]:
     assert rule.mask is not None
     return tuple(answer(question, cell, scene) for question in questions(rule.mask, scene))
 
@@ -141,7 +148,7 @@ def _parts_of(write: Write) -> tuple[Part, ...]:
     return _condition(write.rule.rule, write.scene, write.cell)
 
 
-def _misses(step: Step, cell: Cell, slots: Sequence[str], every_rule: bool) -> list[Miss]:
+def _misses(step: RecordedStep, cell: Cell, slots: Sequence[str], every_rule: bool) -> list[Miss]:
     """Rules that did not happen where they would have written the cell; those of one line once a place, unless all are asked."""
     found: dict[Any, Miss] = {}
     for scene in step.scenes:
@@ -162,7 +169,7 @@ def _misses(step: Step, cell: Cell, slots: Sequence[str], every_rule: bool) -> l
     return list(found.values())
 
 
-def _nearly(rule: Rule, scene: Scene, cell: Cell) -> bool:
+def _nearly(rule: Rule, scene: RecordedSubstep, cell: Cell) -> bool:
     """Whether all parts of a condition but one hold, and the one is not which element the cell is; or all of them."""
     mask: Expr | None = rule.mask
     assert mask is not None

@@ -11,7 +11,7 @@ import numpy as np
 from powderdsl.model.state import Slot
 from powderdsl.model.types import Assign, Move, Offset, Rule, Swap, Transform
 from powderdsl.simulation.provenance import NumberedRule
-from powderdsl.simulation.tracing.scenes import Cell, Scene, Step, pick, value_at
+from powderdsl.simulation.tracing.scenes import Cell, RecordedStep, RecordedSubstep, pick, value_at
 
 HOW = {
     "assign": "a field was assigned",
@@ -38,7 +38,7 @@ class Write:
     before: Any
     after: Any
     how: str
-    scene: Scene | None
+    scene: RecordedSubstep | None
     rule: NumberedRule | None = None
     cell: Cell | None = None
     source: Cell | None = None
@@ -48,14 +48,14 @@ class Write:
         return not np.array_equal(self.before, self.after)
 
 
-def writes_of(step: Step, cell: Cell) -> list[Write]:
+def writes_of(step: RecordedStep, cell: Cell) -> list[Write]:
     """All writes to all slots of a cell in a step, scratch fields among them, in order.
 
     Each write finds what the one before it left; what the last one leaves is what the step leaves.
     """
     found: list[Write] = []
     held = {name: pick(array, cell) for name, array in step.begin.items()}
-    scene: Scene | None = None
+    scene: RecordedSubstep | None = None
     for scene_now in step.scenes:
         first_of_pass = scene is None or scene.pass_ is not scene_now.pass_
         if first_of_pass:
@@ -70,7 +70,12 @@ def writes_of(step: Step, cell: Cell) -> list[Write]:
 
 
 def _differences(
-    scene: Scene | None, table: dict[str, Slot], held: dict[str, Any], now: Any, cell: Cell, how: str
+    scene: RecordedSubstep | None,
+    table: dict[str, Slot],
+    held: dict[str, Any],
+    now: Any,
+    cell: Cell,
+    how: str,
 ) -> Iterator[Write]:
     """What changed without a rule between two substeps."""
     for name, array in now.items():
@@ -78,7 +83,7 @@ def _differences(
             yield Write(table[name], held[name], pick(array, cell), how, scene)
 
 
-def _moment(scene: Scene, cell: Cell, held: dict[str, Any]) -> Iterator[Write]:
+def _moment(scene: RecordedSubstep, cell: Cell, held: dict[str, Any]) -> Iterator[Write]:
     """The writes of a substep; `held` becomes what it leaves. The order is that of `model.reference.run_moment`."""
     claims = [rule for rule in scene.rules if not isinstance(rule.rule, Assign)]
 
@@ -114,11 +119,11 @@ def _moment(scene: Scene, cell: Cell, held: dict[str, Any]) -> Iterator[Write]:
                 yield put(name, default, "limit", None)
 
 
-def _travelling(scene: Scene) -> list[str]:
+def _travelling(scene: RecordedSubstep) -> list[str]:
     return [name for name, slot in scene.table.items() if slot.travels]
 
 
-def anchors(rule: Rule, cell: Cell, scene: Scene, slot: str) -> tuple[Cell, ...]:
+def anchors(rule: Rule, cell: Cell, scene: RecordedSubstep, slot: str) -> tuple[Cell, ...]:
     """Where the rule's condition would have to hold for it to write a slot of the cell."""
     found: list[Offset] = []
     if isinstance(rule, Assign):
@@ -130,7 +135,7 @@ def anchors(rule: Rule, cell: Cell, scene: Scene, slot: str) -> tuple[Cell, ...]
     return tuple(dict.fromkeys(scene.near(cell, (-dy, -dx)) for dy, dx in found))
 
 
-def _arrivals(scene: Scene, rule: Rule, cell: Cell) -> Iterator[tuple[Cell, Cell]]:
+def _arrivals(scene: RecordedSubstep, rule: Rule, cell: Cell) -> Iterator[tuple[Cell, Cell]]:
     """Where a rule's condition held that moves something here, and where that stood."""
     if not isinstance(rule, (Swap, Move)):
         return
@@ -142,7 +147,13 @@ def _arrivals(scene: Scene, rule: Rule, cell: Cell) -> Iterator[tuple[Cell, Cell
 
 
 def _assigned(
-    scene: Scene, rule: NumberedRule, where: Rule, write: Assign, cell: Cell, held: dict[str, Any], put: Any
+    scene: RecordedSubstep,
+    rule: NumberedRule,
+    where: Rule,
+    write: Assign,
+    cell: Cell,
+    held: dict[str, Any],
+    put: Any,
 ) -> Iterator[Write]:
     anchor = scene.near(cell, (-write.offset[0], -write.offset[1]))
     if scene.happened(where, anchor):
@@ -150,7 +161,7 @@ def _assigned(
         yield put(write.field, value, "assign" if where is write else "effect", rule, anchor)
 
 
-def _assigned_value(scene: Scene, write: Assign, anchor: Cell, old: Any) -> Any:
+def _assigned_value(scene: RecordedSubstep, write: Assign, anchor: Cell, old: Any) -> Any:
     value = value_at(write.value, scene.at, anchor)
     with np.errstate(all="ignore"):
         new = old + value if write.op == "+=" else old - value if write.op == "-=" else value
@@ -158,7 +169,7 @@ def _assigned_value(scene: Scene, write: Assign, anchor: Cell, old: Any) -> Any:
     return np.clip(new, int(kind.lo), int(kind.hi)) if kind.name == "int" else new
 
 
-def _after_assignments(scene: Scene, cell: Cell) -> dict[str, Any]:
+def _after_assignments(scene: RecordedSubstep, cell: Cell) -> dict[str, Any]:
     """What a cell holds once the substep's assignments are done: that is what moves."""
     held = {name: pick(array, cell) for name, array in scene.at.state.items()}
     for rule in scene.moment.rules:
@@ -169,7 +180,7 @@ def _after_assignments(scene: Scene, cell: Cell) -> dict[str, Any]:
     return held
 
 
-def _fresh(scene: Scene, slot: Slot, identity: int) -> Any:
+def _fresh(scene: RecordedSubstep, slot: Slot, identity: int) -> Any:
     """What a new cell of an element holds in a slot."""
     dtype = scene.at.state[slot.name].dtype
     if slot.name == "element":

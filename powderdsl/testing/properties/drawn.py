@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.testing.properties.samples import sample_of
-from powderdsl.testing.properties.search import Search
+from powderdsl.testing.properties.search import InvariantSearch
 
 STEPS = 3
 
@@ -16,7 +16,7 @@ def has_hypothesis() -> bool:
     return find_spec("hypothesis") is not None
 
 
-def try_drawn(search: Search, examples: int) -> int:
+def try_drawn(search: InvariantSearch, examples: int) -> int:
     """Hold the properties against so many worlds that Hypothesis draws, the same for the same seed; how many it drew.
 
     It makes nothing small: `shrink` tries hundreds of smaller worlds in one batch.

@@ -21,7 +21,13 @@ from powderdsl.testing.properties.blame import Oracle
 from powderdsl.testing.properties.breaks import Alike
 from powderdsl.testing.properties.outcomes import Result, counterexample_lines
 from powderdsl.testing.properties.samples import Sample, random_samples
-from powderdsl.testing.properties.search import Plan, Search, counterexample, sorted_out, trials_alone
+from powderdsl.testing.properties.search import (
+    InvariantSearch,
+    SearchPlan,
+    counterexample,
+    sorted_out,
+    trials_alone,
+)
 from powderdsl.testing.properties.shrink import Work
 
 WORLDS = 256
@@ -91,7 +97,7 @@ def _report_difference(one: Result, found: Difference, world: Sequence[str], rep
 def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
     """The invariants that a few worlds break, each with a world that was made small."""
     oracle = Oracle(ruleset, ruleset.passes)
-    search = _tried(Search.of(oracle, Plan(), declared_only=True, ledger=ledger))
+    search = _tried(InvariantSearch.of(oracle, SearchPlan(), declared_only=True, ledger=ledger))
     broken = [trial for trial in search.trials if trial.sample is not None]
     found = []
     for trial in broken:
@@ -101,13 +107,13 @@ def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
         found.append(Result(trial.prop, "broken", trial.worlds, "", small))
 
     def false_alone(alone: Ruleset, results: Sequence[Result]) -> set[str]:
-        search = _tried(trials_alone(alone, ruleset, results, Plan(), oracle))
+        search = _tried(trials_alone(alone, ruleset, results, SearchPlan(), oracle))
         return {trial.prop.text for trial in search.trials if trial.sample is not None}
 
     return sorted_out(found, ruleset, false_alone)
 
 
-def _tried(search: Search) -> Search:
+def _tried(search: InvariantSearch) -> InvariantSearch:
     """The search with what a few worlds broke."""
     for number, sample in enumerate(random_samples(search.runner.ruleset, 0, WORLDS)):
         # Where mirrored numbers are used in another way only frequencies can tell: thousands of worlds.
@@ -120,17 +126,17 @@ def _tried(search: Search) -> Search:
     return search
 
 
-def _try_focused(search: Search, sample: Sample) -> None:
+def _try_focused(search: InvariantSearch, sample: Sample) -> None:
     """Try the same worlds with only those elements that the lines in the way of a proof are about."""
     for trial in search.trials:
         kinds = _concerned(search, trial.doubts)
         if kinds and trial.sample is None:
             ids = np.array(kinds, np.uint8)[sample.ids % len(kinds)]
             few = replace(sample, ids=ids, fields={})
-            Search(search.runner, search.plan, search.ledger, {}, [trial]).try_sample(few, STEPS)
+            InvariantSearch(search.runner, search.plan, search.ledger, {}, [trial]).try_sample(few, STEPS)
 
 
-def _concerned(search: Search, lines: tuple[RuleLine, ...]) -> list[int]:
+def _concerned(search: InvariantSearch, lines: tuple[RuleLine, ...]) -> list[int]:
     """Ids of the elements that some lines need, change or move."""
     names: set[str] = set()
     for entry in search.ledger.rules:

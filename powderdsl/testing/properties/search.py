@@ -49,7 +49,7 @@ FEW = {Agreement: 2, Alike: 2, Never: 8}
 
 
 @dataclass(frozen=True)
-class Plan:
+class SearchPlan:
     """How much is tested: so many random worlds, at most so many seconds, from this seed on."""
 
     examples: int = 1000
@@ -76,19 +76,19 @@ class _Trial:
 
 
 @dataclass
-class Search:
+class InvariantSearch:
     """Tests the properties of one ruleset; worlds may be brought from outside too."""
 
     runner: Runs
-    plan: Plan
+    plan: SearchPlan
     ledger: Ledger
     results: dict[str, Result] = field(default_factory=dict)
     trials: list[_Trial] = field(default_factory=list)
 
     @classmethod
     def of(
-        cls, runner: Runs, plan: Plan, declared_only: bool = False, ledger: Ledger | None = None
-    ) -> Search:
+        cls, runner: Runs, plan: SearchPlan, declared_only: bool = False, ledger: Ledger | None = None
+    ) -> InvariantSearch:
         """Everything that can be proven is; the rest is to be tried. `declared_only`: nothing that no pack says.
 
         `ledger`: that of the rules, if it is known already.
@@ -107,10 +107,10 @@ class Search:
                 search.trials.append(_Trial(one, "", verdict.rules))
         return search
 
-    def only(self, text: str) -> Search:
+    def only(self, text: str) -> InvariantSearch:
         """The same search for one property alone; for none if it is proven."""
         trials = [replace(trial) for trial in self.trials if trial.prop.text == text]
-        return Search(self.runner, self.plan, self.ledger, {}, trials)
+        return InvariantSearch(self.runner, self.plan, self.ledger, {}, trials)
 
     def try_random(self) -> None:
         """Random worlds, until there are enough of them, or time is over."""
@@ -209,7 +209,7 @@ def sorted_out(
     ]
 
 
-def told_apart(broken: Sequence[Result], runner: Runs, plan: Plan) -> list[Result]:
+def told_apart(broken: Sequence[Result], runner: Runs, plan: SearchPlan) -> list[Result]:
     """What is broken, and what only added packs break: their scopes are tried alone, on as many worlds."""
 
     def false_alone(alone: Ruleset, results: Sequence[Result]) -> set[str]:
@@ -222,10 +222,10 @@ def told_apart(broken: Sequence[Result], runner: Runs, plan: Plan) -> list[Resul
 
 
 def trials_alone(
-    alone: Ruleset, ruleset: Ruleset, results: Sequence[Result], plan: Plan, runner: Runs
-) -> Search:
+    alone: Ruleset, ruleset: Ruleset, results: Sequence[Result], plan: SearchPlan, runner: Runs
+) -> InvariantSearch:
     """A search for what breaks some invariants on the rules of their scope; the worlds that were found come first."""
-    search = Search.of(Oracle(alone, alone.passes), plan, declared_only=True)
+    search = InvariantSearch.of(Oracle(alone, alone.passes), plan, declared_only=True)
     texts = {result.prop.text for result in results}
     trials = [trial for trial in search.trials if trial.prop.text in texts]
     if trials and isinstance(runner, Runner):
