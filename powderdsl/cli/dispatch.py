@@ -16,23 +16,23 @@ from powderdsl.system.interrupts import LIFELINE, end_with_stdin, interruptible
 
 COMMANDS: dict[str, tuple[str, str]] = {
     # name: (module in powderdsl.cli.commands, summary)
-    "run": ("run", "Run rules on a world: watch it, or write a picture or an animation."),
-    "check": ("check", "Find the mistakes in rule files and tasks, all at once."),
-    "compile": ("compile", "Print what a stage of the compiler makes of rules."),
-    "show": ("show", "List elements, reactions, passes and parameters; or what a task is."),
-    "test": ("test", "Run the tests of packs, and hold their invariants against the rules."),
-    "trace": ("trace", "Say why a cell holds what it holds: which rule wrote it, and what it read."),
+    "run": ("run", "Run a world: watch it, or write a picture or an animation."),
+    "check": ("check", "Find all mistakes in rule files and tasks at once."),
+    "compile": ("compile", "Print the output of a compiler stage."),
+    "show": ("show", "List elements, reactions, passes and parameters, or describe a task."),
+    "test": ("test", "Run the tests of packs and check their invariants."),
+    "trace": ("trace", "Explain a cell: which rule wrote it, and what the rule read."),
     "record": ("record", "Record episodes of a task: data for offline learning and world models."),
     "bench": ("bench", "Measure how fast rules run, on each backend, batch and size."),
-    "train": ("train", "Train an agent on a task; continue where it was interrupted."),
-    "evaluate": ("evaluate", "Compare an agent with acting at random, and with doing nothing."),
-    "watch": ("watch", "Make a film of an agent at its task."),
-    "wm": ("wm", "World models: train networks that predict worlds, test them, teach them packs."),
-    "study": ("study", "Run many settings and seeds of training, and compare what comes out."),
-    "cache": ("cache", "List or remove compiled code that is kept on this machine."),
-    "new": ("new", "Write a first pack: an element, a rule and a test."),
+    "train": ("train", "Train an agent on a task, or resume an interrupted run."),
+    "evaluate": ("evaluate", "Compare an agent with a random policy and with doing nothing."),
+    "watch": ("watch", "Record a film of an agent at its task."),
+    "wm": ("wm", "World models: train, test and fine-tune networks that predict worlds."),
+    "study": ("study", "Run training over many settings and seeds, and compare the results."),
+    "cache": ("cache", "List or remove cached compiled code."),
+    "new": ("new", "Create a starter pack: an element, a rule and a test."),
     "render": ("render", "Draw a world as a picture, without running it."),
-    "explain": ("explain", "Say what a diagnostic code means, and how to fix it."),
+    "explain": ("explain", "Explain a diagnostic code and how to fix it."),
 }
 
 

@@ -74,10 +74,10 @@ class CountType(click.ParamType):
             return value
         text = str(value).replace("_", "")
         if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
-            self.fail(f"`{value}` is no whole number: write 200000 or 2e5", param, ctx)
+            self.fail(f"`{value}` is not an integer: write 200000 or 2e5", param, ctx)
         number = float(text) if "e" in text.lower() else int(text)
         if number != int(number):
-            self.fail(f"`{value}` is no whole number", param, ctx)
+            self.fail(f"`{value}` is not an integer", param, ctx)
         return int(number)
 
 
@@ -194,7 +194,9 @@ def renamed_backend(name: str) -> str:
     return new
 
 
-def backend_option(default: str, about: str = "What runs the rules.") -> Callable[[Decorated], Decorated]:
+def backend_option(
+    default: str, about: str = "Backend that runs the rules."
+) -> Callable[[Decorated], Decorated]:
     return click.option(
         "--backend",
         type=BackendType(),

@@ -111,7 +111,7 @@ FUNCTIONS: dict[str, Function] = {
             (1, 16),
         ),
         Function("sum", "sum(VALUE in KERNEL)", "the weighted sum of a value over the neighborhood", (1, 1)),
-        Function("at", "at(ROWS, COLUMNS)", "the neighbor so many rows down and columns right", (2, 2)),
+        Function("at", "at(ROWS, COLUMNS)", "the neighbor ROWS down and COLUMNS right", (2, 2)),
         Function(
             "inside", "inside(PLACE)", "whether that neighbor lies inside the grid, without wrapping", (1, 1)
         ),

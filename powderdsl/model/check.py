@@ -18,7 +18,7 @@ from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
 from powderdsl.model.expressions.constants import constant_of
-from powderdsl.model.expressions.operands import Asleep, Broken, Poisoned, SetOf
+from powderdsl.model.expressions.operands import Broken, Poisoned, SetOf, Unresolved
 from powderdsl.model.expressions.property_words import not_a_value
 from powderdsl.model.expressions.scope import Scope
 from powderdsl.model.expressions.symbols import (
@@ -191,7 +191,7 @@ def _shaped_kernels(symbols: Symbols, typer: Typer) -> None:
                 fix = "such as `box(5)`, or rows of weights"
                 raise typer.wrong(found, "a shape with its radius", shape.span, fix)
             symbols.constants[name] = replace(found, name=name, wrap=named.decl.wrap)
-        except (Poisoned, Asleep):
+        except (Poisoned, Unresolved):
             symbols.constants.setdefault(name, Broken())
 
 
@@ -351,7 +351,7 @@ def _values(
             return default_of(prop.kind)
         try:
             expr = typer.of_kind(typer.evaluate(syntax, Scope(owner, {})), prop.kind, syntax.span)
-        except (Poisoned, Asleep):
+        except (Poisoned, Unresolved):
             return default_of(prop.kind)
         if expr.op == "param":
             if (
@@ -415,7 +415,7 @@ def _sets(typer: Typer) -> None:
                 typer.resolve_set(name, syntax.span)
         except Poisoned:
             typer.symbols.constants.setdefault(name, Broken())
-        except Asleep:
+        except Unresolved:
             typer.symbols.constants.setdefault(name, SetOf(()))
     typer.used.clear()
 

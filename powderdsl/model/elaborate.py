@@ -11,13 +11,13 @@ from powderdsl.model.declarations import Block, PassDecl
 from powderdsl.model.expressions.operands import (
     FALSE,
     Absent,
-    Asleep,
     Broken,
     Number,
     Operand,
     Place,
     Poisoned,
     SetOf,
+    Unresolved,
     conjunction,
     constant,
 )
@@ -102,10 +102,10 @@ class Elaborator:
             if span not in self.result.awake:
                 self.typer.reporter.report(
                     "PD506",
-                    f"this rule is asleep: `{name}` is not loaded",
+                    f"this rule is inactive: `{name}` is not loaded",
                     span,
                     "left out",
-                    helps=[f"it wakes up with a pack that defines `{name}`"],
+                    helps=[f"it becomes active with a pack that defines `{name}`"],
                 )
         return self.result
 
@@ -176,7 +176,7 @@ class Elaborator:
         if rounds == [] and block.header is not None and not self.typer.reporter.has_errors:
             self.typer.reporter.report(
                 "PD506", "this loop has no rounds", block.header.span, "nothing to loop over",
-                helps=["it wakes up with a pack that has such elements"],
+                helps=["it becomes active with a pack that has such elements"],
             )  # fmt: skip
         for inner, inner_label in rounds:
             if block.rules:
@@ -208,7 +208,7 @@ class Elaborator:
             return [(scope, f"{label}round {i + 1}") for i in range(rounds)]
         try:
             scopes = self.typer.bindings(header.children, scope)
-        except (Poisoned, Asleep):
+        except (Poisoned, Unresolved):
             return []
         variables = [binding.children[0].text for binding in header.children]
         for variable in variables:
@@ -230,7 +230,7 @@ class Elaborator:
             value = self.typer.value(operand, syntax.span)
         except Poisoned:
             return Broken()
-        except Asleep as asleep:
+        except Unresolved as asleep:
             return Absent(asleep.name)
         finally:
             self._empty_lets |= self.typer.empty
@@ -289,7 +289,7 @@ class Elaborator:
         except Poisoned:
             self.result.awake.add(syntax.span)
             return []
-        except Asleep as asleep:
+        except Unresolved as asleep:
             self.result.asleep[syntax.span] = asleep.name
             return []
         empty = self.typer.empty | self._empty_lets
@@ -399,7 +399,7 @@ class Elaborator:
         else:
             operand = self.typer.evaluate(syntax, scope)
         if isinstance(operand, Absent):
-            raise Asleep(operand.name)
+            raise Unresolved(operand.name)
         if not isinstance(operand, Expr) or operand.op not in ("field", "property"):
             fields = [
                 *self.typer.symbols.fields,

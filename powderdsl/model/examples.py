@@ -11,7 +11,7 @@ from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import TestDecl
 from powderdsl.model.expressions.constants import constant_of
-from powderdsl.model.expressions.operands import Asleep, Poisoned
+from powderdsl.model.expressions.operands import Poisoned, Unresolved
 from powderdsl.model.expressions.scope import Scope
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.fields.grids import GridReader
@@ -29,7 +29,7 @@ def check_examples(composition: Composition, typer: Typer) -> tuple[Example, ...
         for decl in pack.tests:
             try:
                 examples.append(_example(decl, pack.name.text, composition, typer))
-            except (Poisoned, Asleep):
+            except (Poisoned, Unresolved):
                 continue
     return tuple(examples)
 
@@ -47,7 +47,7 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         name = composition.element(word, pack)
         if name is None:
             if value.text != word:
-                raise Asleep(word)  # a test of what packs do together waits until both are loaded
+                raise Unresolved(word)  # a test of what packs do together waits until both are loaded
             helps = (
                 *suggest(word, composition.elements, "elements"),
                 f"if its pack may be absent, write `{word}?`",
@@ -68,13 +68,13 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         if not any(side % least for side in sides):  # a pack unknown to this one asks for other worlds
             typer.reporter.report(
                 "PD506",
-                "this test is asleep: its world has sides that these rules do not allow",
+                "this test is inactive: its world has sides that these rules do not allow",
                 decl.scalar.span,
                 "left out",
                 notes=[f"a loaded pack asks for sides that are multiples of {composition.side_multiple}"],
                 helps=["it wakes up without the pack that says `side_multiple`"],
             )
-            raise Asleep("side_multiple")
+            raise Unresolved("side_multiple")
         raise typer.fail(
             "PD110",
             f"a world of {len(given)}×{len(given[0])} cells",

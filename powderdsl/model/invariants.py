@@ -14,10 +14,10 @@ from powderdsl.model.expressions.operands import (
     FALSE,
     TRUE,
     Absent,
-    Asleep,
     Number,
     Poisoned,
     SetOf,
+    Unresolved,
     disjunction,
     member,
 )
@@ -70,10 +70,10 @@ def check_invariants(
             found.append(Invariant(claim, without, pack, line.span, scope))
         except Poisoned:
             pass
-        except Asleep as asleep:
+        except Unresolved as asleep:
             typer.reporter.report(
-                "PD506", f"this invariant is asleep: `{asleep.name}` is not loaded", line.span, "left out",
-                helps=[f"it wakes up with a pack that defines `{asleep.name}`"],
+                "PD506", f"this invariant is inactive: `{asleep.name}` is not loaded", line.span, "left out",
+                helps=[f"it becomes active with a pack that defines `{asleep.name}`"],
             )  # fmt: skip
         added = [one.name.text for one in composition.packs if one.name.text not in scope]
         for remark in typer.reporter.diagnostics:
@@ -104,7 +104,7 @@ def _can_hold(typer: Typer | None, line: Syntax, pack: str) -> bool:
         return typer is not None and bool(_claim(typer, line, pack))
     except Poisoned:
         return False
-    except Asleep:
+    except Unresolved:
         return True
 
 
@@ -157,7 +157,7 @@ def _elements(typer: Typer, what: Syntax, scope: Scope) -> tuple[int, ...]:
     operand = typer.evaluate(what, scope)
     ids = typer.set_of(operand, what.span).ids
     if not ids and typer.absent:
-        raise Asleep(", ".join(sorted(typer.absent)))
+        raise Unresolved(", ".join(sorted(typer.absent)))
     if not ids:
         _says_nothing(typer, what.span, "no element is meant")
     return ids
@@ -188,7 +188,7 @@ def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
             for number in typer.set_of(operand, child.span).ids
         }
         if not ids and typer.absent:
-            raise Asleep(", ".join(sorted(typer.absent)))
+            raise Unresolved(", ".join(sorted(typer.absent)))
         if not ids or ids == set(typer.symbols.ids):
             _says_nothing(typer, call.span, "all cells are counted" if ids else "no element is counted")
         return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, frozenset(ids))
@@ -223,7 +223,7 @@ def _never(typer: Typer, line: Syntax, scope: Scope) -> Claim:
 def _asked(typer: Typer, condition: Expr, span: Span) -> Expr:
     """The condition, unless it is not a question: it may depend on a pack that is not loaded, or be false by its words."""
     if condition == FALSE and typer.absent:
-        raise Asleep(", ".join(sorted(typer.absent)))
+        raise Unresolved(", ".join(sorted(typer.absent)))
     if condition in (TRUE, FALSE):
         _says_nothing(
             typer, span, "every cell fulfills this" if condition == TRUE else "no cell can fulfill this"
@@ -236,7 +236,7 @@ def _stays(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     what, bounds = line.children
     operand = typer.evaluate(what, scope)
     if isinstance(operand, Absent):
-        raise Asleep(operand.name)
+        raise Unresolved(operand.name)
     if (
         not isinstance(operand, Expr)
         or operand.op not in ("field", "property")

@@ -29,7 +29,7 @@ class TrainConfig:
 
     task: str
     """A shipped task's name, or a file's path."""
-    split: str = setting("train", "Which worlds.  [default: train]")
+    split: str = setting("train", "Split: which worlds.  [default: train]")
     knobs: Mapping[str, int] = field(default_factory=dict)
     params: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the rules: numbers, or text such as ``5%``."""
@@ -37,7 +37,7 @@ class TrainConfig:
     """Packs, by name or file, that are added to the task's rules."""
     slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
-    observation: str = setting("compact", "What the network sees.", choices=KINDS)
+    observation: str = setting("compact", "Observation of the network.", choices=KINDS)
     network: str = setting("paper", "The paper's, or a small one.", choices=NETWORKS)
     features: int = setting(256, "Width of its fully connected layers.", 1, 1 << 16)
     envs: int = setting(32, "Worlds that are played at once.", 1, 1 << 20)
@@ -48,7 +48,7 @@ class TrainConfig:
     gamma: float = setting(0.99, "Discount of later rewards.", 0.0, 1.0)
     gae_lambda: float = setting(0.95, "Of generalized advantages.", 0.0, 1.0)
     clip: float = setting(0.2, "How far an update may change chances.", 1e-6, 10.0)
-    entropy: float = setting(0.0, "Weight of the entropy.", 0.0, 100.0)
+    entropy: float = setting(0.0, "Entropy coefficient.", 0.0, 100.0)
     seed: int = setting(0, "Of the run: worlds, network, and actions.", 0, 2**32 - 1)
     steps: int = setting(1_000_000, "Interactions, of all worlds together, such as 2e5.", 1, 10**12)
     """A run ends with the first whole rollout that reaches them."""

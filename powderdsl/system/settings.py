@@ -33,7 +33,7 @@ def out_of_bounds(config: Any) -> Iterator[str]:
             continue
         low, high = bounds
         whole = isinstance(one.default, int)
-        takes = f"a whole number from {low:,} to {high:,}" if whole else f"a number from {low:g} to {high:g}"
+        takes = f"an integer from {low:,} to {high:,}" if whole else f"a number from {low:g} to {high:g}"
         number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
         if not number or not math.isfinite(value) or not low <= value <= high:
             yield f"`{one.name}` is {value!r}: it takes {takes}"

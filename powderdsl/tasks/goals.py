@@ -9,7 +9,7 @@ from functools import reduce
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.expressions.literals import read_number
-from powderdsl.model.expressions.operands import Asleep, Number, Operand, Poisoned, SetOf
+from powderdsl.model.expressions.operands import Number, Operand, Poisoned, SetOf, Unresolved
 from powderdsl.model.expressions.scope import Scope
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import FLAG, REAL, Expr
@@ -86,7 +86,7 @@ class GoalChecker:
             return self.scalar(syntax)
         except Poisoned:
             return None
-        except Asleep as asleep:
+        except Unresolved as asleep:
             self.typer.fail("PD301", f"`{asleep.name}` is not loaded", syntax.span, "depends on it")
             return None
 

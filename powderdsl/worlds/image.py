@@ -159,7 +159,7 @@ def _wrong_color(
 def _many_colors(path: Path, count: int) -> Diagnostic:
     number = f"more than {MAX_COLORS:,}" if count > MAX_COLORS else f"{count:,}"
     helps = ("draw with a hard brush in the elements' colors, one pixel a cell, and scale without smoothing",)
-    return Diagnostic("PD609", f"{number} colors in {path} are no element's", Label(None), helps=helps)
+    return Diagnostic("PD609", f"{number} colors in {path} are not any element's", Label(None), helps=helps)
 
 
 def _distance(one: str, other: str) -> int:

@@ -184,7 +184,7 @@ def test_a_pack_that_asks_for_even_sides_is_added_to_packs_with_odd_tests() -> N
         ELEMENT.replace("slime", "seven").replace("needs: core", "needs: core\nside_multiple: 2")
     )
     shown = run("check", "core+even.yaml", "--quick", "--notes")
-    assert "this test is asleep: its world has sides that these rules do not allow" in shown
+    assert "this test is inactive: its world has sides that these rules do not allow" in shown
 
 
 def test_values_that_ask_each_other_twice_take_no_time() -> None:

@@ -251,8 +251,8 @@ def test_names_after_a_dot_may_be_absent() -> None:
     rules, notes = load_with_diagnostics("core", mine)
     asleep = [note.message for note in notes if note.code == "PD506" and "mine" in str(note.primary.span)]
     assert asleep == [
-        "this rule is asleep: `wet` is not loaded",
-        "this rule is asleep: `one.wet` is not loaded",
+        "this rule is inactive: `wet` is not loaded",
+        "this rule is inactive: `one.wet` is not loaded",
     ]
     rules, notes = load_with_diagnostics("core", "one.yaml", mine)
     buzz = next(one for one in rules.passes if one.name == "buzz")

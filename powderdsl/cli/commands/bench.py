@@ -37,7 +37,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     "backends",
     type=BackendType(),
     multiple=True,
-    help="What runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
+    help="Backend that runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
 )
 @click.option(
     "--batch",
@@ -84,8 +84,8 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 )
 @click.option("--seed", type=WholeType(0, 2**63 - 1), default=0, show_default=True, help="Of the worlds.")
 @set_option
-@click.option("--profile", is_flag=True, help="What each pass costs.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object with every figure, instead of tables.")
+@click.option("--profile", is_flag=True, help="Time of each pass.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of tables.")
 @click.option(
     "--out",
     "data",

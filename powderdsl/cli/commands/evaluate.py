@@ -35,7 +35,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @click.command("evaluate", cls=ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option(
-    "--splits", callback=_names, metavar="A,B", help="Which worlds.  [default: all splits of the task]"
+    "--splits", callback=_names, metavar="A,B", help="Split: which worlds.  [default: all splits of the task]"
 )
 @click.option(
     "--policies", callback=_names, metavar="A,B", help="Of trained, random, nothing.  [default: all]"
@@ -58,7 +58,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
 @set_option
 @packs_option
-@click.option("--backend", type=BackendType(), help="What runs the rules.  [default: the run's]")
+@click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @layout_options("One JSON object instead of a table.")
 @click.option(

@@ -17,7 +17,7 @@ PAGE_WIDTH = 100
 @click.command("explain")
 @click.argument("code", required=False)
 def command(code: str | None) -> None:
-    """Say what a diagnostic code means, and how to fix it.
+    """Explain a diagnostic code and how to fix it.
 
     CODE is a code such as PD301, or its name such as unknown-name. Without one, all codes are listed.
     """

@@ -27,7 +27,7 @@ SCRIPTED = ("random", "nothing")
 @click.argument("task", required=False)
 @click.option("--out", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the dataset goes.")
 @click.option("--episodes", type=WholeType(1, 1 << 32), help="How many are recorded.")
-@click.option("--split", default="train", show_default=True, help="Which worlds.")
+@click.option("--split", default="train", show_default=True, help="Split: which worlds.")
 @click.option(
     "--policy",
     metavar="random|nothing|RUN",

@@ -77,7 +77,11 @@ def called(words: tuple[str, ...]) -> click.Command:
 @click.command("study")
 @click.argument("study", metavar="STUDY", required=False)
 @click.option(
-    "--size", type=click.Choice(SIZES), default="small", show_default=True, help="Which values it takes."
+    "--size",
+    type=click.Choice(SIZES),
+    default="small",
+    show_default=True,
+    help="Size of the study: values of its settings.",
 )
 @click.option(
     "--seeds", type=WholeType(1, 1000), help="How many runs of each combination, instead of the study's."

@@ -33,7 +33,7 @@ MAX_SECONDS = 24 * 3600
 @click.option("--drawn", type=WholeType(0, 1_000_000), default=100, show_default=True,
               help="More worlds, drawn by Hypothesis.")  # fmt: skip
 @click.option("--seconds", type=WholeType(1, MAX_SECONDS), default=60, show_default=True,
-              help="Random worlds end after so many seconds for each RULES.")  # fmt: skip
+              help="Time limit for random worlds, per RULES, in seconds.")  # fmt: skip
 @click.option("--seed", type=WholeType(0, 2**31 - 1), default=0, show_default=True,
               help="Other worlds for another seed, the same for the same.")  # fmt: skip
 @click.option(
@@ -53,7 +53,7 @@ MAX_SECONDS = 24 * 3600
 @click.option("--pack", "packs", multiple=True, metavar="PACK",
               help="With --mutate: only mistakes in this pack. May be repeated.")  # fmt: skip
 @click.option("--mutants", type=WholeType(1, 1_000_000), metavar="N",
-              help="With --mutate: at most so many mistakes, of each kind in proportion.")  # fmt: skip
+              help="With --mutate: maximum number of mutants, of each kind in proportion.")  # fmt: skip
 @click.option("--write", is_flag=True, help="With --mutate: add a test for each of them to its pack.")
 @click.option("--jobs", type=WholeType(1, 256), metavar="N",
               help="With --mutate: processes.  [default: one a processor]")  # fmt: skip

@@ -36,16 +36,14 @@ class CellType(click.ParamType):
 @click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
 @click.option("--seed", type=WholeType(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
 @click.option("--at", "cell", type=CellType(), required=True, help="The cell, counted from 0.")
-@click.option("--step", type=WholeType(1, 10**9), required=True, help="Which step of the run, from 1.")
+@click.option("--step", type=WholeType(1, 10**9), required=True, help="Step of the run, from 1.")
 @click.option(
     "--of", "names", multiple=True, metavar="NAME", help="Only the element, or this field. May be repeated."
 )
-@click.option(
-    "--number", type=WholeType(0, 1 << 20), default=0, help="Which world of a saved batch.  [default: 0]"
-)
+@click.option("--number", type=WholeType(0, 1 << 20), default=0, help="World of a saved batch.  [default: 0]")
 @click.option("--all", "every_rule", is_flag=True, help="Every rule that did not happen, and why.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object.")
-@backend_option("auto", "What runs the steps before.")
+@backend_option("auto", "Backend that runs the steps before it.")
 @set_option
 def command(
     rules: str,

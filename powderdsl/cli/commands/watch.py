@@ -17,7 +17,7 @@ SUFFIXES = (".gif", ".mp4")
 
 @click.command("watch", cls=ManyWords)
 @click.argument("run", metavar="RUN|TASK")
-@click.option("--split", help="Which worlds.  [default: test where the task has it, else train]")
+@click.option("--split", help="Split: which worlds.  [default: test where the task has it, else train]")
 @click.option("--worlds", type=WholeType(1, 64), default=4, show_default=True, help="How many, side by side.")
 @click.option(
     "--first", type=WholeType(0, 2**62), default=0, show_default=True, help="Number of the first one."
@@ -25,7 +25,7 @@ SUFFIXES = (".gif", ".mp4")
 @click.option(
     "--policy",
     type=click.Choice(("trained", "random", "nothing")),
-    help="Who acts.  [default: trained; of a TASK: random]",
+    help="Policy.  [default: trained; of a TASK: random]",
 )
 @click.option(
     "--deterministic/--sampled", default=False, help="The likeliest action, or one drawn.  [default: sampled]"
@@ -44,7 +44,7 @@ SUFFIXES = (".gif", ".mp4")
 )
 @click.option("--fps", type=WholeType(1, 240), default=15, show_default=True, help="Frames a second.")
 @click.option("--scale", type=WholeType(1, 32), default=4, show_default=True, help="Pixels a cell.")
-@click.option("--backend", type=BackendType(), help="What runs the rules.  [default: the run's]")
+@click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
 def command(
     run: str,
     split: str | None,

@@ -48,7 +48,9 @@ def _data_options(function: Decorated) -> Decorated:
         click.option("--buffer", "capacity", type=WholeType(1, 1 << 32), help="Pairs that the buffer holds."),
         click.option("--refresh", type=WholeType(1, 1 << 20), help="Pairs that each iteration replaces."),
         set_option,
-        click.option("--rulesets", type=WholeType(0, 1024), help="Draw so many rulesets around the rules."),
+        click.option(
+            "--rulesets", type=WholeType(0, 1024), help="Number of rulesets to draw around the rules."
+        ),
         click.option(
             "--first-ruleset", type=WholeType(0, 1 << 31), help="The number of the first.  [default: 0]"
         ),
@@ -226,7 +228,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     "--rulesets",
     type=WholeType(0, 1024),
     default=0,
-    help="Test under so many rulesets that training never saw.",
+    help="Number of rulesets to test under that training never saw.",
 )
 @layout_options("One JSON object instead of a table.")
 @click.option("--out", metavar="FILE", type=click.Path(path_type=Path), help="[default: RUN/evaluation.json]")

@@ -10,7 +10,6 @@ from powderdsl.model.expressions.operands import (
     FALSE,
     TRUE,
     Absent,
-    Asleep,
     Bounds,
     Items,
     Number,
@@ -18,6 +17,7 @@ from powderdsl.model.expressions.operands import (
     Place,
     Poisoned,
     SetOf,
+    Unresolved,
     conjunction,
     disjunction,
     look,
@@ -66,7 +66,7 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
         case _, Absent():
             return FALSE
         case Absent(), _:
-            raise Asleep(left.name)
+            raise Unresolved(left.name)
     ids = typer.set_of(right, second.span).ids
     if isinstance(left, SetOf) and left.name is None:
         raise typer.wrong(left, "a place or an element before `is`", first.span, "such as `below is …`")

@@ -82,7 +82,7 @@ class Poisoned(Exception):
     """This expression has been reported already: whatever contains it stays silent."""
 
 
-class Asleep(Exception):
+class Unresolved(Exception):
     """This rule needs `name`, which no loaded pack defines, and says so with a `?`."""
 
     def __init__(self, name: str):
@@ -193,7 +193,7 @@ class Coercer:
         if isinstance(operand, Place):
             return operand
         if isinstance(operand, Absent):
-            raise Asleep(operand.name)
+            raise Unresolved(operand.name)
         raise self.wrong(operand, "a neighbor", span, "such as `below`, `above.left`, or `at(2, -1)`")
 
     def element(self, operand: Operand, span: Span) -> Expr:
@@ -207,7 +207,7 @@ class Coercer:
             case SetOf():
                 raise self.wrong(operand, "one element", span, "name the element itself")
             case Absent():
-                raise Asleep(operand.name)
+                raise Unresolved(operand.name)
         raise self.wrong(operand, "an element", span)
 
     def value(self, operand: Operand, span: Span) -> Expr | Number:
@@ -222,7 +222,7 @@ class Coercer:
             case SetOf():
                 return self.flag(operand, span)
             case Absent():
-                raise Asleep(operand.name)
+                raise Unresolved(operand.name)
         raise self.wrong(operand, "a value", span)
 
     def real(self, operand: Operand, span: Span) -> Expr:
@@ -322,7 +322,7 @@ class Coercer:
         if isinstance(operand, Expr) and operand.kind == DIRECTION:
             return operand
         if isinstance(operand, Absent):
-            raise Asleep(operand.name)
+            raise Unresolved(operand.name)
         raise self.wrong(operand, "a direction", span, "such as `left`, or `octant(…)`")
 
     def offset(self, offset: Offset, span: Span) -> Offset:

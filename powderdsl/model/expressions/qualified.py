@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Span
-from powderdsl.model.expressions.operands import Absent, Asleep, Operand, Place, SetOf, look
+from powderdsl.model.expressions.operands import Absent, Operand, Place, SetOf, Unresolved, look
 from powderdsl.model.expressions.scope import Scope
 from powderdsl.model.types import Expr
 from powderdsl.syntax.ast import Syntax
@@ -47,13 +47,13 @@ def optional_attribute(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     """``pack.name?``, ``below.name?``: absent unless a loaded pack defines it."""
     try:
         return typer.attribute(certain(typer, syntax, scope), scope)
-    except Asleep as asleep:
+    except Unresolved as asleep:
         typer.absent.add(asleep.name)
         return Absent(asleep.name)
 
 
 def certain(typer: Typer, syntax: Syntax, scope: Scope) -> Syntax:
-    """An attribute without its question mark. Raises Asleep if nothing that is loaded has its name."""
+    """An attribute without its question mark. Raises Unresolved if nothing that is loaded has its name."""
     (before,) = syntax.children
     span, symbols = syntax.span, typer.symbols
     plain = replace(syntax, kind="attribute", span=Span(span.source, span.start, span.end - 1))
@@ -65,7 +65,7 @@ def certain(typer: Typer, syntax: Syntax, scope: Scope) -> Syntax:
     if before.kind in ("name", "attribute"):
         found = typer.find(before.text, before.span, scope)
         if found is None or isinstance(found, SetOf):  # a pack that has an element of its name
-            raise Asleep(qualified)
+            raise Unresolved(qualified)
     if typer.find(syntax.text, syntax.span, scope) is None:
-        raise Asleep(syntax.text)
+        raise Unresolved(syntax.text)
     return plain

@@ -18,7 +18,6 @@ from powderdsl.model.expressions.operands import (
     FALSE,
     TRUE,
     Absent,
-    Asleep,
     Bounds,
     Broken,
     Coercer,
@@ -28,6 +27,7 @@ from powderdsl.model.expressions.operands import (
     Place,
     Poisoned,
     SetOf,
+    Unresolved,
     conjunction,
     disjunction,
     look,
@@ -72,7 +72,7 @@ class Typer(Coercer):
         self._rule_span: Span | None = None
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
-        """What the syntax stands for. Raises Poisoned after reporting, Asleep if it depends on an absent name."""
+        """What the syntax stands for. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
         self._work += 1
         if self._work > MAX_WORK + 1:
             raise Poisoned  # that has been said, and is true of all that follows
@@ -230,7 +230,7 @@ class Typer(Coercer):
         base = self.evaluate(base_syntax, scope)
         word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
         if isinstance(base, Absent):
-            raise Asleep(base.name)
+            raise Unresolved(base.name)
         if isinstance(base, Expr) and base.kind.name == "vec2":
             if syntax.text in ("row", "column"):
                 return arithmetic.part(base, syntax.text, syntax.span)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from powderdsl.diagnostics import Label, Span, suggest
-from powderdsl.model.expressions.operands import Asleep, Poisoned
+from powderdsl.model.expressions.operands import Poisoned, Unresolved
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.fields.words import FORMS, WordProblem, read_word
 from powderdsl.model.types import Cell, FieldGrid, Kind
@@ -101,7 +101,7 @@ class GridReader:
         if symbols.is_declared(name, self.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
         if key.text.endswith("?"):
-            raise Asleep(name)  # the test waits for the pack that declares it
+            raise Unresolved(name)  # the test waits for the pack that declares it
         helps = (
             *suggest(name, [*symbols.fields, *symbols.properties], "fields"),
             f"if its pack may be absent, write `{name}?`",

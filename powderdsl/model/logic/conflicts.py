@@ -219,8 +219,8 @@ def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
 
 def _report_sleep(reason: str, span: Span, reporter: Reporter) -> None:
     reporter.report(
-        "PD506", f"this rule is asleep: {reason}", span, "cannot happen with these packs",
-        helps=["it wakes up with a pack that brings what it asks for"],
+        "PD506", f"this rule is inactive: {reason}", span, "cannot happen with these packs",
+        helps=["it becomes active with a pack that brings what it asks for"],
     )  # fmt: skip
 
 

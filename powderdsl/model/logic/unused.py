@@ -47,7 +47,7 @@ def _unused(what: str, name: str, span: Span, reporter: Reporter) -> None:
 
 
 def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
-    """Report fields and values under `let` whose names stand in no rule, not even in one that is asleep.
+    """Report fields and values under `let` whose names stand in no rule, not even in one that is inactive.
 
     Tasks and programs may read a field that a ruleset lists as a channel. Streams and tags are left out: packs declare
     them for others.
