@@ -7,10 +7,20 @@ A loop over cells sees floats, and flags that are stored.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset, walk
+from powderdsl.schedule.costs import (
+    ARITHMETIC,
+    LOGIC,
+    UNIFORM,
+    Costs,
+    is_constant,
+    movable,
+    sources_of,
+    stored_parts,
+)
 from powderdsl.schedule.draws import DRAWS, all_of, asked_for
 from powderdsl.schedule.floats import conjuncts, is_comparison, of_floats
 from powderdsl.schedule.types import (
@@ -23,29 +33,13 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Var,
+    defined_by,
     flat,
     load,
+    loaded,
     ordered,
     values_of,
 )
-
-FAR = 100
-"""The cost of what cannot be computed again."""
-
-UNIFORM = ("const", "param", "coordinate", "inside")
-_LOGIC = ("not", "and", "or", "xor", "select", "when")
-_ARITHMETIC = ("add", "sub", "mul", "neg")
-
-Have = Callable[[Node], bool]
-
-
-@dataclass(frozen=True)
-class Costs:
-    """What storing costs a target. `gates`: summed over all neighbors that ask, up to which a flag is computed again;
-    `floats`: operations up to which a float is."""
-
-    gates: int
-    floats: int
 
 
 def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
@@ -61,73 +55,6 @@ def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
         return replace(schedule, body=tuple(body), leaves=leaves)
 
     return stage
-
-
-# What is computed again
-
-
-def sources_of(node: Node) -> list[tuple[Node, Offset]]:
-    """What a node asks for at neighbors, and where."""
-    if node.op == "shift":
-        return [(node.args[0], node.attr[:2])]
-    if node.op in ("swap", "arrive"):
-        (dy, dx), (content, movers, _) = node.attr, node.args
-        back = [(content, (-dy, -dx)), (movers, (-dy, -dx))]
-        return [*back, (content, (dy, dx))] if node.op == "swap" else back
-    return []
-
-
-def movable(node: Node, have: Have, most: int) -> bool:
-    """Whether a flag can be computed at a neighbor with at most so many gates."""
-    seen: set[tuple[int, Offset]] = set()
-    stack = [(node, (0, 0))]
-    while stack:
-        top, (dy, dx) = stack.pop()
-        if (id(top), (dy, dx)) in seen or is_constant(top):
-            continue
-        seen.add((id(top), (dy, dx)))
-        if len(seen) > most:
-            return False
-        if have(top):
-            continue
-        if top.op == "shift" and top.attr[2]:
-            stack.append((top.args[0], (dy + top.attr[0], dx + top.attr[1])))
-        elif top.op in _LOGIC and not of_floats(top):
-            stack.extend((arg, (dy, dx)) for arg in top.args)
-        else:
-            return False
-    return True
-
-
-def is_constant(node: Node) -> bool:
-    """Whether a value is the same in all cells of a world."""
-    return node.op in ("const", "param") or (node.op == "coordinate" and node.attr[0] == "step")
-
-
-def float_cost(node: Node, have: Have) -> int:
-    """Operations that computing a float at a neighbor takes; FAR if it cannot be done there."""
-    if have(node) or node.op in ("const", "param"):
-        return 0
-    if node.op in _ARITHMETIC:
-        total = 1
-        for arg in node.args:
-            total += float_cost(arg, have)
-            if total >= FAR:  # graphs share nodes: counting on would take forever
-                return FAR
-        return total
-    return float_cost(node.args[0], have) if node.op == "shift" and node.attr[2] else FAR
-
-
-def stored_parts(source: Node, have: Have, most: int) -> list[Node]:
-    """What must be stored so that a float can be computed at a neighbor: itself, or the costly things in it."""
-    if float_cost(source, have) <= most:
-        return []
-    if source.op in _ARITHMETIC:
-        parts = [part for arg in source.args for part in stored_parts(arg, have, most)]
-        ids = {id(part) for part in parts}
-        if float_cost(source, lambda node: have(node) or id(node) in ids) <= most:
-            return parts
-    return [source]
 
 
 # Loops
@@ -162,6 +89,18 @@ class Cutter:
         self.same: dict[str, Node] = {}
         """Loads of variables that have the same value as others, by the others' names."""
 
+        self.there = {var.name for _, var in schedule.finds}
+        """Variables that exist where we are."""
+
+    def emit(self, statement: Statement) -> None:
+        self.statements.append(statement)
+        self.there |= {var.name for var in defined_by(statement)}
+
+    def alias(self, names: dict[str, Node]) -> None:
+        """Variables that are only other names."""
+        self.same |= names
+        self.there |= names.keys()
+
     def have(self, node: Node) -> bool:
         return node.op == "load" or id(node) in self.known
 
@@ -183,7 +122,7 @@ class Cutter:
     ) -> list[Statement]:
         """`kept`: variables that a guard around the block keeps."""
         outer, self.statements = self.statements, []
-        known = dict(self.known)
+        scope = dict(self.known), set(self.there)
         for i, statement in enumerate(body):
             match statement:
                 case Compute(outs, place):
@@ -199,11 +138,12 @@ class Cutter:
                 case Guard():
                     pass  # with the masks before it
                 case Forget():
-                    self.statements.append(statement)
+                    self.emit(statement)
                 case _:
                     raise AssertionError("movements and buffers come after loops")
         found, self.statements = self.statements, outer
-        self.known = known if not top else self.known
+        if not top:
+            self.known, self.there = scope
         return found
 
     def compute(self, outs: Iterable[Out], place: str, kept: frozenset[str] = frozenset()) -> None:
@@ -214,9 +154,9 @@ class Cutter:
             if named.get(id(out.value)) is out.var:
                 continue
             if out.var.name in kept:
-                self.statements.append(Compute((Out(out.var, self.variable(out.value)),), place, "words"))
+                self.emit(Compute((Out(out.var, self.variable(out.value)),), place, "words"))
             else:  # stored under another name
-                self.same[out.var.name] = self.variable(out.value)
+                self.alias({out.var.name: self.variable(out.value)})
 
     def hoist_comparisons(self, masks: list[Node], place: str) -> None:
         """Comparisons that masks ask for, outside any guard, with all others that can be had in one loop."""
@@ -231,13 +171,17 @@ class Cutter:
         asked = list(dict.fromkeys(asked))
         self.ensure([need for node in asked for need in self.needs(node)], place)
         others = [self.led.get(id(node), node) for node in self.comparisons]
-        ready = [node for node in others if not self.have(node) and not self.needs(node)]
+        ready = [
+            node
+            for node in others
+            if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node]))
+        ]
         self.ensure([*asked, *ready], place)
 
     def guarded(self, masks: Compute, guard: Guard) -> None:
         """Masks and the guard that asks for them: first what is cheap, and the rest only where that leaves something."""
         graph, place = self.graph, masks.place
-        self.same |= {out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)}
+        self.alias({out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)})
         masks = replace(masks, outs=tuple(out for out in masks.outs if out.var.name not in self.same))
         split = {out.var.name: self.split(out.value) for out in masks.outs}
         needs = [need for out in masks.outs for need in self.needs(out.value)]
@@ -254,16 +198,17 @@ class Cutter:
         # Whether the cheap parts hold anywhere: only then are the others, and what they need, computed.
         first = [all_of(cheap[node.attr], graph) if node.attr in cheap else node for node in guard.when]
         outer, self.statements = self.statements, []
-        known = dict(self.known)
+        scope = dict(self.known), set(self.there)
         self.ensure([need for out in lazy for need in self.needs(out.value)], place)
         self.ask(lazy, guard)
         inner, self.statements = self.statements, outer
-        self.known = known
+        self.known, self.there = scope
         nothing = graph.node("const", FLAG, (), False)
         kept = (*((out.var, nothing) for out in mine), *self.kept(guard))
-        self.statements.append(Compute((self.answer(first),), place, "words"))
-        when = (load(graph, self.statements[-1].outs[0].var),)  # type: ignore[union-attr]
-        self.statements.append(Guard(when, tuple(inner), kept, guard.place))
+        question = self.answer(first)
+        self.emit(Compute((question,), place, "words"))
+        when = (load(graph, question.var),)
+        self.emit(Guard(when, tuple(inner), kept, guard.place))
 
     def ask(self, masks: list[Out], guard: Guard) -> None:
         """Store masks, ask whether they hold anywhere, and what the guard does then."""
@@ -272,10 +217,10 @@ class Cutter:
         self.ensure([need for node in asked for need in self.needs(node)], guard.place)
         words = tuple(Out(out.var, self.word(out.value)) for out in masks)
         question = self.answer(asked)
-        self.statements.append(Compute((*words, question), guard.place, "words"))
+        self.emit(Compute((*words, question), guard.place, "words"))
         body = tuple(self.block(guard.body, frozenset(var.name for var, _ in guard.keeps)))
         when = (load(self.graph, question.var),)
-        self.statements.append(Guard(when, body, self.kept(guard), guard.place))
+        self.emit(Guard(when, body, self.kept(guard), guard.place))
 
     def answer(self, flags: Sequence[Node]) -> Out:
         """Whether one of some flags holds in any cell."""
@@ -402,7 +347,7 @@ class Cutter:
 
     def words(self, pairs: Sequence[tuple[Var, Node]], place: str, when: Node | None = None) -> None:
         outs = tuple(Out(var, self.word(node)) for var, node in pairs)
-        self.statements.append(Compute(outs, place, "words", when=when))
+        self.emit(Compute(outs, place, "words", when=when))
         self.known |= {id(node): var for var, node in pairs if not self.have(node)}
 
     def cells(
@@ -415,7 +360,7 @@ class Cutter:
         pairs = sorted(pairs, key=lambda pair: (pair[1].type != REAL, pair[1].op == "led"))
         cells = _Cells(self)
         outs = tuple(Out(var, cells.value(node)) for var, node in pairs)
-        self.statements.append(Compute(outs, place, over))
+        self.emit(Compute(outs, place, over))
         self.known |= {id(node): var for var, node in pairs}
 
     # Values of a loop
@@ -448,7 +393,7 @@ class Cutter:
                 assert dy == dx == 0
                 inside = graph.node("inside", FLAG, (), (sy, sx))
                 return graph.node("and", FLAG, (moved, inside))
-            if node.op in _LOGIC:
+            if node.op in LOGIC:
                 return graph.node(node.op, FLAG, tuple(value(arg, dy, dx) for arg in node.args))
             assert dy == dx == 0
             if node.op in ("swap", "arrive"):
@@ -490,6 +435,6 @@ class _Cells:
                 return self.value(node.args[0], dy + sy, dx + sx)
             assert dy == dx == 0
             return graph.node("shift", REAL, (self.cutter.variable(node.args[0]),), node.attr)
-        assert dy == dx == 0 or node.op in _ARITHMETIC
+        assert dy == dx == 0 or node.op in ARITHMETIC
         args = tuple(self.value(arg, dy, dx) for arg in node.args)
         return graph.node(node.op, node.type, args, node.attr, node.places)

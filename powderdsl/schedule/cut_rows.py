@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, REAL, Node, walk
-from powderdsl.schedule.cut import UNIFORM, Costs, Cutter, Have, is_constant, stored_parts
+from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant, stored_parts
+from powderdsl.schedule.cut import Cutter
 from powderdsl.schedule.draws import DRAWS, all_of
 from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.moves import is_movement
@@ -118,7 +119,7 @@ class _RowCutter(Cutter):
 
     def guarded(self, masks: Compute, guard: Guard) -> None:
         place = masks.place
-        self.same |= {out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)}
+        self.alias({out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)})
         outs = [out for out in masks.outs if out.var.name not in self.same]
         self.ensure([part for out in outs for part in self.shared_parts(out.value)], place)
         split = {id(out): self.split(out.value) for out in outs}
@@ -143,12 +144,12 @@ class _RowCutter(Cutter):
             cheap, rest = split[id(out)]
             var = self.namer.var(FLAG) if rest else out.var
             candidates.append(Out(var, self.word(all_of(cheap, graph))))
-        self.statements.append(Compute(tuple(candidates), place, "words", when=masks.when))
+        self.emit(Compute(tuple(candidates), place, "words", when=masks.when))
         asked = [load(graph, out.var) for out in candidates]
         mine = {out.var.name for out in outs}
         asked += [self.renamed(node) for node in guard.when if node.attr not in mine]
         outer, self.statements = self.statements, []
-        known = dict(self.known)
+        scope = dict(self.known), set(self.there)
         lazy = []
         for out, candidate in zip(outs, candidates, strict=True):
             rest = split[id(out)][1]
@@ -156,12 +157,12 @@ class _RowCutter(Cutter):
                 lazy.append(Out(out.var, self.under(load(graph, candidate.var), rest)))
         self.ensure([need for out in lazy for need in self.needs(out.value)], place)
         words = tuple(replace(out, value=self.word(out.value)) for out in lazy)
-        self.statements.append(Compute(words, place, "words"))
+        self.emit(Compute(words, place, "words"))
         inner, self.statements = self.statements, outer
-        self.known = known
+        self.known, self.there = scope
         nothing = graph.node("const", FLAG, (), False)
         kept = tuple((out.var, nothing) for out in lazy)
-        self.statements.append(Guard(tuple(dict.fromkeys(asked)), tuple(inner), kept, guard.place))
+        self.emit(Guard(tuple(dict.fromkeys(asked)), tuple(inner), kept, guard.place))
         self.known |= {id(out.value): out.var for out in outs}
 
     def ask(self, masks: list[Out], guard: Guard) -> None:
@@ -198,7 +199,7 @@ class _RowCutter(Cutter):
             self.move(carried, kept, guard.place)
         if inner:
             body = self.block(inner, frozenset(var.name for var, _ in keeps))
-            self.statements.append(Guard(when, tuple(body), keeps, guard.place))
+            self.emit(Guard(when, tuple(body), keeps, guard.place))
         if not first:
             self.move(carried, kept, guard.place)
 
@@ -230,7 +231,7 @@ class _RowCutter(Cutter):
                 gone = self.graph.node("not", FLAG, (movers,)) if rest.op == "and" else movers
                 leaves = self.graph.node(rest.op, FLAG, (old, gone))
             planes.append(Carried(out.var, old, leaves))
-        self.statements.append(Move(first.op, first.attr, movers, tuple(planes), place))
+        self.emit(Move(first.op, first.attr, movers, tuple(planes), place))
         self.known |= {id(out.value): out.var for out in carried}
 
     # What must be stored
@@ -346,7 +347,7 @@ class _RowCutter(Cutter):
         for node in moves:
             content, movers, rest = (self.variable(arg) for arg in node.args)
             plane = Carried(var(node), content, rest)
-            self.statements.append(Move(node.op, node.attr, movers, (plane,), place))
+            self.emit(Move(node.op, node.attr, movers, (plane,), place))
             self.known[id(node)] = plane.new
 
     def lay(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
@@ -375,7 +376,7 @@ class _RowCutter(Cutter):
                 node = node.args[2]
             keeps.append((var, self.renamed(node)))
         when = tuple(dict.fromkeys(masks))
-        self.statements.append(Guard(when, tuple(inner), tuple(keeps), place))
+        self.emit(Guard(when, tuple(inner), tuple(keeps), place))
 
 
 def _leaves_simply(node: Node) -> bool:

@@ -7,7 +7,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from powderdsl.ir.ops import Node
-from powderdsl.schedule.types import Compute, Guard, Namer, Out, Schedule, Statement, Var, load, ordered
+from powderdsl.schedule.types import (
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    Var,
+    defined_by,
+    load,
+    loaded,
+    ordered,
+)
 
 _CHEAP = ("const", "param", "coordinate", "inside", "load")
 
@@ -37,16 +49,49 @@ def share(schedule: Schedule) -> Schedule:
         for arg in node.args:
             most[id(arg)] = max(most[id(arg)], count[id(node)])
     cut = [node for key, node in nodes.items() if count[key] > 1 and (key in roots or most[key] < count[key])]
+    places = _places(schedule, cut, users)
+    cut = [node for node in cut if id(node) in places]
     if not cut:
         return schedule
     namer = Namer(schedule)
-    vars = {id(node): namer.var(node.type) for node in cut}
-
+    vars = {id(node): (places[id(node)], namer.var(node.type)) for node in cut}
     before: dict[Path, list[tuple[Node, Var]]] = {}
     for node in ordered(cut):
         if id(node) in vars:
-            before.setdefault(_common(users[id(node)]), []).append((node, vars[id(node)]))
+            path, var = vars[id(node)]
+            before.setdefault(path, []).append((node, var))
     return replace(schedule, body=_inserted(schedule, before, vars))
+
+
+def _places(schedule: Schedule, cut: list[Node], users: dict[int, list[Path]]) -> dict[int, Path]:
+    """Before which statement each value is computed, by its id; values that cannot be shared are left out.
+
+    What a guard keeps has one name in its body and after it: users in the body then compute for themselves.
+    """
+    defined: dict[str, list[Path]] = {var.name: [()] for _, var in schedule.finds}
+    for path, statement in _paths(schedule.body):
+        for var in defined_by(statement):
+            defined.setdefault(var.name, []).append(path)
+    found: dict[int, Path] = {}
+    for node in cut:
+        names = set(loaded([node]))
+        left = users[id(node)]
+        while len(left) > 1:
+            path = _common(left)
+            late = [name for name in names if not any(_before(one, path) for one in defined[name])]
+            if not late:
+                found[id(node)] = path
+                break
+            left = [user for user in left if user[: len(path)] != path]
+    return found
+
+
+def _before(definition: Path, path: Path) -> bool:
+    """Whether what a statement defines is there when another begins."""
+    if not definition:
+        return True
+    outer = len(definition) - 1
+    return len(path) > outer and definition[:outer] == path[:outer] and definition[outer] < path[outer]
 
 
 def _paths(body: Sequence[Statement], outer: Path = ()) -> Iterator[tuple[Path, Statement]]:
@@ -65,11 +110,16 @@ def _common(paths: list[Path]) -> Path:
 
 
 def _inserted(
-    schedule: Schedule, before: dict[Path, list[tuple[Node, Var]]], vars: dict[int, Var]
+    schedule: Schedule, before: dict[Path, list[tuple[Node, Var]]], vars: dict[int, tuple[Path, Var]]
 ) -> tuple[Statement, ...]:
     graph = schedule.graph
 
-    def value(root: Node, *, itself: bool) -> Node:
+    def shared(node: Node, path: Path) -> bool:
+        """Whether a value has been computed before a statement."""
+        place = vars[id(node)][0] if id(node) in vars else None
+        return place is not None and (path[: len(place)] == place or _before(place, path))
+
+    def value(root: Node, path: Path, *, itself: bool) -> Node:
         """A value over the variables, with one for itself or not."""
         done: dict[int, Node] = {}
         stack = [(root, False)]
@@ -77,8 +127,8 @@ def _inserted(
             node, ready = stack.pop()
             if id(node) in done:
                 continue
-            if id(node) in vars and (itself or node is not root):
-                done[id(node)] = load(graph, vars[id(node)])
+            if shared(node, path) and (itself or node is not root):
+                done[id(node)] = load(graph, vars[id(node)][1])
             elif ready or not node.args:
                 args = tuple(done[id(arg)] for arg in node.args)
                 same = all(a is b for a, b in zip(args, node.args, strict=True))
@@ -95,10 +145,11 @@ def _inserted(
         for i, statement in enumerate(body):
             for node, var in before.get((*outer, i), ()):
                 place = node.places[0] if node.places else ""
-                result.append(Compute((Out(var, value(node, itself=False)),), place))
+                result.append(Compute((Out(var, value(node, (*outer, i), itself=False)),), place))
             match statement:
                 case Compute(outs):
-                    new = tuple(replace(out, value=value(out.value, itself=True)) for out in outs)
+                    path = (*outer, i)
+                    new = tuple(replace(out, value=value(out.value, path, itself=True)) for out in outs)
                     result.append(replace(statement, outs=new))
                 case Guard(_, inner, _):
                     result.append(replace(statement, body=block(inner, (*outer, i))))

@@ -9,7 +9,8 @@ from powderdsl.ir.ops import PassGraph
 from powderdsl.schedule.blocks import blocks
 from powderdsl.schedule.calm import calm_pass
 from powderdsl.schedule.choices import choices
-from powderdsl.schedule.cut import Costs, cut
+from powderdsl.schedule.costs import Costs
+from powderdsl.schedule.cut import cut
 from powderdsl.schedule.cut_rows import cut_rows
 from powderdsl.schedule.draws import cheap_questions, conditions, thresholds
 from powderdsl.schedule.empty import empty

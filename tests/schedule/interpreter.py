@@ -7,15 +7,16 @@ for, it is the opposite of what it would be.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph
+from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Threshold
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
+    Forget,
     Guard,
     Move,
     Out,
@@ -41,6 +42,8 @@ class World:
     params: Mapping[str, float]
     draws: Mapping[str, Array]
     step: int = 0
+    known: bool = True
+    """Whether the elements are still those that the pass has found."""
 
 
 def run_graph(pass_: PassGraph, world: World) -> dict[int, Array]:
@@ -123,6 +126,8 @@ class _State:
                         self.set(var, kept[var.name])
                 case Sweeps(loops):
                     self.block(loops)
+                case Forget():
+                    self.world = replace(self.world, known=False)
                 case Release(names):
                     for name in names:
                         del self.held[name]
@@ -252,6 +257,8 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             near = [_shift(args[0] != 0, dy, dx, True) for dx in range(-reach, reach + 1)]
             return np.logical_or.reduce(near)
         case "present":
+            if not world.known:
+                return True
             ids = sum(array.astype(np.int64) << i for i, array in _elements(world))
             return any(attr >> int(number) & 1 for number in np.unique(ids))
         case "and" | "or" if node.type == ANSWER:
@@ -300,10 +307,12 @@ def _block(node: Node, args: list[Array]) -> Array:
     return np.where(movers, np.roll(block, (-dy, -dx), (1, 2)), moved) if "swap" in node.op else moved
 
 
-def _limit(value: float, view: str) -> int:
-    count = 1 << int(view[2:])
+def _limit(value: float, threshold: Threshold | None) -> int:
+    if threshold is None:
+        return int(value)
+    count = 1 << threshold.bits
     scaled = np.float64(value) * count - 0.5
-    limit = np.ceil(scaled) if view[:2] == "lt" else np.floor(scaled) + 1
+    limit = np.ceil(scaled) if threshold.strict else np.floor(scaled) + 1
     return int(limit.clip(0, count))
 
 

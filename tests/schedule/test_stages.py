@@ -8,49 +8,64 @@ import numpy as np
 import pytest
 
 from powderdsl.compiler import load, lower
+from powderdsl.diagnostics import CompileError
 from powderdsl.ir.bits import plane_slots
 from powderdsl.ir.gates import width
-from powderdsl.ir.ops import PassGraph, Program
+from powderdsl.ir.ops import PassGraph, Program, plane_name
 from powderdsl.ir.segments import segments
+from powderdsl.model.state import slots as state_slots
+from powderdsl.model.types import Ruleset
 from powderdsl.schedule.barriers import Pending, barriers
 from powderdsl.schedule.buffers import Pool, buffers
 from powderdsl.schedule.stages import ARRAYS, CPP, CUDA, Stage, steps
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.verify import verify
-from tests.schedule.interpreter import World, run_graph, run_schedule
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.schedule.interpreter import SNAP, World, run_graph, run_schedule
 
 WORLDS = 4
 
 
-def packed_passes(rules: str) -> Iterator[tuple[Program, PassGraph]]:
-    for part in segments(lower(load(rules))):
+def packed_passes(rules: Ruleset) -> Iterator[tuple[Program, PassGraph]]:
+    for part in segments(lower(rules)):
         if part.planes is not None:
             for pass_ in part.planes.passes:
                 yield part.program, pass_
 
 
-def random_world(program: Program, pass_: PassGraph, seed: int) -> World:
-    """Some worlds full of everything, some nearly empty, some without floats."""
+def random_world(rules: Ruleset, program: Program, seed: int) -> World:
+    """Some worlds full of everything, some nearly empty, some without floats; floats are clamped as stored ones are."""
     random = np.random.default_rng(seed)
     shape = tuple(random.integers(1, 9, 2))
     busy = (1.0, 0.3, 0.05, 1.0)[seed % 4]
+    kinds = {slot.name: slot.kind for slot in state_slots(rules)}
     slots = {}
     for slot in program.slots:
+        some = random.random(shape) < busy
+        if slot.resets:  # what it can hold when a pass reads it is known to be less than its range
+            some = np.zeros(shape, bool)
         if slot.type.name == "real":
-            value = random.normal(size=shape) * 3 * (random.random(shape) < busy) * (seed % 4 != 3)
-            slots[slot.name] = value.astype(np.float32)
+            kind = kinds[slot.state or slot.name]
+            value = (random.normal(size=shape) * 3 * some * (seed % 4 != 3)).astype(np.float32)
+            value = np.clip(value, np.float32(kind.lo), np.float32(kind.hi))
+            value = np.where(np.abs(value) < SNAP, np.float32(0), value)
+            slots[slot.name] = np.full(shape, slot.default, np.float32) if slot.resets else value
         elif slot.type.name == "flag":
-            slots[slot.name] = random.random(shape) < busy / 2
+            found = random.random(shape) < busy / 2
+            slots[slot.name] = np.full(shape, bool(slot.default)) if slot.resets else found
         else:
-            value = random.integers(slot.type.lo, slot.type.hi + 1, shape) * (random.random(shape) < busy)
+            value = random.integers(slot.type.lo, slot.type.hi + 1, shape) * some
             value = np.clip(value, slot.type.lo, slot.type.hi)
+            value = np.full(shape, int(slot.default)) if slot.resets else value
             for i in range(width(slot.type.lo, slot.type.hi)[0]):
-                slots[f"{slot.name}:{i}"] = value >> i & 1 != 0
+                slots[plane_name(slot.name, i)] = value >> i & 1 != 0
     draws = {name: random.integers(0, 1 << bits, shape) for name, _, bits in program.streams}
-    params = {
-        name: float(random.integers(0, 2)) if kind == "flag" else float(random.random())
-        for name, kind in program.params
-    }
+    params = {}
+    for param in rules.params:
+        low, high = (0, 1) if param.kind.name in ("flag", "chance") else (param.kind.lo, param.kind.hi)
+        number = low + (high - low) * random.random()
+        params[param.name] = float(round(number) if param.kind.name in ("flag", "int") else number)
     return World(shape, slots, params, draws, int(random.integers(0, 9)))
 
 
@@ -75,8 +90,29 @@ RULES = (
 @pytest.mark.parametrize("stages", [ARRAYS, CUDA, CPP], ids=["arrays", "cuda", "cpp"])
 @pytest.mark.parametrize("rules", RULES)
 def test_every_stage(rules: str, stages: tuple[Stage, ...]) -> None:
+    run_stages(load(rules), stages)
+
+
+@pytest.mark.parametrize("stages", [ARRAYS, CUDA, CPP], ids=["arrays", "cuda", "cpp"])
+@pytest.mark.parametrize("seed", [*range(12), 533])
+def test_random_rulesets(seed: int, stages: tuple[Stage, ...]) -> None:
+    run_stages(load_text(random_ruleset_text(seed), f"seed{seed}.yaml"), stages)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("stages", [ARRAYS, CUDA, CPP], ids=["arrays", "cuda", "cpp"])
+def test_many_random_rulesets(stages: tuple[Stage, ...]) -> None:
+    for seed in range(12, 600):
+        try:
+            ruleset = load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
+        except CompileError:
+            continue
+        run_stages(ruleset, stages)
+
+
+def run_stages(rules: Ruleset, stages: tuple[Stage, ...]) -> None:
     for program, pass_ in packed_passes(rules):
-        worlds = [random_world(program, pass_, seed) for seed in range(WORLDS)]
+        worlds = [random_world(rules, program, seed) for seed in range(WORLDS)]
         truths = [run_graph(pass_, world) for world in worlds]
         for stage, schedule in steps(pass_, stages):
             verify(schedule, stage)
@@ -89,7 +125,8 @@ def test_every_stage(rules: str, stages: tuple[Stage, ...]) -> None:
 def test_buffers(rules: str, in_place: bool) -> None:
     """No variable is read after its buffer has been written over; values end in their slots' own buffers."""
     pool: Pool | None = None
-    for program, pass_ in packed_passes(rules):
+    loaded = load(rules)
+    for program, pass_ in packed_passes(loaded):
         planes = [plane for slot in program.slots for plane in plane_slots(slot)]
         kinds = {slot.name: "real" if slot.type.name == "real" else "flag" for slot in planes}
         homes = {name: [n for n in kinds if kinds[n] == kinds[name]].index(name) for name in kinds}
@@ -101,7 +138,7 @@ def test_buffers(rules: str, in_place: bool) -> None:
         ends = dict(schedule.buffers)
         assert all(ends[node.attr][1] == homes[slot] for slot, node in schedule.leaves)
         for seed in range(WORLDS):
-            world = random_world(program, pass_, seed)
+            world = random_world(loaded, program, seed)
             compare(pass_, schedule, world, run_graph(pass_, world))
 
 
