@@ -9,6 +9,7 @@ from dataclasses import replace
 from powderdsl.ir.ops import Graph, Node
 from powderdsl.schedule.types import (
     Compute,
+    Forget,
     Guard,
     Move,
     Schedule,
@@ -93,7 +94,7 @@ def _keep(body: Iterable[Statement], read: Counter[str], outside: frozenset[str]
                     if read[var.name] > own[var.name] or var.name in outside
                 )
                 inner = _keep(inner, read, frozenset(var.name for var, _ in keeps))
-                if keeps:
+                if keeps or any(isinstance(one, Forget) for one in inner):
                     same = keeps == statement.keeps and inner == statement.body
                     result.append(statement if same else replace(statement, body=inner, keeps=keeps))
             case _:

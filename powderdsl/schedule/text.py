@@ -13,11 +13,13 @@ from powderdsl.ir.ops import Node
 from powderdsl.ir.text import attr_text
 from powderdsl.schedule.types import (
     Compute,
+    Forget,
     Guard,
     Move,
     Release,
     Schedule,
     Statement,
+    Sweeps,
     Sync,
     ordered,
     values_of,
@@ -35,6 +37,8 @@ def print_schedule(schedule: Schedule) -> str:
     if schedule.finds:
         found = ", ".join(f"{names.of(var.name)} = {slot}" for slot, var in schedule.finds)
         lines.append(f"  find {found}")
+    if schedule.when is not None:
+        lines.append(f"  when {_Values([schedule.when], names).text(schedule.when)}")
     lines += _block(schedule.body, "  ", names)
     for slot, node in schedule.leaves:
         lines.append(f"  leave {slot} = {_Values([node], names).text(node)}")
@@ -70,6 +74,8 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
         case Compute(outs, _, over, region):
             if over:
                 where = f" over {values.text(region)}" if region is not None else ""
+                where += f" when {values.text(statement.when)}" if statement.when is not None else ""
+                yield from (f"{indent}{line}" for line in values.taken())
                 yield f"{indent}loop {over}{where}{' held' if statement.held else ''}"
                 indent += "  "
             for out in outs:
@@ -80,11 +86,17 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
                 yield f"{indent}{names.of(out.var.name)} = {value}{rest}{into}"
         case Sync():
             yield f"{indent}sync"
+        case Forget():
+            yield f"{indent}forget elements"
+        case Sweeps(loops):
+            for loop in loops:
+                yield from _statement(loop, indent, names)
         case Move(op, (dy, dx), movers, planes):
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
             for plane in planes:
                 leaves = "" if plane.leaves is plane.old else f" leaving {values.text(plane.leaves)}"
-                yield f"{indent}  {names.of(plane.new.name)} = {values.text(plane.old)}{leaves}"
+                into = " in place" if plane.into else ""
+                yield f"{indent}  {names.of(plane.new.name)} = {values.text(plane.old)}{leaves}{into}"
         case Guard(when, inner, keeps):
             asked = " | ".join(values.text(node) for node in when)
             yield from (f"{indent}{line}" for line in values.taken())
@@ -141,6 +153,8 @@ class _Values:
             case "shift":
                 dy, dx, wraps = node.attr
                 return f"{args[0]}[{dy},{dx}{'' if wraps else '|0'}]"
+        if node.op == "present":
+            return f"present({node.attr:#x})"
         if node.attr is not None:
             args.append(attr_text(node.attr))
         return f"{node.op}({', '.join(args)})"
