@@ -105,7 +105,56 @@ class _State:
                         kept = {var.name: value for (var, _), value in zip(keeps, found, strict=True)}
                         self.block(otherwise)
                         for name in {var.name for one in otherwise for var in defined_by(one)}:
-                            # Zeros of either sign: clamping makes them one, and no operation tells them apart.
+                            assert np.array_equal(self.held[name], kept[name]), name
+                    # What the body released or overwrote is gone in either case.
+                    gone = set(before) - set(self.held)
+                    for inside in _all(inner):
+                        if isinstance(inside, Release):
+                            gone |= set(inside.names)
+                        if isinstance(inside, Compute):
+                            gone |= {out.into for out in inside.outs if out.into}
+                    if self.buffers:  # skipped or not, what shares a buffer with what the body makes is gone
+                        made = {
+                            self.buffers[v.name]
+                            for one in _all(inner)
+                            for v in defined_by(one)
+                            if v.name in self.buffers
+                        }
+                        gone |= {name for name in before if self.buffers.get(name) in made}
+                    self.held = {name: value for name, value in before.items() if name not in gone}
+                    for var, _ in keeps:
+                        self.set(var, kept[var.name])
+                case Sweeps(loops):
+                    self.block(loops)
+                case Forget():
+                    self.world = replace(self.world, known=False)
+                case Release(names):
+                    for name in names:
+                        del self.held[name]
+
+    def values(self, nodes: Sequence[Node]) -> list[Array]:
+        found = _evaluate(nodes, self.world, self.held)
+        return [found[id(node)] for node in nodes]
+
+    def inside(self, statement: Compute, out: Out, value: Array) -> Array:
+        """What a variable gets: outside the region something else, which must be the same."""
+        if statement.when is not None and not bool(self.values([statement.when])[0]):
+            (value,) = (
+                self.values([out.otherwise])
+                if out.otherwise is not None
+                else (np.zeros(self.world.shape, bool),)
+            )
+            return value
+        if statement.region is None or out.otherwise is None:
+            return value
+        region, rest = self.values([statement.region, out.otherwise])
+        return np.where(region, value, rest)
+
+    def set(self, var: Var, value: Array) -> None:
+        if var.means is not None and id(var.means) in self.truth:
+            expected = np.broadcast_to(self.truth[id(var.means)], self.world.shape)
+            found = np.broadcast_to(value, self.world.shape)
+            # Zeros of either sign: clamping makes them one, and no operation tells them apart.
             assert np.array_equal(found, expected, equal_nan=var.type == REAL), var.name
         assert var.name not in self.held, f"{var.name} is assigned twice"
         self.held[var.name] = value
@@ -113,7 +162,6 @@ class _State:
             others = [n for n in self.held if n != var.name and self.buffers.get(n) == self.buffers[var.name]]
             for name in others:
                 del self.held[name]
-
 
 
 def _all(body: Sequence[Statement]) -> list[Statement]:
