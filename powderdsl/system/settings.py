@@ -20,7 +20,7 @@ def setting(
     high: float | None = None,
     choices: Sequence[str] = (),
 ) -> Value:
-    """A field of a dataclass: numbers from `low` to `high`, or one of `choices`. With `about` it has an option."""
+    """A field of a dataclass: numbers from `low` to `high` (None: any), or one of `choices`. With `about` it has an option."""
     bounds = None if low is None else (low, high)
     return field(default=default, metadata={"about": about, "bounds": bounds, "choices": tuple(choices)})
 
@@ -33,7 +33,15 @@ def out_of_bounds(config: Any) -> Iterator[str]:
             continue
         low, high = bounds
         whole = isinstance(one.default, int)
-        takes = f"an integer from {low:,} to {high:,}" if whole else f"a number from {low:g} to {high:g}"
+        written = "," if whole else "g"
+        takes = f"a {'whole ' if whole else ''}number from {low:{written}}"
+        takes += "" if high is None else f" to {high:{written}}"
         number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-        if not number or not math.isfinite(value) or not low <= value <= high:
+        if not number or not math.isfinite(value) or not low <= value <= (value if high is None else high):
             yield f"`{one.name}` is {value!r}: it takes {takes}"
+
+
+def check_bounds(config: Any) -> None:
+    """Raises ValueError with all that `out_of_bounds` finds."""
+    if wrong := "; ".join(out_of_bounds(config)):
+        raise ValueError(wrong)

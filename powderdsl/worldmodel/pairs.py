@@ -15,6 +15,7 @@ from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World
+from powderdsl.system.settings import check_bounds, setting
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import check_split, load_task
@@ -44,26 +45,20 @@ class DataConfig:
     only: tuple[str, ...] = ()
     knobs: Mapping[str, int] = field(default_factory=dict)
     params: Mapping[str, float | str] = field(default_factory=dict)
-    states: int = 1_000_000
-    steps: int = 8
-    pairs: int = 16
-    rulesets: int = 0
+    states: int = setting(1_000_000, low=1)
+    steps: int = setting(8, low=1)
+    pairs: int = setting(16, low=1)
+    rulesets: int = setting(0, low=0, high=MAX_RULESETS)
     """How many rulesets are drawn around `rules`; world s runs under number `first_ruleset` + s mod `rulesets`. 0: none."""
-    first_ruleset: int = 0
+    first_ruleset: int = setting(0, low=0)
     variety: Variety = field(default_factory=Variety)
     """How they differ."""
-    capacity: int = 1024 * 256
-    refresh: int = 256
+    capacity: int = setting(1024 * 256, low=1)
+    refresh: int = setting(256, low=1)
 
     def __post_init__(self) -> None:
         """Raises ValueError for numbers that cannot be."""
-        for name in ("states", "steps", "pairs", "capacity", "refresh"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be 1 or more, found {getattr(self, name)}")
-        if not 0 <= self.rulesets <= MAX_RULESETS:
-            raise ValueError(f"rulesets must lie in 0..{MAX_RULESETS}, found {self.rulesets}")
-        if self.first_ruleset < 0:
-            raise ValueError("first_ruleset must be 0 or more")
+        check_bounds(self)
         if self.states > TEST_SEEDS:
             raise ValueError(f"states must be at most {TEST_SEEDS:,}: tests begin there")
 

@@ -19,6 +19,7 @@ from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.system.interrupts import held_back
+from powderdsl.system.settings import check_bounds, setting
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
@@ -47,26 +48,22 @@ class TrainConfig:
     """
 
     data: DataConfig = field(default_factory=DataConfig)
-    width: int = 32
-    iterations: int = 5000
-    batch: int = 256
+    width: int = setting(32, low=1, high=MAX_WIDTH)
+    iterations: int = setting(5000, low=1, high=1 << 40)
+    batch: int = setting(256, low=1, high=1 << 20)
     learning_rate: float = 0.005
-    seed: int = 0
+    seed: int = setting(0, low=0, high=2**63 - 1)
     parent: str | None = None
-    slots: int = 0
+    slots: int = setting(0, low=0, high=MAX_ELEMENTS)
     palette: tuple[str | None, ...] = ()
 
     def __post_init__(self) -> None:
         """Raises ValueError for numbers that cannot be."""
-        for name, most in (("width", MAX_WIDTH), ("iterations", 1 << 40), ("batch", 1 << 20)):
-            if not 1 <= getattr(self, name) <= most:
-                raise ValueError(f"{name} must lie in 1..{most}, found {getattr(self, name)}")
+        check_bounds(self)
         if not 0 < self.learning_rate < float("inf"):
             raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
-        if not 0 <= self.seed < 2**63:
-            raise ValueError(f"seed must be 0 or more, found {self.seed}")
-        if not 0 <= max(self.slots, len(self.palette)) <= MAX_ELEMENTS:
-            raise ValueError(f"slots must lie in 0..{MAX_ELEMENTS}")
+        if len(self.palette) > MAX_ELEMENTS:
+            raise ValueError(f"palette has more than {MAX_ELEMENTS} slots")
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -102,22 +103,13 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 def command(
     rules: str,
     backends: tuple[str, ...],
-    batches: tuple[int, ...],
     sizes: tuple[tuple[int, int], ...],
-    elements: tuple[int, ...],
-    only: tuple[str, ...],
-    threads: tuple[int, ...],
-    workload: str,
     device: str,
-    steps: int,
-    seconds: float,
-    rounds: int,
-    seed: int,
     settings: dict[str, str],
-    profile: bool,
     as_json: bool,
     data: Path | None,
     plot: Path | None,
+    **asked: Any,
 ) -> int:
     """Measure how fast rules run.
 
@@ -134,18 +126,9 @@ def command(
         plan = make_plan(
             ruleset,
             backends=backends or _usual_backends(device),
-            batches=batches,
             sizes=sizes or ((fitting(ruleset, 64),) * 2,),
-            elements=elements,
-            only=only,
-            threads=threads,
-            workload=workload,
             device=device,
-            seed=seed,
-            steps=steps,
-            seconds=seconds,
-            rounds=rounds,
-            profile=profile,
+            **asked,
         )
     report, interrupt = _measured(plan)
     click.echo(json.dumps(report_data(report), indent=2) if as_json else report_text(report))

@@ -235,16 +235,14 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @_machine_options
 def eval_command(
     run: str,
-    task: str | None,
-    split: str,
-    rules: str | None,
     only: tuple[str, ...],
     knobs: tuple[str, ...],
-    worlds: int | None,
-    rulesets: int,
+    threads: int,
+    device: str,
+    backend: str,
     layout: str,
     out: Path | None,
-    **values: Any,
+    **worlds: Any,
 ) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
@@ -256,19 +254,10 @@ def eval_command(
     from powderdsl.worldmodel.scores import evaluate
     from powderdsl.worldmodel.training import load_trained
 
-    machine = _machine(values)
+    machine = _machine({"threads": threads, "device": device, "backend": backend})
     trained = load_trained(run, device=machine.device)
-    tested = evaluate(
-        trained,
-        task=task,
-        split=split,
-        rules=rules,
-        only=only or None,
-        knobs=knob_values(knobs) if knobs else None,
-        worlds=worlds,
-        rulesets=rulesets,
-        machine=machine,
-    )
+    drawn = knob_values(knobs) if knobs else None
+    tested = evaluate(trained, only=only or None, knobs=drawn, machine=machine, **worlds)
     plain = tested.plain()
     if out is not None:
         write_json(out, plain, follow=True)
@@ -297,11 +286,11 @@ def show_command(
     out: Path,
     steps: int | None,
     after: int,
-    task: str | None,
-    split: str,
-    rules: str | None,
     scale: int,
-    **values: Any,
+    threads: int,
+    device: str,
+    backend: str,
+    **chosen: Any,
 ) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
@@ -315,12 +304,12 @@ def show_command(
     from powderdsl.worldmodel.strips import sheet, strips
     from powderdsl.worldmodel.training import load_trained
 
-    machine = _machine(values)
+    machine = _machine({"threads": threads, "device": device, "backend": backend})
     trained = load_trained(run, device=machine.device)
     step = trained.config.data.steps
     if steps is not None and steps % step:
         raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
-    worlds = unseen_worlds(trained, task=task, split=split, rules=rules, machine=machine)
+    worlds = unseen_worlds(trained, machine=machine, **chosen)
     found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after)
     write_png(out, sheet(found, worlds.rules, factor=scale))
     for number, strip in enumerate(found, 1):
