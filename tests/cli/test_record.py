@@ -100,7 +100,7 @@ def test_all_mistakes_are_told_at_once(task: Path, tmp_path: Path) -> None:
     [
         (("--verify", "gone"), "PD630"),
         (("small", "--verify", "gone"), "--verify takes a folder"),
-        (("--seed", "-1"), "no integer"),
+        (("--seed", "-1"), "is not an integer"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
         (("--observation", "matrix"), "matrix"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--device", "tpu"), "PD701"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -66,18 +66,12 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 )
 def command(
     run: str,
-    splits: list[str] | None,
-    policies: list[str] | None,
-    episodes: int,
-    deterministic: bool,
-    seed: int,
     knobs: tuple[str, ...],
     settings: dict[str, str],
     packs: tuple[str, ...],
-    backend: str | None,
-    device: str | None,
     layout: str,
     out: Path | None,
+    **asked: Any,
 ) -> None:
     """Mean return and 95 % interval of the agent of a RUN, on each split, in the same worlds as the other policies.
 
@@ -97,17 +91,8 @@ def command(
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():
-        found = evaluate(
-            find_run(run, "ppo") if task is None else task,
-            splits=splits,
-            policies=policies,
-            episodes=episodes,
-            deterministic=deterministic,
-            seed=seed,
-            backend=backend,
-            device=device,
-            packs=packs if task is None else (),
-        )
+        played = find_run(run, "ppo") if task is None else task
+        found = evaluate(played, packs=packs if task is None else (), **asked)
     if out is not None:
         write_json(out, found.as_json(), follow=True)
     if layout == "json":

@@ -78,18 +78,13 @@ def command(
     episodes: int | None,
     split: str,
     policy: str,
-    observation: str,
-    seed: int,
-    worlds: int,
     knobs: tuple[str, ...],
     settings: dict[str, str],
     packs: tuple[str, ...],
-    shard: int | None,
-    compress: bool,
-    envs: int,
     backend: str,
     device: str,
     verify: Path | None,
+    **asked: Any,
 ) -> int:
     """Record whole episodes of TASK: observations, actions, rewards, ends.
 
@@ -120,18 +115,13 @@ def command(
                 act.policy,
                 out,
                 episodes=episodes,
-                seed=seed,
-                observation=observation,
-                shard=shard,
-                compress=compress,
-                envs=envs,
                 policy_name=act.name,
                 sees=act.sees,
                 progress=lambda done, total: show(done, "episodes"),
                 split=split,
-                worlds=worlds,
                 backend=backend,
                 device=device,
+                **asked,
             )
     except KeyboardInterrupt:
         _say_how_to_go_on(out, episodes)
