@@ -34,7 +34,7 @@ def out_of_bounds(config: Any) -> Iterator[str]:
         low, high = bounds
         whole = isinstance(one.default, int)
         written = "," if whole else "g"
-        takes = f"a {'whole ' if whole else ''}number from {low:{written}}"
+        takes = f"{'an integer' if whole else 'a number'} from {low:{written}}"
         takes += "" if high is None else f" to {high:{written}}"
         number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
         if not number or not math.isfinite(value) or not low <= value <= (value if high is None else high):
