@@ -5,7 +5,6 @@ Checks and the options of commands (`cli.options.setting_options`) follow from t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import field, fields
 from typing import Any, TypeVar
@@ -37,7 +36,7 @@ def out_of_bounds(config: Any) -> Iterator[str]:
         takes = f"{'an integer' if whole else 'a number'} from {low:{written}}"
         takes += "" if high is None else f" to {high:{written}}"
         number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-        if not number or not math.isfinite(value) or not low <= value <= (value if high is None else high):
+        if not number or not low <= value <= (value if high is None else high):
             yield f"`{one.name}` is {value!r}: it takes {takes}"
 
 
