@@ -18,6 +18,7 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Var,
+    in_order,
     load,
 )
 
@@ -78,7 +79,7 @@ class _Blocks:
             keeps = [(var, value) for var, value in keeps if var.name not in gone]
             keeps.append((new, load(self.graph, old)))
             after.append(members)
-            known |= {name: self.members[name] for name in gone}
+            known |= {name: self.members[name] for name in in_order(gone)}
         self.members = known
         # What the body reads of moved planes, it reads of the block.
         names = {out.var.name: out for one in after if isinstance(one, Compute) for out in one.outs}

@@ -12,6 +12,7 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     flat,
+    in_order,
     loaded,
     map_blocks,
     ordered,
@@ -99,10 +100,7 @@ def _written_over(run: Sequence[Compute], passing: set[str]) -> dict[str, str]:
         others = [read for i, one in enumerate(reads) if i != number for read in one]
         later = {name for one in reads[number + 1 :] for name, _, _ in one}
         far = {name for name, dy, _ in others if dy} | {name for name, dy, dx in reads[number] if dy or dx}
-        free = sorted(
-            {name for name, _, _ in reads[number]} & earlier & passing - later - far,
-            key=lambda name: int(name[1:]),
-        )
+        free = in_order({name for name, _, _ in reads[number]} & earlier & passing - later - far)
         fields = [out.var.name for out in loop.outs if out.var.type == REAL]
         if loop.over == "cells":
             over |= dict(zip(fields, free, strict=False))

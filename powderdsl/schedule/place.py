@@ -7,7 +7,17 @@ from dataclasses import dataclass, field, replace
 
 from powderdsl.ir.ops import REAL
 from powderdsl.schedule.release import live_before, made_in, reads
-from powderdsl.schedule.types import BLOCK, Compute, Guard, Out, Release, Schedule, Statement, loaded
+from powderdsl.schedule.types import (
+    BLOCK,
+    Compute,
+    Guard,
+    Out,
+    Release,
+    Schedule,
+    Statement,
+    in_order,
+    loaded,
+)
 
 _OVER = {
     "add": (0, 1), "mul": (0, 1), "sub": (0,), "settle": (0,),
@@ -75,7 +85,7 @@ class _Placing:
                 case _:
                     raise AssertionError("only single operations have places")
             if gone:
-                result.append(Release(tuple(sorted(gone, key=_number))))
+                result.append(Release(tuple(in_order(gone))))
         return tuple(result)
 
     def guard(self, guard: Guard, after: set[str]) -> tuple[Guard, set[str]]:
@@ -140,7 +150,3 @@ def _without(statement: Statement, names: set[str]) -> Statement:
     if not isinstance(statement, Release):
         return statement
     return Release(tuple(name for name in statement.names if name not in names))
-
-
-def _number(name: str) -> int:
-    return int(name[1:])

@@ -15,6 +15,7 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     defined_by,
+    in_order,
     loaded,
     values_of,
 )
@@ -54,7 +55,7 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
             gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
         result.append(statement)
         if gone:
-            result.append(Release(tuple(sorted(gone, key=lambda name: int(name[1:])))))
+            result.append(Release(tuple(in_order(gone))))
     return tuple(result)
 
 

@@ -16,6 +16,7 @@ from powderdsl.schedule.types import (
     Statement,
     Var,
     defined_by,
+    in_order,
     load,
     loaded,
     ordered,
@@ -78,8 +79,7 @@ def _places(schedule: Schedule, cut: list[Node], users: dict[int, list[Path]]) -
         left = users[id(node)]
         while len(left) > 1:
             path = _common(left)
-            late = [name for name in names if not any(_before(one, path) for one in defined[name])]
-            if not late:
+            if all(any(_before(one, path) for one in defined[name]) for name in in_order(names)):
                 found[id(node)] = path
                 break
             left = [user for user in left if user[: len(path)] != path]

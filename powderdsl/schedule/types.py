@@ -240,6 +240,11 @@ def flat(body: Iterable[Statement]) -> Iterator[Statement]:
             yield from flat(statement.otherwise)
 
 
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names of variables by number, so that no order of a set reaches a schedule."""
+    return sorted(sorted(names), key=lambda name: int(name[1:]))
+
+
 def variables(schedule: Schedule) -> dict[str, Var]:
     """All variables by name."""
     found = {var.name: var for _, var in schedule.finds}
@@ -276,5 +281,5 @@ class Namer:
 __all__ = [
     "ANSWER", "BLOCK", "CELLS", "FLAG", "PLACES", "REAL",
     "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
-    "defined_by", "flat", "load", "loaded", "map_blocks", "ordered", "rewritten", "values_of", "variables",
+    "defined_by", "flat", "in_order", "load", "loaded", "map_blocks", "ordered", "rewritten", "values_of", "variables",
 ]  # fmt: skip

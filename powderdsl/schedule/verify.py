@@ -20,6 +20,7 @@ from powderdsl.schedule.types import (
     Sweeps,
     Var,
     defined_by,
+    in_order,
     ordered,
     values_of,
 )
@@ -67,7 +68,7 @@ class _Checker:
                         _demand(var.type == value.type, f"{var.name} is a {var.type}, else a {value.type}")
                     kept = {var.name for var, _ in keeps}
                     made = self.block(otherwise, live) - before
-                    _demand(made <= kept, f"{made - kept} are made only where a body is skipped")
+                    _demand(made <= kept, f"{in_order(made - kept)} are made only where a body is skipped")
                     live = (before & end) | kept
                     continue
                 case Compute(outs):

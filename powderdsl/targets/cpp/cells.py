@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from powderdsl.ir.ops import REAL, Node
-from powderdsl.schedule.types import Compute, Out, Sweeps, ordered
+from powderdsl.schedule.types import Compute, Out, Sweeps, in_order, ordered
 from powderdsl.targets.layout import Layout, literal, param_key
 
 _INFIX = {"add": "+", "sub": "-", "mul": "*"}
@@ -29,10 +29,10 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, active
         rows.append((f"if (!strips || part == {part}) " if sweeps.parts[-1] else "") + printed.rows())
         after.append(printed.after())
         used |= printed.fields
-    lasting = {_first(name, over) for name in used if name not in sweeps.passing}
+    lasting = {_first(name, over) for name in in_order(used) if name not in sweeps.passing}
     places = " ".join(
         f"const int l{name} = {'l' if _first(name, over) in lasting else 'l & strips'};"
-        for name in sorted(used, key=lambda name: int(name[1:]))
+        for name in in_order(used)
     )
     blocks = f"EACH_BLOCK({sweeps.parts[-1]})"
     inner = "\n".join(rows)
