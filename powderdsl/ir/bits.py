@@ -1,6 +1,6 @@
-"""IR on numbers -> IR on bit planes: every whole number becomes a few flags, every rule gates, shifts and swaps.
+"""IR on numbers -> IR on bit planes: every integer becomes a few flags, every rule gates, shifts and swaps.
 
-The result is ordinary IR without whole numbers: flags and reals remain. Slots of whole numbers become one flag slot
+The result is ordinary IR without integers: flags and floats remain. Slots of integers become one flag slot
 a plane, ``element:0`` the lowest.
 """
 
@@ -224,7 +224,7 @@ class _PassBits:
         return self._function(value, lo, hi, lambda v: v in members)
 
     def _function(self, value: Bits, lo: int, hi: int, function: Callable[..., int]) -> Node:
-        """A flag that depends on a small whole number only."""
+        """A flag that depends on a small integer only."""
         count = len(value.planes)
         if count > MAX_TABLE_BITS:
             raise NotBits(f"a table over {count} planes")
@@ -354,7 +354,7 @@ class _PassBits:
                 return self._quotient(node, args[0], args[1])
             case "mod":
                 return self._mod(node, args[0])
-        raise NotBits(f"{node.op} of whole numbers")
+        raise NotBits(f"{node.op} of integers")
 
     def _multiply(self, a: Bits, b: Bits, lo: int, hi: int) -> Bits:
         """Shifted additions; a negative factor counts its sign bit as minus."""
@@ -420,7 +420,7 @@ class _PassBits:
         return Bits(planes, signed)
 
     def _to_real(self, argument: Node) -> Node:
-        """A number from its planes: exact, since whole numbers stay below 2^24."""
+        """A number from its planes: exact, since integers stay below 2^24."""
         build = self.build
         value = self.values[id(argument)]
         if isinstance(value, Node):
@@ -428,7 +428,7 @@ class _PassBits:
                 return value
             return build.select(value, build.real(1.0), build.real(0.0))
         if max(abs(argument.type.lo), abs(argument.type.hi)) >= 1 << 24:
-            raise NotBits("a whole number too large for float32")
+            raise NotBits("an integer too large for float32")
         weights: dict[int, tuple[Node, float]] = {}  # equal planes count together
         always = 0.0
         for i, plane in enumerate(value.planes):

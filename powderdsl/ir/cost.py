@@ -22,7 +22,7 @@ out as native code needs them on worlds full of everything: most do to a factor 
 class PassCost:
     """One pass. Counts are for every cell and step.
 
-    `gates` are those of flags and whole numbers on planes, `shifts` the planes read at a neighbor, `moves` those
+    `gates` are those of flags and integers on planes, `shifts` the planes read at a neighbor, `moves` those
     exchanged with one, `random_bits` what its draws take at most, `reals` operations on float32. A pass on cells has
     `dense` operations instead, with the reason and the rule (``file:line``) that is why. `share` is an estimate.
     """

@@ -1,6 +1,6 @@
 """Boolean circuits on flag planes: gates that fold as they are built, adders, comparators, truth tables.
 
-A whole number is a `Bits`: planes from the lowest bit, and whether the highest one is a sign (two's complement).
+An integer is a `Bits`: planes from the lowest bit, and whether the highest one is a sign (two's complement).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from powderdsl.ir.ops import FLAG, Node, Offset
 
 @dataclass(frozen=True)
 class Bits:
-    """Planes of a whole number, lowest first."""
+    """Planes of an integer, lowest first."""
 
     planes: tuple[Node, ...]
     signed: bool = False

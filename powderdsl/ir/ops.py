@@ -1,6 +1,6 @@
 """The IR: one immutable, interned node; one table of operations; programs made of moments.
 
-Values are planes over the grid, one a world: flags, whole numbers with a declared range, or float32. There is no
+Values are planes over the grid, one a world: flags, integers with a declared range, or float32. There is no
 control flow inside a step. Equal nodes of one graph are the same object, so common sub-expressions are free.
 """
 
@@ -112,7 +112,7 @@ OPS: dict[str, Op] = {
         Op("and", ("flag", "flag"), "flag"),
         Op("or", ("flag", "flag"), "flag"),
         Op("xor", ("flag", "flag"), "flag"),
-        # whole numbers and reals
+        # integers and floats
         Op("in_set", ("int",), "flag", "frozen set", "whether the value is one of these"),
         Op("table", ("int",), "int", "values by index, from 0"),
         Op("eq", ("=", "="), "flag"),

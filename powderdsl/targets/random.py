@@ -35,7 +35,7 @@ def words(keys: Tensor, bits: int, height: int, width: int) -> Tensor:
 
 
 def draws(keys: Tensor, bits: int, height: int, width: int) -> Tensor:
-    """The first `bits` bits of each cell's draw as a whole number: int64 [B, H, W]."""
+    """The first `bits` bits of each cell's draw as an integer: int64 [B, H, W]."""
     planes = words(keys, bits, height, width)
     column = torch.arange(32, dtype=torch.int64, device=keys.device)
     result = torch.zeros((), dtype=torch.int64, device=keys.device)

@@ -1,4 +1,4 @@
-"""Typed expressions -> IR nodes. Draws become comparisons of whole numbers with exact thresholds."""
+"""Typed expressions -> IR nodes. Draws become comparisons of integers with exact thresholds."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def _to_real(expr: Expr, at: Planes) -> Node:
 
 
 def _draw_real(expr: Expr, at: Planes) -> Node:
-    """A draw as float32. Sums with whole numbers are rounded after each addition."""
+    """A draw as float32. Sums with integers are rounded after each addition."""
     if expr.op == "draw":
         return at.build.make("draw", REAL, attr=_stream(expr, at))
     parts = [_draw_real(a, at) if a.kind.name == "draw" else at.build.to_real(node(a, at)) for a in expr.args]
@@ -204,7 +204,7 @@ def _stream(expr: Expr, at: Planes) -> tuple[str, int]:
 
 
 def _split_draw(expr: Expr, at: Planes) -> tuple[Expr, tuple[int, int], Node | None]:
-    """A draw expression as (draw, where it is read, whole number added to it)."""
+    """A draw expression as (draw, where it is read, integer added to it)."""
     if expr.op == "draw":
         return expr, (0, 0), None
     if expr.op == "look":

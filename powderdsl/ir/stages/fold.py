@@ -24,7 +24,7 @@ def _not(node: Node, build: Builder) -> Node | None:
         return build.flag(not a.attr)
     if a.op == "not":  # not not a = a
         return a.args[0]
-    if a.op == "le":  # not (a ≤ b) = b < a, whole numbers only: a NaN is neither
+    if a.op == "le":  # not (a ≤ b) = b < a, integers only: a NaN is neither
         return build.compare("lt", a.args[1], a.args[0]) if a.args[0].type != REAL else None
     if a.op == "lt" and a.args[0].type != REAL:  # not (a < b) = b ≤ a
         return build.compare("le", a.args[1], a.args[0])

@@ -18,7 +18,7 @@ _BY = [np.array(i, np.uint64) for i in range(WORD)]
 
 
 def pack(flags: Array) -> Array:
-    """bool or whole numbers [..., W], zero or not → uint64 [..., ⌈W/64⌉]."""
+    """bool or integers [..., W], zero or not → uint64 [..., ⌈W/64⌉]."""
     width = flags.shape[-1]
     count = -(-width // WORD)
     if width % WORD == 0:

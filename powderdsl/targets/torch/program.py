@@ -1,7 +1,7 @@
 """The readable torch backend: one tensor element a cell; masks, rolls and shifted sums. Handles every IR operation.
 
 Each pass becomes a generated, straight-line Python function; names in it come from node numbers only, never from
-rule files. Flags are bool, whole numbers int32, reals float32, all [B, H, W] or broadcastable to it.
+rule files. Flags are bool, integers int32, floats float32, all [B, H, W] or broadcastable to it.
 """
 
 from __future__ import annotations
