@@ -43,7 +43,7 @@ def shifted(x: Array, width: int, dx: int, wraps: bool) -> Array:
         dx %= width
     if not -width < dx < width:
         return np.zeros_like(x)
-    result = np.empty_like(x)
+    result = np.empty(x.shape, x.dtype)  # in rows, even if x is one number seen as many
     # In one piece, over the ends of the rows, which are then put right.
     flat, cells = result.reshape(-1), x.reshape(-1)
     if dx >= 0:
