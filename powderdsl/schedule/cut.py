@@ -60,6 +60,10 @@ def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
 # Loops
 
 
+Pairs = Callable[[list[Node]], list[tuple[Var, Node]]]
+"""Nodes with the variables that they are stored in."""
+
+
 class Cutter:
     """Loops for targets where a question costs a barrier, and everything is computed word by word."""
 
@@ -289,8 +293,8 @@ class Cutter:
         return list(found.values())
 
     def cell_needs(self, node: Node) -> list[Node]:
-        flags: dict[int, Node] = {}
-        floats: dict[int, Node] = {}
+        """Flags, then floats, that a loop over cells reads."""
+        found: dict[int, Node] = {}
         seen: set[int] = set()
         stack = [node]
         while stack:
@@ -298,25 +302,37 @@ class Cutter:
             if id(top) in seen or (top is not node and self.have(top)):
                 continue
             seen.add(id(top))
-            if top.op == "led":
+            if self.stands_apart(top, node):
+                found[id(top)] = top
+            elif top.op == "led":
                 stack.extend(top.args)
             elif top.type != REAL and top is not node and not is_comparison(top):
                 if top.op != "param":
-                    flags[id(top)] = top
+                    found[id(top)] = top
             elif top.op == "shift":
                 source = top.args[0]
                 if self.have(source):
                     continue
                 parts = stored_parts(source, self.have, self.costs.floats) if top.attr[2] else [source]
-                floats |= {id(part): part for part in parts}
+                found |= {id(part): part for part in parts}
                 if not parts:
                     stack.append(source)
             else:
                 stack.extend(top.args)
-        return [*flags.values(), *floats.values()]
+        return sorted(found.values(), key=lambda need: need.type == REAL)
 
-    def ensure(self, nodes: Iterable[Node], place: str, named: dict[int, Var] | None = None) -> None:
-        """Store nodes, and before them everything they need."""
+    def stands_apart(self, part: Node, node: Node) -> bool:
+        """Whether a part of a node is computed in another way, before the loop of the node."""
+        return False
+
+    def ensure(
+        self,
+        nodes: Iterable[Node],
+        place: str,
+        named: dict[int, Var] | None = None,
+        when: Node | None = None,
+    ) -> None:
+        """Store nodes, and before them everything they need. `when`: see `Compute`."""
         named = named or {}
         wanted = [
             node
@@ -332,18 +348,26 @@ class Cutter:
         ]
         if before:
             self.ensure(before, place, named)
-            self.ensure(wanted, place, named)
+            self.ensure(wanted, place, named, when)
             return
         floats = [node for node in wanted if of_floats(node)]
         # What neighbors will be asked for later is stored while it is computed anyway.
         floats += [i for node in floats for i in walk(node) if id(i) in self.wanted and not self.have(i)]
         flags = [node for node in wanted if node not in floats]
+
+        def pairs(nodes: list[Node]) -> list[tuple[Var, Node]]:
+            return [(named.get(id(node)) or self.namer.var(node.type), node) for node in nodes]
+
+        self.store(list(dict.fromkeys(floats)), flags, pairs, place, when)
+
+    def store(
+        self, floats: list[Node], flags: list[Node], pairs: Pairs, place: str, when: Node | None
+    ) -> None:
+        """Loops for nodes of which all that they need is there."""
         if floats:
-            self.cells(
-                [(named.get(id(n)) or self.namer.var(n.type), n) for n in dict.fromkeys(floats)], place
-            )
+            self.cells(pairs(floats), place)
         if flags:
-            self.words([(named.get(id(n)) or self.namer.var(FLAG), n) for n in flags], place)
+            self.words(pairs(flags), place, when)
 
     def words(self, pairs: Sequence[tuple[Var, Node]], place: str, when: Node | None = None) -> None:
         outs = tuple(Out(var, self.word(node)) for var, node in pairs)

@@ -7,12 +7,12 @@ are laid over a field one after the other.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, REAL, Node, walk
-from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant, stored_parts
-from powderdsl.schedule.cut import Cutter
+from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant
+from powderdsl.schedule.cut import Cutter, Pairs
 from powderdsl.schedule.draws import DRAWS, all_of
 from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.moves import is_movement
@@ -249,36 +249,9 @@ class _RowCutter(Cutter):
             return [need for need in found if not self.have(need) and id(need) not in ids]
         return super().needs(node)
 
-    def cell_needs(self, node: Node) -> list[Node]:
-        """Flags and floats that a loop over cells reads; long chains of choices are laid before it."""
-        found: dict[int, Node] = {}
-        apart = not _is_kept(node, self.found)
-        seen: set[int] = set()
-        stack = [node]
-        while stack:
-            top = stack.pop()
-            if id(top) in seen or self.have(top):
-                continue
-            seen.add(id(top))
-            if apart and top is not node and chain_of(top, self.have):
-                found[id(top)] = top
-            elif top.op == "led":
-                stack.extend(top.args)
-            elif top.type != REAL and top is not node and not is_comparison(top):
-                if top.op != "param":
-                    found[id(top)] = top
-            elif top.op == "shift":
-                source = top.args[0]
-                if self.have(source):
-                    continue
-                parts = stored_parts(source, self.have, self.costs.floats) if top.attr[2] else [source]
-                found |= {id(part): part for part in parts}
-                if not parts:
-                    stack.append(source)
-            else:
-                stack.extend(top.args)
-        flags = [need for need in found.values() if need.type != REAL]
-        return [*flags, *(need for need in found.values() if need.type == REAL)]
+    def stands_apart(self, part: Node, node: Node) -> bool:
+        """Long chains of choices are laid before the loop that reads them."""
+        return part is not node and not _is_kept(node, self.found) and bool(chain_of(part, self.have))
 
     def word_needs(self, node: Node) -> list[Node]:
         found: dict[int, Node] = {}
@@ -304,51 +277,21 @@ class _RowCutter(Cutter):
                 stack.extend(top.args)
         return list(found.values())
 
-    def ensure(
-        self,
-        nodes: Iterable[Node],
-        place: str,
-        named: dict[int, Var] | None = None,
-        when: Node | None = None,
+    def store(
+        self, floats: list[Node], flags: list[Node], pairs: Pairs, place: str, when: Node | None
     ) -> None:
-        named = named or {}
-        wanted = [
-            node
-            for node in dict.fromkeys(nodes)
-            if not self.have(node) and not (node.op in UNIFORM and node.type == REAL)
-        ]
-        if not wanted:
-            return
-        before = [
-            need
-            for need in dict.fromkeys(n for node in wanted for n in self.needs(node))
-            if not self.have(need)
-        ]
-        if before:
-            self.ensure(before, place, named)
-            self.ensure(wanted, place, named, when)
-            return
-        floats = [node for node in wanted if of_floats(node)]
-        floats += [i for node in floats for i in walk(node) if id(i) in self.wanted and not self.have(i)]
-        floats = list(dict.fromkeys(floats))
         laid = [node for node in floats if chain_of(node, self.have)]
-        moves = [node for node in wanted if is_movement(node)]
-        flags = [node for node in wanted if node not in floats and node not in moves]
-
-        def var(node: Node) -> Var:
-            return named.get(id(node)) or self.namer.var(node.type)
-
+        moves = [node for node in flags if is_movement(node)]
         if laid:
-            self.lay([(var(node), node) for node in laid], place)
+            self.lay(pairs(laid), place)
         if floats := [node for node in floats if node not in laid]:
-            self.kept_cells([(var(node), node) for node in floats], place)
-        if flags:
-            self.words([(var(node), node) for node in flags], place, when)
-        for node in moves:
+            self.kept_cells(pairs(floats), place)
+        if flags := [node for node in flags if node not in moves]:
+            self.words(pairs(flags), place, when)
+        for var, node in pairs(moves):
             content, movers, rest = (self.variable(arg) for arg in node.args)
-            plane = Carried(var(node), content, rest)
-            self.emit(Move(node.op, node.attr, movers, (plane,), place))
-            self.known[id(node)] = plane.new
+            self.emit(Move(node.op, node.attr, movers, (Carried(var, content, rest),), place))
+            self.known[id(node)] = var
 
     def lay(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
         """Chains of choices; those that depend on the same masks together."""
