@@ -9,6 +9,7 @@ import numpy as np
 from powderdsl.ir.ops import REAL, Node
 from powderdsl.schedule.types import Compute, Out, Sweeps, in_order, ordered
 from powderdsl.targets.layout import Layout, literal, param_key
+from powderdsl.targets.values import CellValues
 
 _INFIX = {"add": "+", "sub": "-", "mul": "*"}
 
@@ -277,20 +278,18 @@ class _Loop:
         yield f"EACH_ACTIVE({first + count}) {{ {finish} }}\n}}"
 
 
-class _Chunks:
+class _Chunks(CellValues):
     """Values of sixteen cells of one world."""
 
     def __init__(self, layout: Layout, outs: tuple[Out, ...]):
+        super().__init__()
         self.layout = layout
-        self.lines: list[str] = []
-        self.known: dict[int, str] = {}
         self.rows: dict[str, str] = {}
         self.words: dict[str, str] = {}
         self.fields: set[str] = set()
         self.choices = [node for node in ordered(out.value for out in outs) if node.op == "select"]
         self.led: dict[str, tuple[list[str], dict[int, str], list[str]]] = {}
         """What is computed only where a comparison holds somewhere in the chunk, by its name."""
-        self.count = 0
 
     def temporary(self, text: str, type: str = "F", prefix: str = "v") -> str:
         self.count += 1
@@ -402,30 +401,17 @@ class _Chunks:
         for first, (lines, _, ends) in self.led.items():
             self.lines.append(f"if ({first}) {{ {' '.join([*lines, *ends])} }}")
 
-    def chain(self, node: Node) -> list[Node]:
-        """A choice and those below it in its third argument, the outermost first."""
-        chain: list[Node] = []
-        while node.op == "select" and id(node) not in self.known:
-            chain.append(node)
-            node = node.args[2]
-        return chain
-
     def choice(self, node: Node) -> None:
         """Choices laid over each other. Where no cell of the chunk is chosen, nothing of a choice is computed."""
-        chain = self.chain(node)
-        masks = [choice.args[0] for choice in chain]
-        # Parts of a vector depend on the same masks: they are tested once for both.
-        alike = [
-            self.chain(other) for other in self.choices if other is not node and id(other) not in self.known
-        ]
-        chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
+        chains = self.alike(node)
+        masks = [choice.args[0] for choice in chains[0]]
         names = []
         for one in chains:
             base = self.of(one[-1].args[2])
             self.count += 1
             names.append(f"v{self.count}")
             self.lines.append(f"F {names[-1]} = {base};")
-        for level in reversed(range(len(chain))):
+        for level in reversed(range(len(masks))):
             self.count += 1
             bits = f"b{self.count}"
             outer, before = self.lines, self.known

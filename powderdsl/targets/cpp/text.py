@@ -9,6 +9,7 @@ from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import Compute, Forget, Guard, Move, Release, Schedule, Statement, Sweeps, Var
 from powderdsl.targets.cpp.cells import sweeps_text
 from powderdsl.targets.layout import Layout, param_key
+from powderdsl.targets.values import WordValues
 
 _LOGIC = {"and": "&", "or": "|", "xor": "^"}
 LOOP = (
@@ -210,41 +211,21 @@ def whole(value: Node, layout: Layout) -> str:
     return f"cleared(c, {kept.attr}, {gone.args[0].attr})"
 
 
-class _Words:
+class _Words(WordValues):
     """Values of a word of 64 columns in eight worlds."""
 
+    type, leaf = "V", "shift"
+
     def __init__(self, layout: Layout):
+        super().__init__()
         self.layout = layout
-        self.lines: list[str] = []
-        self.known: dict[int, str] = {}
         self.edges: dict[tuple[str, str], int] = {}
         """How many rows away planes are read, by the call that makes these ready and the plane."""
         self.clear: dict[int, bool] = {}
-        self.count = 0
 
     def ready(self) -> str:
         """Statements before the loop: rows of other strips that it reads."""
         return " ".join(f"{call}(c, {plane}, {rows});" for (call, plane), rows in self.edges.items())
-
-    def name(self, text: str) -> str:
-        self.count += 1
-        self.lines.append(f"const V t{self.count} = {text};")
-        return f"t{self.count}"
-
-    def of(self, root: Node) -> str:
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if not ready:
-                stack.append((node, True))
-                below = node.args[:1] if node.op == "when" else () if node.op == "shift" else node.args
-                stack.extend((arg, False) for arg in reversed(below))
-                continue
-            text = self.lazy(node) if node.op == "when" else self.node(node)
-            self.known[id(node)] = text if text.isidentifier() else self.name(text)
-        return self.known[id(root)]
 
     def lazy(self, node: Node) -> str:
         """Both; the second only where the first holds in the word."""

@@ -8,6 +8,7 @@ from powderdsl.ir.ops import REAL, Node
 from powderdsl.schedule.buffers import Buffer
 from powderdsl.schedule.types import ANSWER, Compute, Guard, Out, Schedule, Statement, Sync, ordered
 from powderdsl.targets.layout import Layout, literal, param_key
+from powderdsl.targets.values import CellValues, WordValues
 
 _LOGIC = {"and": "&", "or": "|", "xor": "^"}
 _ARITHMETIC = {"add": "+", "sub": "-", "mul": "*", "eq": "==", "lt": "<", "le": "<="}
@@ -109,35 +110,15 @@ class _Printer:
         return f"{lines} if (({busy}) != 0{''.join(dirty)}) return true; {' '.join(quiet)} return false;"
 
 
-class _Words:
+class _Words(WordValues):
     """Values of a word of 32 columns, each as an expression or the name of a constant."""
 
+    type, leaf = "u32", "live"
+
     def __init__(self, printer: _Printer):
+        super().__init__()
         self.printer, self.layout = printer, printer.layout
-        self.lines: list[str] = []
-        self.known: dict[int, str] = {}
         self.rows: dict[int, str] = {}
-        self.count = 0
-
-    def of(self, root: Node) -> str:
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if not ready:
-                stack.append((node, True))
-                below = node.args[:1] if node.op == "when" else () if node.op == "live" else node.args
-                stack.extend((arg, False) for arg in reversed(below))
-                continue
-            text = self.lazy(node) if node.op == "when" else self.node(node)
-            self.known[id(node)] = text if text.isidentifier() else self.name(text)
-        return self.known[id(root)]
-
-    def name(self, text: str) -> str:
-        self.count += 1
-        self.lines.append(f"const u32 t{self.count} = {text};")
-        return f"t{self.count}"
 
     def lazy(self, node: Node) -> str:
         """Both; the second only where the first holds in the word."""
@@ -220,19 +201,17 @@ class _Words:
         return f"draw_below_planes({self.layout.streams[stream]}, l, y, w, {wanted}, {bits}, {name})"
 
 
-class _Cells:
+class _Cells(CellValues):
     """Values of one cell, which a warp computes for the 32 cells of a word; masks are tested by word."""
 
     def __init__(self, printer: _Printer, outs: Sequence[Out]):
+        super().__init__()
         self.printer, self.layout = printer, printer.layout
-        self.lines: list[str] = []
-        self.known: dict[int, str] = {}
         self.masks: dict[int, str] = {}
         """Words of flags by buffer, read before the cells."""
         self.places: dict[tuple[str, int], str] = {}
         nodes = ordered(out.value for out in outs)
         self.choices = [node for node in nodes if node.op == "select"]
-        self.count = 0
 
     def fresh(self, prefix: str) -> str:
         self.count += 1
@@ -334,29 +313,16 @@ class _Cells:
         )
         return name
 
-    def chain(self, node: Node) -> list[Node]:
-        """A choice and those below it in its third argument, the outermost first."""
-        chain: list[Node] = []
-        while node.op == "select" and id(node) not in self.known:
-            chain.append(node)
-            node = node.args[2]
-        return chain
-
     def choice(self, node: Node) -> None:
         """Choices laid over each other. Where no cell of the word is chosen, nothing of a choice is computed."""
-        chain = self.chain(node)
-        masks = [choice.args[0] for choice in chain]
-        # Parts of a vector depend on the same masks: they are tested once for both.
-        alike = [
-            self.chain(other) for other in self.choices if other is not node and id(other) not in self.known
-        ]
-        chains = [chain, *(c for c in alike if len(c) > 1 and [choice.args[0] for choice in c] == masks)]
+        chains = self.alike(node)
+        masks = [choice.args[0] for choice in chains[0]]
         names = []
         for one in chains:
             base = self.of(one[-1].args[2])
             names.append(self.fresh("v"))
             self.lines.append(f"float {names[-1]} = {base};")
-        for level in reversed(range(len(chain))):
+        for level in reversed(range(len(masks))):
             running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
             known = self.known | running  # only here: the names' values change
             mask = self.mask(masks[level])

@@ -1,0 +1,75 @@
+"""What the printers of C++ and CUDA share: values as named temporaries of a block, computed once each."""
+
+from __future__ import annotations
+
+from powderdsl.ir.ops import Node
+
+
+class Values:
+    """Statements of a block, and the names of the values that they compute, by id."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.known: dict[int, str] = {}
+        self.count = 0
+
+
+class WordValues(Values):
+    """Flags, a word at a time. `type` is a word's type; `leaf` the operation that reads variables by itself."""
+
+    type: str
+    leaf: str
+
+    def node(self, node: Node) -> str:
+        """The expression of a node whose arguments are known."""
+        raise NotImplementedError
+
+    def lazy(self, node: Node) -> str:
+        """The name of a `when`, whose second argument is computed only where the first holds."""
+        raise NotImplementedError
+
+    def of(self, root: Node) -> str:
+        """The name of a value."""
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            if not ready:
+                stack.append((node, True))
+                below = node.args[:1] if node.op == "when" else () if node.op == self.leaf else node.args
+                stack.extend((arg, False) for arg in reversed(below))
+                continue
+            text = self.lazy(node) if node.op == "when" else self.node(node)
+            self.known[id(node)] = text if text.isidentifier() else self.name(text)
+        return self.known[id(root)]
+
+    def name(self, text: str) -> str:
+        self.count += 1
+        self.lines.append(f"const {self.type} t{self.count} = {text};")
+        return f"t{self.count}"
+
+
+class CellValues(Values):
+    """Floats, and flags that compare them. `choices` are all choices that the block computes."""
+
+    choices: list[Node]
+
+    def chain(self, node: Node) -> list[Node]:
+        """A choice and those below it in its third argument, the outermost first."""
+        chain: list[Node] = []
+        while node.op == "select" and id(node) not in self.known:
+            chain.append(node)
+            node = node.args[2]
+        return chain
+
+    def alike(self, node: Node) -> list[list[Node]]:
+        """The chain of a choice, and others on the same masks: parts of a vector are tested once for both."""
+        chain = self.chain(node)
+        masks = [choice.args[0] for choice in chain]
+        others = [
+            self.chain(other) for other in self.choices if other is not node and id(other) not in self.known
+        ]
+        return [
+            chain, *(one for one in others if len(one) > 1 and [choice.args[0] for choice in one] == masks)
+        ]  # fmt: skip
