@@ -209,7 +209,8 @@ def _params(symbols: Symbols, typer: Typer) -> None:
                     "PD401",
                     f"a parameter cannot be a {kind}",
                     decl.name.span,
-                    helps=("kinds: chance, LOW..HIGH, real(LOW..HIGH), flag",),
+                    "",
+                    "kinds: chance, LOW..HIGH, real(LOW..HIGH), flag",
                 )
             value = constant_of(decl.default, kind, Scope(named.pack, {}), typer)
         except Poisoned:
@@ -257,7 +258,7 @@ def _kind_of_literal(decl: TypedDecl, typer: Typer) -> Kind:
         f"the parameter `{decl.name.text}` does not say its kind",
         decl.default.span,
         "neither a percentage nor `yes` or `no`",
-        (_kind_help(decl.name.text, decl.default.span.text),),
+        _kind_help(decl.name.text, decl.default.span.text),
     )
 
 
@@ -280,7 +281,8 @@ def _properties(symbols: Symbols, typer: Typer) -> None:
                     "PD401",
                     f"a property cannot be a {kind}",
                     named.decl.type.span,
-                    helps=("kinds of properties: LOW..HIGH, flag, chance",),
+                    "",
+                    "kinds of properties: LOW..HIGH, flag, chance",
                 )
         except Poisoned:
             continue
@@ -360,8 +362,7 @@ def _values(
             ):
                 typer.fail(
                     "PD402", f"the parameter may leave {prop.kind}", syntax.span, f"it is {expr.kind}",
-                    (f"declare it as {prop.kind}",),
-                )  # fmt: skip
+                    f"declare it as {prop.kind}")  # fmt: skip
             return str(expr.value)
         if expr.op != "const":
             typer.fail("PD405", "expected a constant or a parameter", syntax.span, "depends on the world")
@@ -386,7 +387,7 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
             kind = read_kind(decl.type, typer)
             if kind.name == "chance":
                 raise typer.fail(
-                    "PD401", "a field cannot be a chance", decl.type.span, helps=("use `real(0..1)`",)
+                    "PD401", "a field cannot be a chance", decl.type.span, "", "use `real(0..1)`"
                 )
             default = (
                 constant_of(decl.default, kind, scope, typer)

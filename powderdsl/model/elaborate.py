@@ -166,7 +166,7 @@ class Elaborator:
                 "loops in loops that never end",
                 block.header.span,
                 "repeated too often",
-                ("loop over fewer things",),
+                "loop over fewer things",
             )
         symmetry, policy = block.symmetry or symmetry, block.policy or policy
         for scalar, syntax in block.lets:
@@ -274,7 +274,7 @@ class Elaborator:
             f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules",
             rules[0].span,
             "here",
-            ("loop over fewer things",),
+            "loop over fewer things",
         )
 
     # Rules
@@ -366,7 +366,7 @@ class Elaborator:
                 f"`{syntax.text}` needs a number",
                 syntax.span,
                 f"`{name}` is a {kind}",
-                ("assign with `:=`",),
+                "assign with `:=`",
             )
         return Assign(name, offset, syntax.text, expr, mask, syntax.span)
 
@@ -414,7 +414,7 @@ class Elaborator:
                 f"`{syntax.span.text}` cannot be assigned",
                 syntax.span,
                 "not a field or property",
-                helps,
+                *helps,
             )
         name = str(operand.value)
         if operand.op == "property":
@@ -424,7 +424,7 @@ class Elaborator:
                     f"the chance `{name}` cannot be assigned",
                     syntax.span,
                     "chances belong to elements",
-                    ("declare it as an integer",),
+                    "declare it as an integer",
                 )
             self.result.overridden.add(name)
         return name, operand.kind, offset
@@ -439,7 +439,7 @@ class Elaborator:
         if isinstance(operand, Expr) and operand.kind.name == "vec2":
             fix = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
             raise self.typer.fail(
-                "PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", (fix,)
+                "PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", fix
             )
         return self.typer.place(operand, before.span)
 
@@ -452,7 +452,7 @@ class Elaborator:
                 f"`{name}` is not a vector",
                 target.span,
                 f"this is a {kind}",
-                ("`push` works on vec2 fields",),
+                "`push` works on vec2 fields",
             )
         mask = self._mask([self.typer.condition(source, scope)], syntax, scope)
         strength = self.typer.real(self.typer.evaluate(amount, scope), amount.span)

@@ -52,7 +52,7 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
                 *suggest(word, composition.elements, "elements"),
                 f"if its pack may be absent, write `{word}?`",
             )
-            raise typer.fail("PD301", f"unknown element `{word}`", value.span, helps=helps)
+            raise typer.fail("PD301", f"unknown element `{word}`", value.span, "", *helps)
         if len(key.text) != 1:
             raise typer.fail("PD110", "a legend explains single characters", key.span, "not one character")
         legend[key.text] = name
@@ -195,8 +195,7 @@ def _check_whole(scalar: Scalar, legend: dict[str, str], typer: Typer) -> None:
         whole = text[scalar.span.start : end].strip()
         raise typer.fail(
             "PD110", "a drawing that stops at a comment", Span(scalar.span.source, start, scalar.span.end + len(rest.rstrip())),
-            "a comment, to YAML", (f'put quotes around the drawing: "{whole}"', "or draw it on the next lines, below `|`"),
-        )  # fmt: skip
+            "a comment, to YAML", f'put quotes around the drawing: "{whole}"', "or draw it on the next lines, below `|`")  # fmt: skip
 
 
 def _rows(scalar: Scalar, legend: dict[str, str], typer: Typer, *, wildcard: bool) -> tuple[str, ...]:
@@ -215,6 +214,6 @@ def _rows(scalar: Scalar, legend: dict[str, str], typer: Typer, *, wildcard: boo
                 f"`{char}` stands for nothing",
                 Span(scalar.span.source, place, place + 1),
                 "not in the legend",
-                (f"known: {known}",),
+                f"known: {known}",
             )
     return rows

@@ -124,8 +124,7 @@ def _words(typer: Typer, words: tuple[Syntax, ...], wanted: tuple[tuple[str, ...
             close = [fix for fix in suggest(word.text, options) if fix.startswith("did")]
             raise typer.fail(
                 "PD201", f"unexpected `{word.text}`", word.span, f"expected {listed}",
-                tuple(close) or _FORMS,
-            )  # fmt: skip
+                *tuple(close) or _FORMS)  # fmt: skip
 
 
 _FORMS = (
@@ -138,8 +137,7 @@ def _number(typer: Typer, text: str, span: Span, least: int, most: int) -> int:
     if len(text) > 6 or not least <= int(text) <= most:
         raise typer.fail(
             "PD402", f"{text[:12]} lies outside {least}..{most}", span, "out of range",
-            (f"write a number from {least} to {most}",),
-        )  # fmt: skip
+            f"write a number from {least} to {most}")  # fmt: skip
     return int(text)
 
 
@@ -167,7 +165,7 @@ def _total(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     """`count(…) is constant`, `sum(…) is constant`."""
     (what,) = line.children
     if what.kind != "is_" or what.children[0].kind != "call" or what.children[1].kind != "name":
-        raise typer.fail("PD201", "this states nothing", what.span, "not an invariant", _FORMS)
+        raise typer.fail("PD201", "this states nothing", what.span, "not an invariant", *_FORMS)
     _words(typer, (what.children[1],), (("constant",),))
     return _total_of(typer, what.children[0], "constant", scope)
 
@@ -175,7 +173,7 @@ def _total(typer: Typer, line: Syntax, scope: Scope) -> Claim:
 def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
     if call.text not in ("count", "sum") or not call.children:
         raise typer.fail(
-            "PD406", "a total is written `count(SET)` or `sum(VALUE)`", call.span, "not a total", _FORMS
+            "PD406", "a total is written `count(SET)` or `sum(VALUE)`", call.span, "not a total", *_FORMS
         )
     for child in call.children:
         if child.kind == "in_" and isinstance(typer.evaluate(child.children[1], scope), Kernel):
@@ -215,8 +213,7 @@ def _never(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     if condition == TRUE:
         raise typer.fail(
             "PD511", "this invariant cannot hold", line.children[0].span, "every cell fulfills this",
-            ("say what no cell may fulfill",),
-        )  # fmt: skip
+            "say what no cell may fulfill")  # fmt: skip
     return Never(_asked(typer, condition, line.children[0].span), steps)
 
 
@@ -254,7 +251,7 @@ def _stays(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     ]
     if outside or beyond:
         found = f"`{name}` holds {operand.kind}" if outside else f"a fresh cell has {beyond[0]}"
-        raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, ("widen the bounds",))
+        raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, "widen the bounds")
     return Bounded(name, lo, hi)
 
 

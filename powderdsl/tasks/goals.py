@@ -108,7 +108,7 @@ class GoalChecker:
             first, second = self.scalar(parts[0]), self.scalar(parts[1])
             if kind in ("divide", "mod") and _always_zero(second):
                 raise self.typer.fail(
-                    "PD402", "division by zero", parts[1].span, "this is 0", ("divide by another number",)
+                    "PD402", "division by zero", parts[1].span, "this is 0", "divide by another number"
                 )
             return Expr(_BINARY[kind], REAL, (first, second))
         if kind == "choose":
@@ -159,14 +159,14 @@ class GoalChecker:
         if syntax.kind == "name" and self.typer.find(syntax.text, syntax.span, self.scope) is None:
             helps = suggest(syntax.text, [*names, *self.typer.symbols.names()])
             return self.typer.fail(
-                "PD301", f"unknown name `{syntax.text}`", syntax.span, "not defined", helps
+                "PD301", f"unknown name `{syntax.text}`", syntax.span, "not defined", *helps
             )
         return self.typer.fail(
             "PD401",
             "expected one number of the whole world",
             syntax.span,
             "this is something of each cell",
-            (f"write `count({text})`, or `share({text})`",),
+            f"write `count({text})`, or `share({text})`",
         )
 
     # Numbers of the whole world
@@ -176,13 +176,13 @@ class GoalChecker:
         span = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(name))
         if name not in FUNCTIONS:
             helps = suggest(name, FUNCTIONS, "functions")
-            raise self.typer.fail("PD301", f"unknown function `{name}`", span, "not a function", helps)
+            raise self.typer.fail("PD301", f"unknown function `{name}`", span, "not a function", *helps)
         least, most = (2, MAX_VALUES) if name in ("min", "max") else (1, 1)
         if not least <= len(parts) <= most:
             wanted = "1 value" if most == 1 else f"{least} to {most} values"
             message = f"`{name}` takes {wanted}, found {len(parts)}"
             usage = (f"write `{FUNCTIONS[name]}`",)
-            raise self.typer.fail("PD406", message, syntax.span, "", usage)
+            raise self.typer.fail("PD406", message, syntax.span, "", *usage)
         if name in ARITHMETIC:
             values = [self.scalar(part) for part in parts]
             if len(values) == 1:
@@ -202,7 +202,7 @@ class GoalChecker:
             if cells.kind != "name" or cells.text not in self.targets:
                 helps = suggest(cells.text, self.targets, "targets") or ("the task defines no targets",)
                 raise self.typer.fail(
-                    "PD802", f"unknown target `{cells.text}`", cells.span, "not defined", helps
+                    "PD802", f"unknown target `{cells.text}`", cells.span, "not defined", *helps
                 )
             return Measure("match", None, None, cells.text)
         region = None
@@ -213,7 +213,7 @@ class GoalChecker:
             elif self.typer.find(word.text, word.span, self.scope) is None:
                 helps = suggest(word.text, self.regions, "regions") or ("the task defines no regions",)
                 raise self.typer.fail(
-                    "PD802", f"unknown region `{word.text}`", word.span, "not defined", helps
+                    "PD802", f"unknown region `{word.text}`", word.span, "not defined", *helps
                 )
         value = self.cells(how, cells)
         return Measure(how, value, region)

@@ -81,7 +81,7 @@ def _compare_discrete(
                     f"{words} is not more or less than another",
                     span,
                     "has no order",
-                    ("use `==` or `!=`",),
+                    "use `==` or `!=`",
                 )
             return Expr(op, FLAG, (left, right), span=span)  # type: ignore[arg-type]
     raise typer.fail(
@@ -89,7 +89,7 @@ def _compare_discrete(
         "vectors are not compared",
         span,
         "one side is a vector",
-        helps=("compare `length(…)`, or `.row` and `.column`",),
+        "compare `length(…)`, or `.row` and `.column`",
     )
 
 
@@ -112,11 +112,7 @@ def _compare_draw(
 ) -> Expr:
     if op == "eq":
         raise typer.fail(
-            "PD401",
-            "a draw never equals anything exactly",
-            span,
-            "always false",
-            ("compare with `<` or `>`",),
+            "PD401", "a draw never equals anything exactly", span, "always false", "compare with `<` or `>`"
         )
     on_left = isinstance(left, Expr) and left.kind.name == "draw"
     draw, other, place = (left, right, places[1]) if on_left else (right, left, places[0])
@@ -133,7 +129,7 @@ def _compare_draw(
                     f"a draw compared with {shown}",
                     place,
                     "draws lie between 0 and 1",
-                    (f"did you mean {fix}?",),
+                    f"did you mean {fix}?",
                 )
             return TRUE if (other.value > draw.kind.hi) == (draw is left) else FALSE
         kind = CHANCE if 0 <= other.value <= 1 else Kind("number")
@@ -227,7 +223,7 @@ def _vector_arithmetic(typer: Typer, op: str, left: Value, right: Value, span: S
             "a vector adds up with vectors only",
             span,
             "one side is not a vector",
-            ("write `vector(rows, columns)`",),
+            "write `vector(rows, columns)`",
         )
     if (op == "mul" and left_is and right_is) or (op == "div" and right_is):
         raise typer.fail(

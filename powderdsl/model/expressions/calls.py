@@ -72,7 +72,7 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         helps = (meant,) if meant else suggest(name, [*FUNCTIONS, *KERNEL_SHAPES], "functions")
         if not helps:
             helps = (f"functions: {', '.join(f'`{known}`' for known in FUNCTIONS)}",)
-        raise typer.fail("PD301", f"unknown function `{name}`", name_span, "not a function", helps)
+        raise typer.fail("PD301", f"unknown function `{name}`", name_span, "not a function", *helps)
     (lo, hi), usage = (function.arity, function.signature) if function else ((1, 1), f"{name}(RADIUS)")
     count = len(syntax.children)
     if not lo <= count <= hi:
@@ -82,7 +82,7 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
             f"`{name}` takes {wanted}, found {count}",
             syntax.span,
             "too few" if count < lo else "too many",
-            helps=(f"write `{usage}`",),
+            f"write `{usage}`",
         )
     return CALLS[name](typer, syntax, scope) if function else _shaped(typer, syntax, scope)
 
@@ -118,7 +118,7 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         if not isinstance(value, Number) or value.value.denominator != 1:
             fix = "where it varies, loop over the values: `any(… for n in 0..3)`"
             raise typer.fail(
-                "PD405", "`at` takes two whole constants", child.span, "not an integer constant", (fix,)
+                "PD405", "`at` takes two whole constants", child.span, "not an integer constant", fix
             )
         steps.append(int(value.value))
     place = Place(typer.offset((steps[0], steps[1]), syntax.span))
@@ -176,7 +176,7 @@ def _clamp(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
             "the bounds of `clamp` are the wrong way round",
             high[1],
             "below the other bound",
-            (f"write `clamp({value[1].text}, {high[1].text}, {low[1].text})`",),
+            f"write `clamp({value[1].text}, {high[1].text}, {low[1].text})`",
         )
     raised = arithmetic.extreme(typer, "max", [value, low], syntax.span)
     return arithmetic.extreme(

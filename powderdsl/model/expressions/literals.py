@@ -18,7 +18,7 @@ def read_number(syntax: Syntax, coercer: Coercer) -> Fraction:
             f"`{text}` starts with a zero",
             syntax.span,
             "not a plain number",
-            helps=(f"write `{text.lstrip('0') or '0'}`",),
+            f"write `{text.lstrip('0') or '0'}`",
         )
     if "e" in text.lower() and abs(int(text.lower().split("e")[1])) > 12:
         raise coercer.fail(
@@ -45,10 +45,6 @@ def read_bounds(syntax: Syntax, coercer: Coercer) -> tuple[int, int]:
     lo, hi = bounds
     if lo > hi:
         raise coercer.fail(
-            "PD402",
-            "a range that runs backwards",
-            syntax.span,
-            f"{lo} is above {hi}",
-            (f"write `{hi}..{lo}`",),
+            "PD402", "a range that runs backwards", syntax.span, f"{lo} is above {hi}", f"write `{hi}..{lo}`"
         )
     return lo, hi

@@ -90,7 +90,6 @@ def _not_a_set(typer: Typer, syntax: Syntax) -> Poisoned:
     if syntax.kind in ("is_", "is_not"):
         return typer.fail(
             "PD401", "`is` asks for an element or a direction", second.span, "this is a number",
-            ("compare numbers with `==`",),
-        )  # fmt: skip
+            "compare numbers with `==`")  # fmt: skip
     fix = "a range is written `LOW..HIGH`" if second.kind == "subtract" else "compare numbers with `==`"
-    return typer.fail("PD401", "`in` asks for a range or a set", second.span, "this is a number", (fix,))
+    return typer.fail("PD401", "`in` asks for a range or a set", second.span, "this is a number", fix)

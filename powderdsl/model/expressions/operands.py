@@ -127,9 +127,8 @@ class Coercer:
         self.reporter = reporter
         self._misused: set[tuple[Span, str]] = set()
 
-    def fail(
-        self, code: str, message: str, span: Span, label: str = "", helps: tuple[str, ...] = ()
-    ) -> Poisoned:
+    def fail(self, code: str, message: str, span: Span, label: str = "", *helps: str) -> Poisoned:
+        """Report an error; the exception to raise after it."""
         self.reporter.error(code, message, span, label, helps=helps)
         return Poisoned()
 
@@ -248,8 +247,7 @@ class Coercer:
             if value.value.denominator != 1:
                 raise self.fail(
                     "PD401", "expected an integer", span, f"{float(value.value):g} is not whole",
-                    ("write an integer; a field may also be declared as `real(LOW..HIGH)`",),
-                )  # fmt: skip
+                    "write an integer; a field may also be declared as `real(LOW..HIGH)`")  # fmt: skip
             return constant(value, span)
         if value.kind.name == "int":
             return value
@@ -267,7 +265,7 @@ class Coercer:
                     if meant
                     else "write a chance from `0%` to `100%`"
                 )
-                raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%", (fix,))
+                raise self.fail("PD403", f"a chance of {shown}", span, "chances lie in 0%..100%", fix)
             return Expr("const", CHANCE, value=value.value, span=span)
         if value.kind.name in ("chance", "real"):
             return value
@@ -310,7 +308,7 @@ class Coercer:
                 f"{value.value:g} lies outside {kind}",
                 span,
                 f"the range is {kind.lo:g}..{kind.hi:g}",
-                ("write a number in this range, or widen it where it is declared",),
+                "write a number in this range, or widen it where it is declared",
             )
         return value
 

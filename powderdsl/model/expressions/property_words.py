@@ -26,4 +26,4 @@ def not_a_value(prop: Property, syntax: Syntax, typer: Typer) -> None:
         if meant and prop.kind.name == "flag"
         else f"write {example}, or a parameter of this pack"
     )
-    typer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", (fix,))
+    typer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", fix)

@@ -132,7 +132,7 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
                 f"`{syntax.text}` needs bounds",
                 syntax.span,
                 "no bounds",
-                helps=(f"write `{syntax.text}(-100..100)`",),
+                f"write `{syntax.text}(-100..100)`",
             )
     if syntax.kind == "call" and syntax.text in ("real", "vec2") and len(syntax.children) == 1:
         lo, hi = read_bounds(syntax.children[0], coercer)
@@ -143,7 +143,7 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
         helps = (f"write `{_KINDS_ELSEWHERE[word]}`",)
     elif close and close[0].startswith("did"):
         helps = close
-    raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", helps)
+    raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", *helps)
 
 
 def default_of(kind: Kind, first_id: int = 0) -> Value:

@@ -81,8 +81,7 @@ class Typer(Coercer):
             raise self.fail(
                 "PD508", "a rule that expands to too much" if self._work <= MAX_WORK else "rules that expand to too much",
                 self._rule_span or syntax.span, "written out, it has thousands of parts",
-                ("loop over fewer things, or name parts under `let:`",),
-            )  # fmt: skip
+                "loop over fewer things, or name parts under `let:`")  # fmt: skip
         return HANDLERS[syntax.kind](self, syntax, scope)
 
     def start_rule(self, span: Span) -> None:
@@ -150,7 +149,7 @@ class Typer(Coercer):
                 f"`{other}`" for other in [*self.resolving[self.resolving.index(name) :], name]
             )
             raise self.fail(
-                "PD307", f"the set `{name}` is defined by itself", span, path, ("list elements or tags",)
+                "PD307", f"the set `{name}` is defined by itself", span, path, "list elements or tags"
             )
         if len(self.resolving) >= MAX_SET_DEPTH:
             for waiting in self.resolving:
@@ -160,8 +159,7 @@ class Typer(Coercer):
             self._sets_too_deep = True
             raise self.fail(
                 "PD508", f"more than {MAX_SET_DEPTH} sets that depend on each other", span, "too many in a row",
-                ("list elements or tags",),
-            )  # fmt: skip
+                "list elements or tags")  # fmt: skip
         pack, syntax = self.set_definitions[name]
         self.resolving.append(name)
         try:
@@ -193,19 +191,19 @@ class Typer(Coercer):
                 f"`{syntax.text}` stands without `mod`",
                 syntax.span,
                 "endless by itself",
-                (f"write `{syntax.text} mod 2`: rules are the same everywhere and always, up to a pattern",),
+                f"write `{syntax.text} mod 2`: rules are the same everywhere and always, up to a pattern",
             )
         shape = syntax.text in KERNEL_SHAPES and syntax.text not in KERNELS
         if shape and self.find(syntax.text, syntax.span, scope) is None:
             label, fix = "its radius is missing", (f"write `{syntax.text}(3)`",)
-            raise self.fail("PD406", f"`{syntax.text}` needs a radius", syntax.span, label, fix)
+            raise self.fail("PD406", f"`{syntax.text}` needs a radius", syntax.span, label, *fix)
         if syntax.text in FUNCTIONS:
             raise self.fail(
                 "PD406",
                 f"`{syntax.text}` is a function",
                 syntax.span,
                 "its values are missing",
-                helps=(f"write `{FUNCTIONS[syntax.text].signature}`",),
+                f"write `{FUNCTIONS[syntax.text].signature}`",
             )
         return self.lookup(syntax.text, syntax.span, scope)
 
@@ -239,7 +237,7 @@ class Typer(Coercer):
                 f"a vector has no `{syntax.text}`",
                 word,
                 "not a part of it",
-                helps=("parts of a vector: `.row`, `.column`",),
+                "parts of a vector: `.row`, `.column`",
             )
         if not isinstance(base, Place):
             raise self.wrong(base, "a neighbor before the dot", base_syntax.span, "such as `below.FIELD`")
@@ -257,7 +255,7 @@ class Typer(Coercer):
                     f"`{syntax.text}` is not a field or property",
                     word,
                     f"this is {'an element' if value.name else 'a set of elements'}",
-                    helps=(f"write `{text}`",),
+                    f"write `{text}`",
                 )
         raise self.wrong(value, "a field, property or neighbor after the dot", word)
 
@@ -364,7 +362,7 @@ class Typer(Coercer):
                     f"`{variable.text}` already means something here",
                     variable.span,
                     "hides the other meaning",
-                    ("choose another name",),
+                    "choose another name",
                 )
             self.used.add(variable.text)
             straight = replace(
@@ -379,7 +377,7 @@ class Typer(Coercer):
                 f"a loop of {rounds:,} rounds",
                 place,
                 f"the limit is {MAX_ROUNDS:,}",
-                ("loop over fewer things",),
+                "loop over fewer things",
             )
         return [scope.bind(**dict(choice)) for choice in product(*domains)]
 
@@ -393,7 +391,7 @@ class Typer(Coercer):
                         f"a loop of {operand.hi - operand.lo + 1:,} rounds",
                         syntax.span,
                         "the limit is 64",
-                        ("loop over fewer things",),
+                        "loop over fewer things",
                     )
                 return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():

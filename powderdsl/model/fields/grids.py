@@ -58,7 +58,7 @@ class GridReader:
                 f"`{key.text}` has another size than `given`",
                 places[0] if places else key.span,
                 f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}",
-                (f"write a word for each cell, or one for all of them: {FORMS[kind.name][1]}",),
+                f"write a word for each cell, or one for all of them: {FORMS[kind.name][1]}",
             )
         words: dict[str, Cell] = {}
         cells, at = [], 0
@@ -106,7 +106,7 @@ class GridReader:
             *suggest(name, [*symbols.fields, *symbols.properties], "fields"),
             f"if its pack may be absent, write `{name}?`",
         )
-        raise self.typer.fail("PD301", f"unknown field `{name}`", key.span, helps=helps)
+        raise self.typer.fail("PD301", f"unknown field `{name}`", key.span, "", *helps)
 
     def _places(self, scalar: Scalar, count: int) -> list[Span]:
         """Where each word stands; in text that YAML changes while reading it, the whole text."""
@@ -125,12 +125,12 @@ class GridReader:
                 return None
             fix = (f"write `{DEFAULT}` for what a fresh cell has",)
             raise self.typer.fail(
-                "PD110", "a start world leaves nothing open", place, FORMS[kind.name][1], fix
+                "PD110", "a start world leaves nothing open", place, FORMS[kind.name][1], *fix
             )
         try:
             return read_word(word, kind, self.ids, ranges=expected)
         except WordProblem as wrong:
-            raise self.typer.fail(wrong.code, wrong.message, place, wrong.label, wrong.helps) from None
+            raise self.typer.fail(wrong.code, wrong.message, place, wrong.label, *wrong.helps) from None
 
     def _check_holders(
         self,
