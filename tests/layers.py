@@ -12,7 +12,6 @@ _STEPS = (
     "simulation.draw",
     "simulation.state_checks",
     "simulation.programs",
-    "simulation.views",
     "simulation.observe",
     "simulation.simulator",
 )
@@ -62,8 +61,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "simulation.native_start": _BACK,
     "simulation.auto": _BACK,
     "simulation.programs": (*_BACK, "simulation.native_start", "simulation.auto"),
-    "simulation.views": ("ir", "targets", "targets.cpp"),
-    "simulation.observe": (*_BACK, "simulation.draw", "simulation.views"),
+    "simulation.observe": (*_BACK, "simulation.draw"),
     "simulation.simulator": (*_BACK, "simulation.programs", "simulation.observe", "simulation.state_checks"),
     "simulation.provenance": (*_FRONT, "simulation.simulator"),
     "simulation.tracing": (
@@ -120,7 +118,6 @@ _TORCH = (
     "simulation.native_start",
     "simulation.auto",
     "simulation.programs",
-    "simulation.views",
     "simulation.observe",
     "simulation.state_checks",
     "simulation.simulator",

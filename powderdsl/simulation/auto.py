@@ -16,9 +16,8 @@ from dataclasses import replace
 from torch import Tensor
 
 from powderdsl.targets.cpp.compilers import CURE, NoCompiler
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Job, Runnable
 from powderdsl.targets.laps import profile_of
-from powderdsl.targets.torch.mixed import Part
 
 WORTH = 2.0
 """Seconds of arrays, done or still to come in the call that runs, from which native code is compiled. Compiling takes
@@ -31,11 +30,11 @@ SLICE = 0.25
 class Build:
     """Native code on its way, in a thread that waits for the compiler and ends with the process."""
 
-    def __init__(self, make: Callable[[], Part]):
+    def __init__(self, make: Callable[[], Runnable]):
         self._make = make
         self._began = time.perf_counter()
         self._took: float | None = None
-        self.program: Part | None = None
+        self.program: Runnable | None = None
         self.problem = ""
         self._thread = threading.Thread(target=copy_context().run, args=(self._run,), daemon=True)
         self._thread.start()
@@ -70,11 +69,14 @@ class AutoProgram:
     """
 
     def __init__(
-        self, arrays: Callable[[], Part], ready: Callable[[], Part | None], make: Callable[[], Part]
+        self,
+        arrays: Callable[[], Runnable],
+        ready: Callable[[], Runnable | None],
+        make: Callable[[], Runnable],
     ):
         self._arrays, self._make = arrays, make
         self._build: Build | None = None
-        self._native: Part | None = None
+        self._native: Runnable | None = None
         self._problem = ""
         self._beginning = threading.Lock()
         self._spent = 0.0
@@ -84,8 +86,6 @@ class AutoProgram:
             self._native = ready()
         except NoCompiler as error:
             self._problem = str(error)
-        if self._native is None:
-            arrays()
 
     @property
     def running(self) -> str:
@@ -175,7 +175,7 @@ class AutoProgram:
         finally:
             self._beginning.release()
 
-    def _arrived(self) -> Part | None:
+    def _arrived(self) -> Runnable | None:
         """The native program if it is there."""
         build = self._build
         if self._native is None and build is not None:

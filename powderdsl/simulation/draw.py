@@ -1,4 +1,4 @@
-"""Worlds -> RGB pictures, one pixel a cell. NumPy in, NumPy out; torch tensors stay on their device."""
+"""Worlds -> RGB pictures, one pixel a cell. NumPy in, NumPy out; tensors in, tensors on their device out."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Ramp:
 
     id: int
     field: str
-    starts: NDArray[Any]
-    colors: NDArray[np.uint8]
+    starts: Array
+    colors: Array
 
 
 def ramps(elements: Sequence[Element]) -> tuple[Ramp, ...]:
@@ -117,39 +117,30 @@ def rgb(
     Raises ValueError for ids without a color, fields that are missing and shapes that do not fit, TypeError for ids
     of another type.
     """
-    table = _table(colors)
-    tensor = _is_tensor(ids)
-    if not tensor:
-        ids = np.asarray(ids)
-    _check(ids, motion, len(table), tensor)
-    ramped = [(ramp, _values(ramp, fields or {}, ids, tensor)) for ramp in ramps]
-    if tensor:
-        return _rgb_torch(ids, table, motion, ramped)
-    image = table[ids]
-    for ramp, values in ramped:
-        cells = ids == ramp.id
-        image[cells] = ramp.colors[np.searchsorted(ramp.starts, values[cells], side="right")]
-    if motion is None:
+    table, cells = _table(colors), to_numpy(ids)
+    _check(cells, len(table))
+    image = table[cells]
+    for ramp in ramps:
+        if ramp.field not in (fields or {}):
+            raise ValueError(
+                f"the color of element {ramp.id} follows the field {ramp.field}, which is missing"
+            )
+        values = to_numpy((fields or {})[ramp.field]).astype(ramp.starts.dtype)
+        _check_shape(ramp.field, values, cells.shape)
+        ramped = cells == ramp.id
+        image[ramped] = ramp.colors[np.searchsorted(ramp.starts, values[ramped], side="right")]
+    if motion is not None:
+        motion = to_numpy(motion).astype(np.float32)
+        _check_shape("motion", motion, (*cells.shape[:-2], 2, *cells.shape[-2:]))
+        speed = np.hypot(*np.moveaxis(motion, -3, 0))
+        weight = np.nan_to_num(np.clip(speed / 2, 0, MAX_TINT))[..., None]
+        tint = np.array(MOTION_COLOR, dtype=np.float32)
+        image = (image + (tint - image) * weight + 0.5).astype(np.uint8)
+    if not _is_tensor(ids):
         return image
-    speed = np.hypot(*np.moveaxis(np.asarray(motion, dtype=np.float32), -3, 0))
-    weight = np.nan_to_num(np.clip(speed / 2, 0, MAX_TINT))[..., None]
-    motion = np.array(MOTION_COLOR, dtype=np.float32)
-    return (image + (motion - image) * weight + 0.5).astype(np.uint8)
-
-
-def _rgb_torch(ids: Any, table: NDArray[np.uint8], motion: Any, ramped: Sequence[tuple[Ramp, Any]]) -> Any:
     import torch
 
-    image = torch.as_tensor(table, device=ids.device)[ids.long()]
-    for ramp, values in ramped:
-        starts, colors = (torch.from_numpy(part).to(ids.device) for part in (ramp.starts, ramp.colors))
-        reached = torch.bucketize(values.to(starts.dtype), starts, right=True)
-        image = torch.where((ids == ramp.id)[..., None], colors[reached], image)
-    if motion is None:
-        return image
-    weight = (torch.hypot(*motion.float().unbind(-3)) / 2).clamp(0, MAX_TINT).nan_to_num()[..., None]
-    motion = torch.tensor(MOTION_COLOR, dtype=torch.float32, device=ids.device)
-    return (image + (motion - image) * weight + 0.5).to(torch.uint8)
+    return torch.from_numpy(image).to(ids.device)
 
 
 def scale(image: Array, factor: int) -> Any:
@@ -214,31 +205,20 @@ def _is_tensor(value: object) -> bool:
     return any(base.__module__.partition(".")[0] == "torch" for base in type(value).__mro__)
 
 
-def _check(ids: Any, motion: Any, colors: int, tensor: bool) -> None:
-    integer = not (ids.is_floating_point() or ids.is_complex()) if tensor else ids.dtype.kind in "iu"
-    if not integer or str(ids.dtype).endswith("bool"):
+def _check(ids: NDArray[Any], colors: int) -> None:
+    if ids.dtype.kind not in "iu":
         raise TypeError(f"ids must be integers, not {ids.dtype}")
     if ids.ndim < 2:
-        raise ValueError(f"ids must have shape [..., H, W], not {tuple(ids.shape)}")
-    if math.prod(ids.shape) and not 0 <= int(ids.min()) <= int(ids.max()) < colors:
+        raise ValueError(f"ids must have shape [..., H, W], not {ids.shape}")
+    if ids.size and not 0 <= int(ids.min()) <= int(ids.max()) < colors:
         raise ValueError(
             f"ids reach from {int(ids.min())} to {int(ids.max())}, but there are {colors} colors"
         )
-    if motion is None:
-        return
-    expected = (*ids.shape[:-2], 2, *ids.shape[-2:])
-    if tuple(motion.shape) != expected:
-        raise ValueError(f"motion must have shape {expected}, not {tuple(motion.shape)}")
 
 
-def _values(ramp: Ramp, fields: Mapping[str, Array], ids: Any, tensor: bool) -> Any:
-    """The values of a ramp's field, of the kind of the ids."""
-    if ramp.field not in fields:
-        raise ValueError(f"the color of element {ramp.id} follows the field {ramp.field}, which is missing")
-    values = fields[ramp.field] if tensor else np.asarray(fields[ramp.field]).astype(ramp.starts.dtype)
-    if tuple(values.shape) != tuple(ids.shape):
-        raise ValueError(f"{ramp.field} must have shape {tuple(ids.shape)}, not {tuple(values.shape)}")
-    return values
+def _check_shape(name: str, values: NDArray[Any], expected: tuple[int, ...]) -> None:
+    if values.shape != expected:
+        raise ValueError(f"{name} must have shape {expected}, not {values.shape}")
 
 
 def _table(colors: Colors) -> NDArray[np.uint8]:

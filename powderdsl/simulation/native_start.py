@@ -23,7 +23,8 @@ from powderdsl.targets.cpp.build import cache_key, current
 from powderdsl.targets.cpp.code import NativeCode, compile_program, recall, remember
 from powderdsl.targets.cpp.compilers import find_compiler, flags_for
 from powderdsl.targets.cpp.program import NativeProgram
-from powderdsl.targets.torch.mixed import Part, mixed_program
+from powderdsl.targets.job import Runnable
+from powderdsl.targets.torch.mixed import mixed_program
 
 Lowered = Callable[[], Program]
 """Gives a ruleset in IR; the work is done when it is first called."""
@@ -51,13 +52,13 @@ def generator() -> str:
     return found.hexdigest()
 
 
-def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Part | None:
+def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable | None:
     """A program that has been compiled before, None if there is none. Raises NoCompiler if none could be made."""
     code = recall(start_key(ruleset))
     return None if code is None else _whole(code, lowered, threads)
 
 
-def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Part:
+def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable:
     """A program compiled unless it has been before; passes that planes cannot carry run on cells.
 
     Raises:
@@ -81,7 +82,7 @@ def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Part:
         )
 
 
-def _whole(code: NativeCode, lowered: Lowered, threads: int) -> Part:
+def _whole(code: NativeCode, lowered: Lowered, threads: int) -> Runnable:
     def with_clocks() -> NativeCode:
         (whole,) = segments(lowered())
         assert whole.planes is not None
@@ -90,6 +91,6 @@ def _whole(code: NativeCode, lowered: Lowered, threads: int) -> Part:
     return NativeProgram(code, threads, with_clocks)
 
 
-def _compiled(cells: Program, planes: Program, threads: int) -> Part:
+def _compiled(cells: Program, planes: Program, threads: int) -> Runnable:
     code = compile_program(cells, planes)
     return NativeProgram(code, threads, lambda: compile_program(cells, planes, clocks=True))

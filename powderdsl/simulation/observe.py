@@ -1,8 +1,13 @@
-"""Ways out of a world: fields, pictures, the paper's matrix, packed planes, each written into a given buffer or a new one."""
+"""What worlds show: fields, pictures, the paper's matrix, packed planes, each written into a given buffer or a new one.
+
+Worlds that are packed in native memory are read from there; all others are tensors. Nothing waits for a GPU.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,26 +16,31 @@ from torch import Tensor
 
 from powderdsl.diagnostics import suggest
 from powderdsl.ir.gates import width as width_of
-from powderdsl.ir.lower.rules import plane_type
-from powderdsl.ir.ops import Type
+from powderdsl.ir.lower.rules import plane_names, plane_type
+from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, slot_name, slots, storage
 from powderdsl.model.types import MatrixChannel, Property, Ruleset
-from powderdsl.simulation.draw import palette, ramps
-from powderdsl.simulation.views import (
-    Channel,
-    PlaneName,
-    RampTable,
-    State,
-    code_values,
-    shape_of,
-    write_channels,
-    write_codes,
-    write_planes,
-    write_ramp,
-    write_rgb,
-    write_slot,
-)
-from powderdsl.targets.words import word_count
+from powderdsl.simulation.draw import Ramp, palette, ramps
+from powderdsl.targets.cpp.program import PackedState, address
+from powderdsl.targets.words import pack, word_count
+
+State = Mapping[str, Tensor]
+
+SHIFT = 20
+"""Low bits of a float32 that a code of `compact` drops: three bits of the mantissa remain."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Where one channel of cells in float32 comes from.
+
+    `kind` is ``zero``; ``one_hot``, 1 where the slot has the number `value`; ``table``, entry `value` of the tables at
+    the slot's number; or ``slot``, the slot's value. Components of vectors have slots of their own: ``name.row``.
+    """
+
+    kind: str
+    slot: str = ""
+    value: int = 0
 
 
 class Observer:
@@ -46,76 +56,73 @@ class Observer:
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._tables: dict[str, Tensor] = {}
 
+    @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
         """A field or property: what `World.__getitem__` returns, or a copy of it in `out`.
 
         Raises:
-            KeyError: for a name that the ruleset does not have. ValueError, TypeError: a buffer that does not fit.
+            KeyError: the ruleset has no such name. ValueError, TypeError: the buffer does not fit.
         """
         name = slot_name(self.ruleset, name)
-        if name in self.slots:
+        slot, prop = self.slots.get(name), self.ruleset.property(name)
+        batch, height, width = shape_of(state)
+        if slot is not None:
             if out is None:
                 return state[name]
-            slot = self.slots[name]
-            batch, height, width = shape_of(state)
             shape = (batch, 2, height, width) if slot.planes == 2 else (batch, height, width)
-            self._check(out, shape, getattr(torch, slot.dtype))
-            with torch.no_grad():
-                write_slot(state, name, out)
-            return out
-        prop = self.ruleset.property(name)
+            return _write_slot(state, name, self._buffer(out, shape, getattr(torch, slot.dtype)))
         if prop is None:
             known = [*self.slots, *(p.name for p in self.ruleset.properties)]
             raise KeyError(
                 f"{self.ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}"
             )
-        out = self._buffer(out, shape_of(state), _dtype(prop))
-        with torch.no_grad():
-            out.copy_(self.table(name)[state["element"].int()])
-        return out
+        out = self._buffer(out, (batch, height, width), _dtype(prop))
+        return out.copy_(self.table(name)[state["element"].int()])
 
+    @torch.no_grad()
     def rgb(self, state: State, out: Any = None) -> Tensor:
         """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields."""
         out = self._buffer(out, (*shape_of(state), 3), torch.uint8)
-        with torch.no_grad():
-            write_rgb(state, self._palette, out)
-            for ramp in self._ramps:
-                write_ramp(state, ramp, out)
+        _write_rgb(state, self._palette, out)
+        for ramp in self._ramps:
+            _write_ramp(state, ramp, out)
         return out
 
+    @torch.no_grad()
     def matrix(self, state: State, out: Any = None) -> Tensor:
         """Channels float32 [B, C, H, W], as the ruleset's `matrix:` names them."""
         batch, height, width = shape_of(state)
         channels, tables = self._channels
         out = self._buffer(out, (batch, len(channels), height, width), torch.float32)
-        with torch.no_grad():
-            write_channels(state, channels, tables, out)
+        _write_channels(state, channels, tables, out)
         return out
 
+    @torch.no_grad()
     def compact(self, state: State, out: Any = None) -> Tensor:
-        """Everything that lasts from step to step, in small numbers: uint8 [B, C, H, W], C those of `compact_names`."""
+        """Everything that lasts from step to step, as bytes: uint8 [B, C, H, W], C those of `compact_names`."""
         batch, height, width = shape_of(state)
-        out = self._buffer(out, (batch, len(self.compact_names), height, width), torch.uint8)
-        with torch.no_grad():
-            at = 0
-            for slot in self._lasting:
-                for part in _parts(slot):
-                    write_codes(state, slot, part, self._floor(slot), out[:, at])
-                    at += 1
+        out = self._buffer(out, (batch, len(self._coded), height, width), torch.uint8)
+        for at, (name, slot) in enumerate(self._coded):
+            _write_codes(state, slot, name, out[:, at])
+        return out
+
+    @torch.no_grad()
+    def planes(self, state: State, out: Any = None) -> Tensor:
+        """Packed planes int64 [B, P, H, ⌈W/64⌉], in the order of `plane_names`."""
+        batch, height, width = shape_of(state)
+        out = self._buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
+        _write_planes(state, self._bits, out)
         return out
 
     @cached_property
     def compact_names(self) -> tuple[str, ...]:
         """What the channels of `compact` are: ``element``, fields by name, ``name.row`` and ``name.column``."""
-        return tuple(
-            f"{slot.name}.{part}" if part else slot.name for slot in self._lasting for part in _parts(slot)
-        )
+        return tuple(name for name, _ in self._coded)
 
     @cached_property
     def compact_values(self) -> Tensor:
         """What the numbers of `compact` stand for: float32 [C, 256]."""
-        rows = [code_values(slot, self._floor(slot)) for slot in self._lasting for _ in _parts(slot)]
-        return torch.stack(rows).to(self.device)
+        return torch.stack([_code_values(slot) for _, slot in self._coded]).to(self.device)
 
     @cached_property
     def matrix_names(self) -> tuple[str, ...]:
@@ -124,8 +131,11 @@ class Observer:
 
     @cached_property
     def matrix_tables(self) -> tuple[tuple[int, ...], Tensor]:
-        """The channels of `matrix` from those of `compact`: the channel that each is read from, and float32 [n, 256],
-        what it is where that channel has a number. Fields that do not last read as 0."""
+        """How the channels of `matrix` follow from those of `compact`.
+
+        For each channel, the number of the channel that it is read from; and float32 [n, 256], its value for each
+        byte there. Fields that do not last read as 0.
+        """
         channels, tables = self._channels
         sources, rows = [], []
         for channel in channels:
@@ -141,23 +151,12 @@ class Observer:
             rows.append(row)
         return tuple(sources), torch.stack(rows)
 
-    @cached_property
-    def _lasting(self) -> tuple[Slot, ...]:
-        """The slots that a step does not restart."""
-        return tuple(slot for slot in self.slots.values() if not slot.resets)
-
-    def _floor(self, slot: Slot) -> float:
-        """Eight times the smallest step of a slot's codes: a power of two near 2⁻¹⁵ of its largest value."""
-        return 2.0 ** (math.ceil(math.log2(max(abs(slot.kind.lo), abs(slot.kind.hi), 1e-3))) - 15)
-
-    def planes(self, state: State, out: Any = None) -> Tensor:
-        """Packed planes int64 [B, P, H, ⌈W/64⌉], in the order of `plane_names`."""
-        batch, height, width = shape_of(state)
-        shape = (batch, len(self.planes_there), height, word_count(width))
-        out = self._buffer(out, shape, torch.int64)
-        with torch.no_grad():
-            write_planes(state, self.planes_there, out)
-        return out
+    @property
+    def plane_names(self) -> tuple[str, ...]:
+        """What each plane is: a flag's name, or ``name:bit`` for integers."""
+        return tuple(
+            name if self.slots[name].kind.name == "flag" else f"{name}:{bit}" for name, bit in self._bits
+        )
 
     def table(self, name: str) -> Tensor:
         """A property's values by id, parameters at their defaults: float64 [256]."""
@@ -171,38 +170,45 @@ class Observer:
         return self._tables[name]
 
     @cached_property
-    def planes_there(self) -> tuple[PlaneName, ...]:
-        """The planes of flags and integers, slot by slot, lowest bit first. Floats have none."""
-        return tuple(
-            PlaneName(slot.name, bit)
-            for slot in self.slots.values()
-            if not slot.is_real
-            for bit in range(_bits(plane_type(slot.kind, self.ruleset.slots)))
-        )
+    def _coded(self) -> tuple[tuple[str, Slot], ...]:
+        """The channels of `compact`: names, and the slots that they are codes of, which a step does not restart."""
+        lasting = [slot for slot in self.slots.values() if not slot.resets]
+        return tuple((name, slot) for slot in lasting for name in plane_names(slot))
 
-    @property
-    def plane_names(self) -> tuple[str, ...]:
-        """What each plane is: a flag's name, or ``name:bit`` for integers."""
-        flags = {slot.name for slot in self.slots.values() if slot.kind.name == "flag"}
-        return tuple(p.slot if p.slot in flags else f"{p.slot}:{p.bit}" for p in self.planes_there)
+    @cached_property
+    def _bits(self) -> tuple[tuple[str, int], ...]:
+        """The slot and bit of each plane: flags and integers, slot by slot, lowest bit first. Floats have none."""
+        found = []
+        for slot in self.slots.values():
+            if not slot.is_real:
+                type = plane_type(slot.kind, self.ruleset.slots)
+                count = 1 if type.name == "flag" else width_of(type.lo, type.hi)[0]
+                found += [(slot.name, bit) for bit in range(count)]
+        return tuple(found)
 
     @cached_property
     def _palette(self) -> Tensor:
         """uint8 [256, 4]: red, green, blue, nothing."""
-        colors = torch.from_numpy(palette(self.ruleset.elements))
-        table = torch.zeros(256, 4, dtype=torch.uint8)
-        table[: len(colors), :3] = colors
-        return table.to(self.device)
+        return self._colors(palette(self.ruleset.elements), 256)
 
     @cached_property
-    def _ramps(self) -> tuple[RampTable, ...]:
-        found = []
-        for ramp in ramps(self.ruleset.elements):
-            colors = torch.zeros(len(ramp.colors), 4, dtype=torch.uint8)
-            colors[:, :3] = torch.from_numpy(ramp.colors)
-            starts = torch.from_numpy(ramp.starts).to(self.device)
-            found.append(RampTable(ramp.id, ramp.field, starts, colors.to(self.device)))
-        return tuple(found)
+    def _ramps(self) -> tuple[Ramp, ...]:
+        """As tensors, with four bytes a color."""
+        found = ramps(self.ruleset.elements)
+        return tuple(
+            replace(
+                ramp,
+                starts=torch.from_numpy(ramp.starts).to(self.device),
+                colors=self._colors(ramp.colors, len(ramp.colors)),
+            )
+            for ramp in found
+        )
+
+    def _colors(self, colors: Any, count: int) -> Tensor:
+        """Colors uint8 [n, 3] with a fourth byte, and black up to `count` of them."""
+        table = torch.zeros(count, 4, dtype=torch.uint8)
+        table[: len(colors), :3] = torch.from_numpy(colors)
+        return table.to(self.device)
 
     @cached_property
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:
@@ -224,14 +230,9 @@ class Observer:
         return Channel("table", "element", len(tables) - 1)
 
     def _buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """The buffer that was given, or a new one."""
+        """The given buffer, if it fits, or a new one."""
         if out is None:
             return torch.empty(shape, dtype=dtype, device=self.device)
-        self._check(out, shape, dtype)
-        tensor: Tensor = out
-        return tensor
-
-    def _check(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> None:
         if not isinstance(out, Tensor):
             raise TypeError(f"out must be a torch tensor, found {type(out).__name__}")
         if tuple(out.shape) != shape:
@@ -244,18 +245,154 @@ class Observer:
             raise ValueError(
                 f"each world of out must be contiguous, and worlds apart; found the strides {list(out.stride())}"
             )
+        return out
 
 
-def _parts(slot: Slot) -> tuple[str, ...]:
-    return ("row", "column") if slot.planes == 2 else ("",)
+def shape_of(state: State) -> tuple[int, int, int]:
+    """(worlds, rows, columns), without unpacking anything."""
+    batch, height, width = (
+        state.like["element"][1] if isinstance(state, PackedState) else state["element"].shape
+    )
+    return batch, height, width
 
 
-def _bits(type: Type) -> int:
-    return 1 if type.name == "flag" else width_of(type.lo, type.hi)[0]
+def _write_slot(state: State, name: str, out: Tensor) -> Tensor:
+    """Write a slot in its storage dtype; returns `out`."""
+    if isinstance(state, PackedState) and not state.has(name):
+        return state.write(name, out)
+    return out.copy_(state[name])
+
+
+def _write_rgb(state: State, colors: Tensor, out: Tensor) -> None:
+    """Write the elements' colors uint8 [B, H, W, 3]. `colors` is uint8 [256, 4]."""
+    if isinstance(state, PackedState):
+        slot, bits, _ = state.program.planes_of("element")
+        state.program.library.pd_rgb(state.handle, slot, bits, address(colors), address(out), out.stride(0))
+    else:
+        ids = state["element"].flatten().int()
+        out.copy_(colors[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
+
+
+def _write_ramp(state: State, ramp: Ramp, out: Tensor) -> None:
+    """Color the cells of a ramp's element in pictures uint8 [B, H, W, 3]; others stay."""
+    if isinstance(state, PackedState):
+        program = state.program
+        slot, bits, _ = program.planes_of("element")
+        real = ramp.starts.dtype == torch.float32
+        field = (program.layout.reals[ramp.field], 0, False) if real else program.planes_of(ramp.field)
+        program.library.pd_ramp(
+            state.handle, slot, bits, ramp.id, int(real), field[0], field[1], int(field[2]), len(ramp.starts),
+            address(ramp.starts), address(ramp.colors), address(out), out.stride(0),
+        )  # fmt: skip
+        return
+    reached = torch.bucketize(state[ramp.field].to(ramp.starts.dtype), ramp.starts, right=True)
+    cells = (state["element"] == ramp.id)[..., None]
+    torch.where(cells, ramp.colors[:, :3][reached], out, out=out)
+
+
+def _write_channels(state: State, channels: Sequence[Channel], tables: Tensor, out: Tensor) -> None:
+    """Write channels float32 [B, C, H, W]. `tables` is float32 [n, 256]."""
+    if isinstance(state, PackedState):
+        wanted = torch.tensor([_native_channel(c, state) for c in channels], dtype=torch.int32)
+        state.program.library.pd_channels(
+            state.handle, len(channels), address(wanted), address(tables), address(out), out.stride(0)
+        )
+        return
+    at = 0
+    while at < len(channels):
+        channel, end = channels[at], at + 1
+        if channel.kind == "one_hot":  # consecutive numbers together
+            while end < len(channels) and channels[end] == replace(channel, value=channel.value + end - at):
+                end += 1
+            numbers = torch.arange(
+                channel.value, channel.value + end - at, device=out.device, dtype=torch.uint8
+            )
+            out[:, at:end] = state[channel.slot][:, None] == numbers[:, None, None]
+        elif channel.kind == "table":
+            out[:, at] = tables[channel.value][state[channel.slot].int()]
+        elif channel.kind == "slot":
+            out[:, at] = _component(state, channel.slot)
+        else:
+            out[:, at] = 0
+        at = end
+
+
+def _component(state: State, name: str) -> Tensor:
+    """A slot [B, H, W], or one component of a vector."""
+    vector, component = component_of(name)
+    return state[name] if component is None else state[vector][:, component]
+
+
+def _native_channel(channel: Channel, state: PackedState) -> tuple[int, int, int, int]:
+    """A channel as native code has it: kind, first plane or float slot, planes, value."""
+    program = state.program
+    if channel.kind == "zero":
+        return 0, 0, 0, 0
+    if channel.slot in program.layout.reals:
+        return 4, program.layout.reals[channel.slot], 0, 0
+    slot, bits, signed = program.planes_of(channel.slot)
+    if channel.kind == "slot":
+        return 3, slot, bits, int(signed)
+    return (1 if channel.kind == "one_hot" else 2), slot, bits, channel.value
+
+
+def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
+    """Write the codes uint8 [B, H, W] of a slot, or of its component `name`: see `_code_values`."""
+    if _is_small(slot):
+        _write_slot(state, slot.name, out.view(getattr(torch, slot.dtype)))
+        if slot.kind.lo:
+            out -= int(slot.kind.lo) & 255  # in eight bits, that is +
+        return
+    floor = _floor(slot)
+    if isinstance(state, PackedState) and slot.dtype == "float32" and not state.has(slot.name):
+        program = state.program
+        program.library.pd_codes(state.handle, program.layout.reals[name], floor, address(out), out.stride(0))
+    else:
+        value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
+        one = torch.tensor(floor, device=out.device).view(torch.int32)
+        size = ((value.abs() + floor).view(torch.int32) - one + (1 << (SHIFT - 1))) >> SHIFT
+        out.copy_(128 + torch.where(value < 0, -size, size))
+
+
+def _code_values(slot: Slot) -> Tensor:
+    """What each of the 256 codes of a slot stands for: float32 [256].
+
+    Integers in a range of at most 256 are counted from the lowest. Others have a sign and a size: code 128 is 0,
+    and 128 ± n is ±(x − `_floor`), where x grows by an eighth of a power of two with each n: steps of an eighth of the
+    floor near 0, and of an eighth of the value, at most, far from it.
+    """
+    if _is_small(slot):
+        return torch.arange(256, dtype=torch.float32) + float(slot.kind.lo)
+    floor = _floor(slot)
+    one = torch.tensor(floor).view(torch.int32)
+    signed = torch.arange(256, dtype=torch.int32) - 128
+    size = (one + (signed.abs() << SHIFT)).to(torch.int32).view(torch.float32) - floor
+    return torch.where(signed < 0, -size, size)
+
+
+def _floor(slot: Slot) -> float:
+    """Eight times the smallest step of a slot's codes: a power of two near 2⁻¹⁵ of its largest value."""
+    return 2.0 ** (math.ceil(math.log2(max(abs(slot.kind.lo), abs(slot.kind.hi), 1e-3))) - 15)
+
+
+def _is_small(slot: Slot) -> bool:
+    """Whether eight bits hold every value."""
+    return slot.dtype in ("uint8", "int8")
+
+
+def _write_planes(state: State, names: Sequence[tuple[str, int]], out: Tensor) -> None:
+    """Write packed planes int64 [B, P, H, ⌈W/64⌉], slots and bits by `names`; bits beyond the width are zero."""
+    if isinstance(state, PackedState):
+        program = state.program
+        slots = torch.tensor([program.planes_of(name)[0] + bit for name, bit in names], dtype=torch.int32)
+        program.library.pd_planes(state.handle, len(names), address(slots), address(out), out.stride(0))
+        return
+    for i, (name, bit) in enumerate(names):
+        out[:, i] = pack((state[name] >> bit) & 1 != 0)
 
 
 def _dtype(prop: Property) -> torch.dtype:
-    """In which a property is read."""
+    """The dtype in which a property is read."""
     if prop.kind.name == "chance":
         return torch.float32
     if prop.kind.name == "int":

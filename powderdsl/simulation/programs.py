@@ -1,30 +1,22 @@
-"""Backends by name: what each makes of a checked model. All of them run the same signature (`Runnable`)."""
+"""Backends by name: makes the program of a checked model, a `Runnable`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from functools import cache
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from powderdsl.compiler import lower, starting_backend
-from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
 from powderdsl.model import reference
 from powderdsl.model.types import Ruleset
-from powderdsl.targets.job import Job
+from powderdsl.system.writing import failure
+from powderdsl.targets.job import Job, Runnable
 from powderdsl.targets.laps import Laps, profile_of, unwatched
-
-
-class Runnable(Protocol):
-    """A ruleset made executable."""
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        ...
 
 
 class ReferenceProgram:
@@ -72,40 +64,13 @@ def find_device(name: str | torch.device) -> torch.device:
             raise RuntimeError("a meta device has shapes and no values")
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError, NotImplementedError, TypeError, ValueError, ImportError) as error:
-        reporter = Reporter()
         problem = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        reporter.error("PD701", f"no device `{name}`", None, notes=[problem], helps=["run on `cpu`"])
-        raise CompileError(reporter.diagnostics) from None
+        raise failure("PD701", f"no device `{name}`", notes=(problem,), helps=("run on `cpu`",)) from None
     return device
 
 
-class StartingProgram:
-    """What runs at once, without a compiler: `arrays` on the CPU, `torch` on other devices. Made when first needed."""
-
-    def __init__(self, program: Program, device: torch.device):
-        self.program = program
-        self.device = device
-        self.running = starting_backend(device.type)
-        self._made: Runnable | None = None
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        return self.made().run(job)
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps`."""
-        return profile_of(self.made(), job)
-
-    def made(self) -> Runnable:
-        """The program."""
-        if self._made is None:
-            make = _array_program if self.running == "arrays" else _torch_program
-            self._made = make(self.program, self.device)
-        return self._made
-
-
 class CompiledProgram:
-    """Native code or kernels for whole steps; what starts at once where draws are given or passes chosen."""
+    """Native code or kernels for whole steps; the program without a compiler where draws are given or passes chosen."""
 
     def __init__(self, native: Runnable, rest: Callable[[], Runnable], running: str = "native"):
         self._native, self._rest, self.running = native, rest, running
@@ -130,7 +95,8 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         return ReferenceProgram(ruleset)
     # Both are made when first needed: code that was compiled before needs neither.
     lowered = cache(lambda: lower(ruleset))
-    starting = cache(lambda: StartingProgram(lowered(), device))
+    begin = _array_program if starting_backend(device.type) == "arrays" else _torch_program
+    starting = cache(lambda: begin(lowered(), device))
     if backend == "torch":
         return _torch_program(lowered(), device)
     if backend == "arrays":
@@ -146,11 +112,14 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         from powderdsl.simulation.auto import AutoProgram
         from powderdsl.simulation.native_start import native_program, ready_program
 
-        return AutoProgram(
+        program = AutoProgram(
             starting,
             lambda: ready_program(ruleset, lowered, threads),
             lambda: native_program(ruleset, lowered, threads),
         )
+        if program.running == "arrays":
+            lowered()  # what cannot be lowered is reported before the first step
+        return program
     return starting()
 
 
@@ -166,8 +135,8 @@ def _array_program(program: Program, device: torch.device) -> Runnable:
     from powderdsl.targets.torch.mixed import packed_program
 
     if device.type != "cpu":
-        helps = [f"run on the device `cpu`, or on the backend `torch` or `auto` on `{device}`"]
-        raise _refusal("arrays", "NumPy's arrays are in the memory of the CPU", helps)
+        problem = "NumPy's arrays are in the memory of the CPU"
+        raise _refusal("arrays", problem, _ELSEWHERE.format(device))
     return packed_program(program, device, ArrayProgram)
 
 
@@ -180,15 +149,15 @@ def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.devi
             return native_program(ruleset, lowered, threads)
         except NoCompiler as error:
             problem = str(error)
-        helps = [f"run on the backend `arrays`, or {CURE}"]
+            help = f"run on the backend `arrays`, or {CURE}"
     else:
-        problem = "native code runs on the CPU"
-        helps = [f"run on the device `cpu`, or on the backend `torch` or `auto` on `{device}`"]
-    raise _refusal("native", problem, helps)
+        problem, help = "native code runs on the CPU", _ELSEWHERE.format(device)
+    raise _refusal("native", problem, help)
 
 
-def _refusal(backend: str, problem: str, helps: list[str]) -> CompileError:
-    reporter = Reporter()
+_ELSEWHERE = "run on the device `cpu`, or on the backend `torch` or `auto` on `{}`"
+
+
+def _refusal(backend: str, problem: str, help: str) -> CompileError:
     message = f"the {backend} backend is not available"
-    reporter.error("PD701", message, None, notes=problem.splitlines(), helps=helps)
-    return CompileError(reporter.diagnostics)
+    return failure("PD701", message, notes=tuple(problem.splitlines()), helps=(help,))

@@ -14,14 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import BACKENDS, current_backend, load
-from powderdsl.diagnostics import CompileError, Reporter, suggest
+from powderdsl.compiler import BACKENDS, current_backend, load, starting_backend
+from powderdsl.diagnostics import suggest
 from powderdsl.model.state import Slot
 from powderdsl.model.types import Ruleset
 from powderdsl.model.world_sides import check_sides
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.programs import find_device, make_program
 from powderdsl.simulation.state_checks import check_ids, checked_integers, checked_reals, looked_up
+from powderdsl.system.writing import failure
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import profile_of
 
@@ -58,7 +59,7 @@ class World:
 
     def __getitem__(self, name: str) -> Tensor:
         """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""
-        return self.sim.read(self, name)
+        return self.read(name)
 
     def select(self, worlds: int | slice | Sequence[int] | Tensor) -> World:
         """Some worlds of the batch, with their random futures unchanged."""
@@ -67,24 +68,36 @@ class World:
         return replace(self, state=chosen, seed=self.seed[keys], index=self.index[keys], step=self.step[keys])
 
     def read(self, name: str, out: Tensor | None = None) -> Tensor:
-        """`world[name]`, written into `out`. This and the methods below are those of `Simulator`."""
-        return self.sim.read(self, name, out)
+        """`world[name]`, written into `out`.
+
+        Args:
+            out: written to and returned, instead of a new tensor or the world's own: of the same shape, dtype and
+                device, each of its worlds contiguous. The methods below take one too.
+
+        Raises:
+            KeyError: an unknown name. TypeError, ValueError: `out` is not a tensor, or does not fit.
+        """
+        return self.sim.observer.read(self.state, name, out)
 
     def matrix(self, out: Tensor | None = None) -> Tensor:
         """All channels of the ruleset's `matrix:` as float32 [B, C, H, W]: elements one-hot, then fields."""
-        return self.sim.matrix(self, out)
+        return self.sim.observer.matrix(self.state, out)
 
     def rgb(self, out: Tensor | None = None) -> Tensor:
-        """Pictures, a pixel a cell: uint8 [B, H, W, 3]."""
-        return self.sim.rgb(self, out)
+        """Pictures in the elements' colors, a pixel a cell: uint8 [B, H, W, 3]."""
+        return self.sim.observer.rgb(self.state, out)
 
     def compact(self, out: Tensor | None = None) -> Tensor:
         """All that lasts, in small numbers: uint8 [B, C, H, W]; `sim.observer.compact_names` says what they are."""
         return self.sim.observer.compact(self.state, out)
 
     def planes(self, out: Tensor | None = None) -> Tensor:
-        """The packed planes int64 [B, P, H, ⌈W/64⌉]; `Simulator.plane_names` says what they are."""
-        return self.sim.planes(self, out)
+        """Flags and integers in bits: int64 [B, P, H, ⌈W/64⌉].
+
+        Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of
+        `Simulator.plane_names`. Fields of floats have none: `read` them.
+        """
+        return self.sim.observer.planes(self.state, out)
 
 
 class Simulator:
@@ -104,7 +117,8 @@ class Simulator:
     @property
     def running(self) -> str:
         """The backend that the next step runs on: for ``auto`` on the CPU, ``arrays`` or ``native``."""
-        return str(getattr(self._program, "running", self.backend))
+        at_once = starting_backend(self.device.type) if self.backend == "auto" else self.backend
+        return str(getattr(self._program, "running", at_once))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -147,19 +161,17 @@ class Simulator:
         check_sides(self.ruleset, (int(tensor.shape[1]), int(tensor.shape[2])))
         if tensor.numel() > MAX_CELLS:
             raise ValueError(f"{tensor.numel():,} cells are more than {MAX_CELLS:,}")
-        self._check_ids(tensor, "ids")
+        check_ids(tensor, self._known, "ids", self.ruleset)
         element = tensor.to(torch.uint8)
         batch = len(element)
-        one_seed = (not isinstance(seed, Tensor) and not hasattr(seed, "__len__")) or getattr(
-            seed, "ndim", 1
-        ) == 0
+        seeds = self._integers(seed, "seed")
         if index is None:
-            index = range(batch) if one_seed else [0] * batch
+            index = range(batch) if seeds.ndim == 0 else [0] * batch
         return World(
             self,
             {name: self._fresh(slot, element) for name, slot in self._slots.items()},
-            self._numbers(seed, "seed", batch),
-            self._numbers(index, "index", batch),
+            self._numbers(seeds, "seed", batch),
+            self._numbers(self._integers(index, "index"), "index", batch),
             torch.zeros(batch, dtype=torch.int64, device=self.device),
         )
 
@@ -173,6 +185,13 @@ class Simulator:
             return looked_up(self.observer.table(prop.name), ids, dtype)
         values = torch.tensor([slot.fresh(i) for i in range(256)], dtype=dtype, device=self.device)
         return looked_up(values, ids, dtype)
+
+    def _renewed(self, state: Mapping[str, Tensor], ids: Tensor, cells: Tensor) -> dict[str, Tensor]:
+        """A state with fresh cells of the elements `ids`, uint8 [B, H, W], where `cells` is set."""
+        return {
+            name: _where(slot, cells, self._fresh(slot, ids), state[name]) if slot.travels else state[name]
+            for name, slot in self._slots.items()
+        }
 
     def _tensor(self, value: Any, name: str) -> Tensor:
         flags = getattr(value, "flags", None)
@@ -189,8 +208,9 @@ class Simulator:
             raise TypeError(f"{name} must be integers, found {tensor.dtype}")
         return tensor
 
-    def _numbers(self, value: Any, name: str, batch: int) -> Tensor:
-        tensor = self._integers(list(value) if isinstance(value, range) else value, name).to(torch.int64)
+    def _numbers(self, tensor: Tensor, name: str, batch: int) -> Tensor:
+        """Integers of 0 or more, one a world: int64 [B] in memory of their own."""
+        tensor = tensor.to(torch.int64)
         if tensor.ndim == 0:
             tensor = tensor.expand(batch)
         if tensor.shape != (batch,) or bool((tensor < 0).any()):
@@ -199,38 +219,7 @@ class Simulator:
             )
         return tensor.clone()
 
-    def _check_ids(self, ids: Tensor, name: str) -> None:
-        check_ids(ids, self._known, name, self.ruleset)
-
     # Reading and changing worlds
-
-    def read(self, world: World, name: str, out: Tensor | None = None) -> Tensor:
-        """What `World.__getitem__` returns.
-
-        Args:
-            out: written to and returned, instead of a new tensor or the world's own: of the same shape, dtype and
-                device, each of its worlds contiguous. `matrix`, `rgb` and `planes` take one too.
-
-        Raises:
-            KeyError: an unknown name. TypeError, ValueError: `out` is not a tensor, or does not fit.
-        """
-        return self.observer.read(world.state, name, out)
-
-    def matrix(self, world: World, out: Tensor | None = None) -> Tensor:
-        """What `World.matrix` returns."""
-        return self.observer.matrix(world.state, out)
-
-    def rgb(self, world: World, out: Tensor | None = None) -> Tensor:
-        """Pictures uint8 [B, H, W, 3] in the elements' colors, a pixel a cell."""
-        return self.observer.rgb(world.state, out)
-
-    def planes(self, world: World, out: Tensor | None = None) -> Tensor:
-        """Flags and integers in bits: int64 [B, P, H, ⌈W/64⌉].
-
-        Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of `plane_names`.
-        Real fields have none: `read` them.
-        """
-        return self.observer.planes(world.state, out)
 
     @property
     def plane_names(self) -> tuple[str, ...]:
@@ -251,20 +240,14 @@ class Simulator:
         if "ids" in fields or "element" in fields:
             given = fields.pop("ids", None) if "ids" in fields else fields.pop("element")
             ids = self._shaped(self._integers(given, "ids"), "ids", world.shape, False)
-            self._check_ids(ids, "ids")
+            check_ids(ids, self._known, "ids", self.ruleset)
             element = ids.to(torch.uint8)
-            fresh = self.world(element).state
-            changed = element != state["element"]
-            for name, slot in self._slots.items():
-                if slot.travels:
-                    state[name] = torch.where(
-                        changed[:, None] if slot.planes == 2 else changed, fresh[name], state[name]
-                    )
+            state = self._renewed(state, element, element != state["element"])
         for name, value in fields.items():
             if name not in self._slots:
                 prop = self.ruleset.property(name)
                 if prop is None:
-                    self.read(world, name)
+                    world.read(name)
                 if not torch.equal(
                     self._shaped(value, name, world.shape, False).double(),
                     self.observer.table(name)[state["element"].long()],
@@ -317,24 +300,15 @@ class Simulator:
                 raise KeyError(
                     f"no element `{element}`; {'; '.join(suggest(element, self.elements, 'elements'))}"
                 )
-            fresh = self.world(torch.full_like(world.ids, found.id)).state
-            state = {
-                name: torch.where(mask[:, None] if slot.planes == 2 else mask, fresh[name], world.state[name])
-                if slot.travels
-                else world.state[name]
-                for name, slot in self._slots.items()
-            }
-            world = replace(world, state=state)
+            element_ids = torch.full_like(world.ids, found.id)
+            world = replace(world, state=self._renewed(world.state, element_ids, mask))
         for name, value in fields.items():
             if name not in self._slots:
-                self.read(world, name)
+                world.read(name)
                 raise ValueError(f"`{name}` follows from the element: it cannot be painted")
             slot = self._slots[name]
-            old = world.state[name]
             new = self._shaped(value, name, world.shape, slot.planes == 2)
-            painted = torch.where(
-                mask[:, None] if slot.planes == 2 else mask, new.to(torch.float64), old.to(torch.float64)
-            )
+            painted = _where(slot, mask, new.to(torch.float64), world.state[name].to(torch.float64))
             world = self.replace(world, **{name: painted})
         return world
 
@@ -372,7 +346,7 @@ class Simulator:
                 raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
         if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
             raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
-        steps = _whole(steps, "steps")
+        steps = _count(steps, "steps")
         unknown = [name for name in passes or () if name not in self.passes]
         if unknown:
             raise KeyError(f"no pass `{unknown[0]}`; {'; '.join(suggest(unknown[0], self.passes, 'passes'))}")
@@ -389,7 +363,7 @@ class Simulator:
         Native code counts processor time on one thread, and is compiled once more for it.
         """
         clock = (world.seed, world.index, world.step)
-        job = Job(world.state, clock, _whole(steps, "steps"), self.parameters({}, len(world)), {}, None)
+        job = Job(world.state, clock, _count(steps, "steps"), self.parameters({}, len(world)), {}, None)
         seconds = profile_of(self._program, job)
         return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
@@ -433,7 +407,12 @@ class Simulator:
         return values
 
 
-def _whole(value: Any, name: str) -> int:
+def _where(slot: Slot, cells: Tensor, yes: Tensor, no: Tensor) -> Tensor:
+    """`torch.where` for the values of a slot, by cells bool [B, H, W]."""
+    return torch.where(cells[:, None] if slot.planes == 2 else cells, yes, no)
+
+
+def _count(value: Any, name: str) -> int:
     """An integer of 0 or more, Python's or NumPy's."""
     try:
         number = index(value)
@@ -463,7 +442,5 @@ def compile(
         raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
     backend = current_backend(backend)
     if backend not in BACKENDS:
-        reporter = Reporter()
-        reporter.error("PD701", f"no backend `{backend}`", None, helps=["backends: " + ", ".join(BACKENDS)])
-        raise CompileError(reporter.diagnostics)
+        raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
     return Simulator(model, backend, device, threads)

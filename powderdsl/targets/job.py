@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from torch import Tensor
 
@@ -27,3 +28,11 @@ class Job:
     passes: frozenset[str] | None
     reuse: bool = False
     """Whether `state` may be written to: nobody reads it afterwards."""
+
+
+class Runnable(Protocol):
+    """A ruleset, or some of its passes, made executable."""
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        ...

@@ -15,7 +15,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.bench.plan import make_plan
 from powderdsl.rl.config import check_config, from_json, preset
-from powderdsl.simulation.programs import StartingProgram, make_program
+from powderdsl.simulation.programs import make_program
 from powderdsl.targets.arrays.program import ArrayProgram
 from powderdsl.targets.torch.program import TorchProgram
 from tests.cli.commands import powderdsl as command
@@ -77,9 +77,7 @@ def test_what_runs_on_the_cpu_is_refused_elsewhere(backend: str) -> None:
 
 def test_other_devices_run_tensors() -> None:
     program = make_program(powderdsl.load("life"), "auto", torch.device("meta"))
-    assert isinstance(program, StartingProgram)
-    assert program.running == "torch"
-    assert type(program.made()) is TorchProgram
+    assert type(program) is TorchProgram
 
 
 def test_without_a_compiler_native_names_what_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:

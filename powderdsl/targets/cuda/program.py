@@ -14,8 +14,8 @@ from powderdsl.targets import words as torch_words
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda import build
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
-from powderdsl.targets.job import Job
-from powderdsl.targets.torch.mixed import Part, packed_program
+from powderdsl.targets.job import Job, Runnable
+from powderdsl.targets.torch.mixed import packed_program
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def worlds_of(arguments: Arguments) -> build.Worlds:
     return build.Worlds(*addresses, len(arguments.clock[0]), arguments.steps)
 
 
-def cuda_program(program: Program, device: torch.device) -> Part:
+def cuda_program(program: Program, device: torch.device) -> Runnable:
     """A program for a CUDA device; passes that planes cannot carry run on cells.
 
     Raises:

@@ -4,34 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Job, Runnable
 from powderdsl.targets.laps import profile_of
 from powderdsl.targets.torch.program import TorchProgram
 
-
-class Part(Protocol):
-    """Some passes of a ruleset made executable."""
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        ...
-
-
-MakePacked = Callable[[Program, Program], Part]
+MakePacked = Callable[[Program, Program], Runnable]
 """Makes a part of a program on numbers and the same on planes."""
 
 
 class MixedProgram:
     """Parts that take turns. The state goes from one to the next whole, unpacked and packed again on the way."""
 
-    def __init__(self, parts: Sequence[Part]):
+    def __init__(self, parts: Sequence[Runnable]):
         self.parts = tuple(parts)
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
@@ -57,12 +47,12 @@ class MixedProgram:
         return seconds
 
 
-def packed_program(program: Program, device: torch.device, make: MakePacked) -> Part:
+def packed_program(program: Program, device: torch.device, make: MakePacked) -> Runnable:
     """A program on planes by `make`, except for the passes that planes cannot carry."""
     return mixed_program(segments(program), device, make)
 
 
-def mixed_program(found: Sequence[Segment], device: torch.device, make: MakePacked) -> Part:
+def mixed_program(found: Sequence[Segment], device: torch.device, make: MakePacked) -> Runnable:
     """The program of some segments; that of a single one as it is."""
     parts = [
         TorchProgram(one.program, device) if one.planes is None else make(one.program, one.planes)
