@@ -60,7 +60,7 @@ def integer(lo: float, hi: float) -> Kind:
 
 @dataclass(frozen=True)
 class Expr:
-    """A typed expression. `op` is one of `OPS`; `value` is what the operation needs besides its arguments."""
+    """A typed expression. `op` is one of `operations.OPS`; `value` is what the operation needs besides its arguments."""
 
     op: str
     kind: Kind
@@ -73,48 +73,6 @@ class Expr:
         yield self
         for arg in self.args:
             yield from arg.walk()
-
-
-OPS: dict[str, str] = {
-    "const": "value: the constant",
-    "param": "value: the parameter's qualified name",
-    "element": "the element of this cell",
-    "property": "value: the property's name, as this cell's element has it (or as the cell overrides it)",
-    "field": "value: the field's name, or a pass's scratch field",
-    "let": "value: the name of a value fixed earlier in the pass",
-    "draw": "value: the stream's name; a number strictly between 0 and 1",
-    "coordinate": "value: (row, column or step, modulus)",
-    "inside": "value: offset; whether that neighbor lies inside the grid",
-    "look": "value: offset; the argument as it is at that neighbor (the grid wraps around)",
-    "member": "value: frozen set of ids; whether the argument is one of them",
-    "not": "",
-    "and": "",
-    "or": "",
-    "eq": "",
-    "lt": "",
-    "le": "",
-    "add": "",
-    "sub": "",
-    "mul": "",
-    "div": "real division; x / 0 is 0",
-    "quotient": "integer division, rounded down; x div 0 is 0",
-    "neg": "",
-    "abs": "",
-    "min": "",
-    "max": "",
-    "mod": "value: the modulus, an integer above 0",
-    "to_real": "an int, flag or chance as float32; a draw rounded to float32",
-    "count": "value: kernel; weighted number of neighborhood cells where the argument holds",
-    "sum": "value: kernel; weighted sum of the argument, within a row from the left, then the rows from the top",
-    "choose": "condition, value if it holds, value otherwise",
-    "octant": "the direction a vec2 points to",
-    "opposite": "the direction the other way",
-    "length": "√(y² + x²) in float32",
-    "row_part": "the first component of a vec2",
-    "column_part": "the second component of a vec2",
-    "vector": "a vec2 from its two components",
-}
-"""Every operation of the model, and what its `value` is."""
 
 
 @dataclass(frozen=True)

@@ -161,7 +161,7 @@ class Measure:
 class Goal:
     """What counts. `each` is given after every action, `final` with the last; conditions end an episode early.
 
-    Each is arithmetic on one number a world: the arithmetic, comparisons and logic of `model.types.OPS`, and
+    Each is arithmetic on one number a world: the arithmetic, comparisons and logic of `model.operations.OPS`, and
     ``measure`` (value: Measure), ``action`` (value: ``taken``, ``left``, ``painted``, ``blown``, ``placed``), ``start``
     and ``before`` (the argument at the start, and after the previous action). Conditions are 0 or 1; x / 0 is 0; ``mod``
     has two arguments.

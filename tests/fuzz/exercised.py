@@ -11,8 +11,9 @@ from powderdsl.ir.ops import OPS as IR_OPS
 from powderdsl.ir.ops import Node, Program, nodes_of, walk
 from powderdsl.ir.segments import segments
 from powderdsl.model.builtins import COORDINATES, DIRECTION_SETS, DIRECTIONS, FUNCTIONS, KERNELS, KIND_WORDS
+from powderdsl.model.operations import OPS
 from powderdsl.model.schema import KEYS, PREFIXES
-from powderdsl.model.types import OPS, Assign, Expr, Ruleset
+from powderdsl.model.types import Assign, Expr, Ruleset
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_text, parser
 from powderdsl.syntax.yaml_tree import Mapping, Scalar, Sequence, parse_yaml

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from itertools import islice
 
 from powderdsl.model.expressions.operands import TRUE, conjunction, disjunction, look
+from powderdsl.model.operations import OPS
 from powderdsl.model.types import FLAG, Expr
 
 MAX_PARTS = 64
@@ -46,21 +47,5 @@ def _follows(expr: Expr, follow: Mapping[str, Expr]) -> Expr:
 
 
 _COORDINATES = frozenset(
-    (
-        "const",
-        "coordinate",
-        "not",
-        "and",
-        "or",
-        "eq",
-        "lt",
-        "le",
-        "add",
-        "sub",
-        "mul",
-        "quotient",
-        "neg",
-        "abs",
-        "mod",
-    )
+    ("const", "coordinate", "and", "or", *(name for name, row in OPS.items() if row.evaluate))
 )

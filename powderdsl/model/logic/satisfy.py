@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from powderdsl.model.logic.budget import QUESTION, Budget, Exhausted
+from powderdsl.model.operations import OPS, Bounds
 from powderdsl.model.types import Expr, Offset, Property
 
 Key = tuple[str, object, Offset]
 Assignment = dict[Key, object]
-Bounds = tuple[Any, Any]
 
 MAX_DOMAIN = 256
 MAX_LET = 150
@@ -336,7 +336,12 @@ class Search:
             case _ if _is_opaque(node):
                 return self._span(_opaque(node, at), chosen)
         args = [self._bounds(arg, at, chosen) for arg in node.args]
-        return _BOUNDS[node.op](node, *args)
+        bounds = OPS[node.op].bounds
+        if bounds is not None:
+            return bounds(node, *args)
+        if all(low == high for low, high in args):
+            return (_EVALUATE[node.op](node, *(low for low, _ in args)),) * 2
+        return (node.kind.lo, node.kind.hi) if node.kind.name == "int" else _ANY
 
     def _span(self, key: Key, chosen: Assignment) -> Bounds:
         """The least and the greatest value of a variable: domains ascend."""
@@ -346,68 +351,8 @@ class Search:
         return (domain[0], domain[-1]) if key[0] != "draw" else (0.0, 1.0)
 
 
-_EVALUATE: dict[str, Callable] = {
-    "member": lambda node, a: a in node.value,
-    "not": lambda node, a: not a,
-    "eq": lambda node, a, b: a == b,
-    "lt": lambda node, a, b: a < b,
-    "le": lambda node, a, b: a <= b,
-    "add": lambda node, a, b: a + b,
-    "sub": lambda node, a, b: a - b,
-    "mul": lambda node, a, b: a * b,
-    "quotient": lambda node, a, b: a // b if b else 0,
-    "neg": lambda node, a: -a,
-    "abs": lambda node, a: abs(a),
-    "min": lambda node, a, b: min(a, b),
-    "max": lambda node, a, b: max(a, b),
-    "mod": lambda node, a: a % node.value,
-    "opposite": lambda node, a: (a + 4) % 8,
-}
-"""Exact evaluation of discrete operations."""
-
-
-def _chosen_bounds(node: Expr, condition: Bounds, yes: Bounds, no: Bounds) -> Bounds:
-    if condition[0] == condition[1]:
-        return yes if condition[0] else no
-    return min(yes[0], no[0]), max(yes[1], no[1])
-
-
-def _product_bounds(node: Expr, a: Bounds, b: Bounds) -> Bounds:
-    products = [x * y for x in a for y in b]
-    return min(products), max(products)
-
-
-def _abs_bounds(node: Expr, a: Bounds) -> Bounds:
-    return (0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))), max(abs(a[0]), abs(a[1]))
-
-
-def _quotient_bounds(node: Expr, a: Bounds, b: Bounds) -> Bounds:
-    if a[0] == a[1] and b[0] == b[1]:
-        return (a[0] // b[0] if b[0] else 0,) * 2
-    return node.kind.lo, node.kind.hi
-
-
 _ANY: Bounds = (-math.inf, math.inf)
-_BOUNDS: dict[str, Callable[..., Bounds]] = {
-    "and": lambda node, a, b: (a[0] and b[0], a[1] and b[1]),
-    "or": lambda node, a, b: (a[0] or b[0], a[1] or b[1]),
-    "not": lambda node, a: (1 - a[1], 1 - a[0]),
-    "eq": lambda node, a, b: (a[0] == a[1] == b[0] == b[1], a[0] <= b[1] and b[0] <= a[1]),
-    "lt": lambda node, a, b: (a[1] < b[0], a[0] < b[1]),
-    "le": lambda node, a, b: (a[1] <= b[0], a[0] <= b[1]),
-    "add": lambda node, a, b: (a[0] + b[0], a[1] + b[1]),
-    "sub": lambda node, a, b: (a[0] - b[1], a[1] - b[0]),
-    "neg": lambda node, a: (-a[1], -a[0]),
-    "min": lambda node, a, b: (min(a[0], b[0]), min(a[1], b[1])),
-    "max": lambda node, a, b: (max(a[0], b[0]), max(a[1], b[1])),
-    "mod": lambda node, a: (a[0] % node.value,) * 2 if a[0] == a[1] else (0, node.value - 1),
-    "opposite": lambda node, a: ((a[0] + 4) % 8,) * 2 if a[0] == a[1] else (0, 7),
-    "mul": _product_bounds,
-    "abs": _abs_bounds,
-    "quotient": _quotient_bounds,
-    "choose": _chosen_bounds,
-}
-"""The same between bounds. Flags are 0, 1, False or True."""
+_EVALUATE = {name: row.evaluate for name, row in OPS.items() if row.evaluate}
 
 
 def _plus(at: Offset, offset: object) -> Offset:
@@ -446,7 +391,7 @@ def _is_opaque(node: Expr) -> bool:
         arg.kind.name in ("real", "vec2", "chance") and arg.op != "const" for arg in node.args
     ):
         return True
-    if node.op in ("to_real", "length", "vector", "row_part", "column_part", "div"):
+    if node.op not in _EVALUATE and node.op not in ("and", "or", "choose"):
         raise _Unknown
     return False
 
