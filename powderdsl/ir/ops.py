@@ -6,11 +6,17 @@ control flow inside a step. Equal nodes of one graph are the same object, so com
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+import operator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 Offset = tuple[int, int]
+
+SNAP = 2.0**-20
+"""Floats of a smaller magnitude are stored as zero."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +51,38 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Op:
-    """A row of the table: argument types (`?` any, `=` all alike, `*` any number of them), result, what `attr` is."""
+    """A row of the table: argument types (`?` any, `=` all alike, `*` any number of them), result, what `attr` is.
+
+    `evaluate` gives the result for `attr` and the values of the arguments, numbers or NumPy arrays: stages fold
+    constants with it. None where the result depends on more than these, or is a choice between planes.
+    """
 
     name: str
     args: tuple[str, ...]
     result: str
     attr: str = ""
     about: str = ""
+    evaluate: Callable[..., Any] | None = None
+
+
+def _divide(attr: None, a: Any, b: Any) -> Any:
+    return np.where(b == 0, np.float32(0), a / b)[()]
+
+
+def _quotient(attr: None, a: Any, b: Any) -> Any:
+    return np.where(b == 0, 0, a // np.where(b == 0, 1, b))[()]
+
+
+def _settle(attr: tuple[float, float], a: Any) -> Any:
+    kept = np.clip(a, np.float32(attr[0]), np.float32(attr[1]))
+    return np.where(np.abs(kept) >= np.float32(SNAP), kept, np.float32(0))[
+        ()
+    ]  # what is not a number is not ≥ SNAP
+
+
+def _plain(evaluate: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of the arguments alone."""
+    return lambda attr, *args: evaluate(*args)
 
 
 OPS: dict[str, Op] = {
@@ -115,20 +146,20 @@ OPS: dict[str, Op] = {
         # integers and floats
         Op("in_set", ("int",), "flag", "frozen set", "whether the value is one of these"),
         Op("table", ("int",), "int", "values by index, from 0"),
-        Op("eq", ("=", "="), "flag"),
-        Op("lt", ("=", "="), "flag"),
-        Op("le", ("=", "="), "flag"),
-        Op("add", ("=", "="), "="),
-        Op("sub", ("=", "="), "="),
-        Op("mul", ("=", "="), "="),
-        Op("div", ("real", "real"), "real", about="x / 0 is 0"),
-        Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0"),
-        Op("neg", ("?",), "="),
-        Op("abs", ("?",), "="),
-        Op("min", ("=", "="), "="),
-        Op("max", ("=", "="), "="),
-        Op("mod", ("int",), "int", "modulus"),
-        Op("sqrt", ("real",), "real"),
+        Op("eq", ("=", "="), "flag", evaluate=_plain(operator.eq)),
+        Op("lt", ("=", "="), "flag", evaluate=_plain(operator.lt)),
+        Op("le", ("=", "="), "flag", evaluate=_plain(operator.le)),
+        Op("add", ("=", "="), "=", evaluate=_plain(operator.add)),
+        Op("sub", ("=", "="), "=", evaluate=_plain(operator.sub)),
+        Op("mul", ("=", "="), "=", evaluate=_plain(operator.mul)),
+        Op("div", ("real", "real"), "real", about="x / 0 is 0", evaluate=_divide),
+        Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0", evaluate=_quotient),
+        Op("neg", ("?",), "=", evaluate=_plain(operator.neg)),
+        Op("abs", ("?",), "=", evaluate=_plain(abs)),
+        Op("min", ("=", "="), "=", evaluate=_plain(np.minimum)),
+        Op("max", ("=", "="), "=", evaluate=_plain(np.maximum)),
+        Op("mod", ("int",), "int", "modulus", evaluate=lambda modulus, a: a % modulus),
+        Op("sqrt", ("real",), "real", evaluate=_plain(np.sqrt)),
         Op("to_real", ("?",), "real"),
         Op(
             "settle",
@@ -136,6 +167,7 @@ OPS: dict[str, Op] = {
             "real",
             "(low, high)",
             "not a number → 0, cut off at the bounds, smaller than SNAP → 0",
+            _settle,
         ),
         # choices and movements
         Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),

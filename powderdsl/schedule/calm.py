@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.gates import Gates
-from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Step, nodes_of, walk
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Step, nodes_of, walk
 
-SNAP = np.float32(2.0**-20)
 WORTH = 0.75
 """A quiet form must have this share of the pass's nodes at most."""
-
-_REALS: dict[str, Callable[..., Any]] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt,
-    "min": np.minimum, "max": np.maximum, "div": lambda a, b: a / b if b else np.float32(0),
-}  # fmt: skip
-_COMPARE: dict[str, Callable[..., Any]] = {"eq": np.equal, "lt": np.less, "le": np.less_equal}
 
 
 def real_inputs(pass_: PassGraph) -> tuple[str, ...]:
@@ -67,20 +57,16 @@ def _ordered(root: Node) -> list[Node]:
 
 def _quiet(node: Node, args: list[Node], gates: Gates) -> Node:
     """A node on quiet arguments, folded."""
-    build, op = gates.build, node.op
+    build, op, evaluate = gates.build, node.op, OPS[node.op].evaluate
     known = bool(args) and all(arg.op == "const" for arg in args)
     if op == "input" and node.type == REAL:
         return build.real(0.0)
     if known and args[0].type == REAL:
         values = [np.float32(arg.attr) for arg in args]
         with np.errstate(all="ignore"):
-            if op in _COMPARE:
-                return build.flag(bool(_COMPARE[op](*values)))
-            if op in _REALS:
-                return build.real(float(_REALS[op](*values)))
-            if op == "settle":
-                cut = np.clip(values[0], np.float32(node.attr[0]), np.float32(node.attr[1]))
-                return build.real(float(cut) if abs(cut) >= SNAP else 0.0)
+            if evaluate is not None:
+                found = evaluate(node.attr, *values)
+                return build.flag(bool(found)) if node.type == FLAG else build.real(float(found))
         if op == "shift" and (node.attr[2] or not args[0].attr):
             return args[0]
     if op == "select" and args[0].op == "const":

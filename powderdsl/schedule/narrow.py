@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -147,11 +147,17 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
             result = visit(node.args[2])
         elif node.op in ("param", "draw"):
             raise LookupError
-        else:
-            args = [visit(arg) for arg in node.args]
-            if node.op == "shift" and not node.attr[2] and args[0]:
+        elif node.op == "led":
+            result = visit(node.args[0]) and visit(node.args[1])
+        elif node.op == "shift":
+            result = visit(node.args[0])
+            if result and not node.attr[2]:
                 raise LookupError
-            result = _CALM[node.op](node, *args)
+        else:
+            evaluate = OPS[node.op].evaluate
+            if evaluate is None:
+                raise LookupError
+            result = evaluate(node.attr, *map(visit, node.args))
         memo[id(node)] = result
         return result
 
@@ -163,25 +169,6 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
     if any(isinstance(number, np.floating) and number != 0 for number in found):
         return None
     return found, list(masks.values())
-
-
-_CALM: dict[str, Callable[..., Any]] = {
-    "add": lambda n, a, b: a + b,
-    "sub": lambda n, a, b: a - b,
-    "mul": lambda n, a, b: a * b,
-    "div": lambda n, a, b: np.float32(0) if b == 0 else a / b,
-    "neg": lambda n, a: -a,
-    "abs": lambda n, a: abs(a),
-    "min": lambda n, a, b: np.minimum(a, b),
-    "max": lambda n, a, b: np.maximum(a, b),
-    "sqrt": lambda n, a: np.sqrt(a),
-    "shift": lambda n, a: a,
-    "settle": lambda n, a: np.float32(min(max(a, n.attr[0]), n.attr[1])) if a == a else np.float32(0),
-    "eq": lambda n, a, b: bool(a == b),
-    "lt": lambda n, a, b: bool(a < b),
-    "le": lambda n, a, b: bool(a <= b),
-    "led": lambda n, a, b: a and b,
-}
 
 
 def _reads(values: list[Node]) -> list[tuple[Node, int, int]]:

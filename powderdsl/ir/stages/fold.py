@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import frexp
 
 import numpy as np
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import FLAG, REAL, Node
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node
 from powderdsl.ir.rewrite import Rewrite
 
 
@@ -94,26 +93,11 @@ def _compare(node: Node, build: Builder) -> Node | None:
 
 def _whole_constants(node: Node, build: Builder) -> Node | None:
     """Whole-number arithmetic on constants, and neutral elements."""
-    if node.type.name != "int" or node.op not in (
-        "add",
-        "sub",
-        "mul",
-        "min",
-        "max",
-        "neg",
-        "abs",
-        "mod",
-        "quotient",
-    ):
+    evaluate = OPS[node.op].evaluate
+    if node.type.name != "int" or evaluate is None:
         return None
     if all(arg.op == "const" for arg in node.args):
-        values = [int(arg.attr) for arg in node.args]
-        evaluate: dict[str, Callable[..., int]] = {
-            "add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "min": min, "max": max,
-            "neg": lambda a: -a, "abs": abs, "mod": lambda a: a % node.attr,
-            "quotient": lambda a, b: a // b if b else 0,
-        }  # fmt: skip
-        return build.whole(evaluate[node.op](*values))
+        return build.whole(int(evaluate(node.attr, *(int(arg.attr) for arg in node.args))))
     if node.op in ("add", "sub"):
         a, b = node.args
         if b.op == "const" and b.attr == 0:  # a + 0 = a

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from powderdsl.ir.ops import SNAP
 from powderdsl.targets.arrays.draws import Draws
 from powderdsl.targets.arrays.words import WORD, Array, columns, pack, rows, shifted, unpack
-
-SNAP = 2.0**-20
 
 PIECE = 1 << 14
 """Reals that stay in the first-level cache from one operation to the next."""

@@ -6,7 +6,7 @@ from functools import reduce
 from importlib.resources import files
 from operator import or_
 
-from powderdsl.ir.ops import Program
+from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPP, plan
 from powderdsl.targets.cpp.text import pass_text
@@ -19,8 +19,6 @@ LIBRARY = ("vectors", "runtime", "planes", "fields")
 """What stands before the generated passes, in this order: *.hpp."""
 DRIVER = ("driver", "views")
 """What stands behind them."""
-
-SNAP = 2.0**-20
 
 
 def native_source(program: Program) -> tuple[str, Layout]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.resources import files
 
-from powderdsl.ir.ops import Program
+from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.barriers import Pending, barriers
 from powderdsl.schedule.buffers import Pool, buffers
 from powderdsl.schedule.stages import CUDA, plan
@@ -15,7 +15,6 @@ from powderdsl.targets.layout import Layout, layout_of, literal
 GENERATOR_VERSION = 2
 """Part of every cache key: raise it when generated code changes meaning."""
 
-SNAP = 2.0**-20
 WARP = 32
 MAX_THREADS = 1024
 SMALL = 64

@@ -13,15 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.ir.ops import Program, Threshold
+from powderdsl.ir.ops import SNAP, Program, Threshold
 from powderdsl.system.random import base_keys
 from powderdsl.targets import random
 from powderdsl.targets.codec import limits, pieces
 from powderdsl.targets.job import Job
 from powderdsl.targets.laps import Laps, unwatched
 from powderdsl.targets.torch.source import load_source, pass_source
-
-SNAP = 2.0**-20
 
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
 

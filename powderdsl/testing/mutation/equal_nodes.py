@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from powderdsl.ir.ops import COMMUTATIVE, REAL, Node, Offset
+from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Node, Offset
 
 Array = np.ndarray[Any, Any]
 Variable = tuple[Hashable, ...]
@@ -276,10 +276,14 @@ class _Cases:
             case "count":
                 return self._count(node, at)
         parts = [self.value(part, place) for part, place in _reads(node, at)]
-        if node.op not in _EVALUATE:
+        own, shared = _EVALUATE.get(node.op), OPS[node.op].evaluate
+        if own is not None:
+            found: Array = own(node, self, at, *parts)
+        elif shared is not None:
+            found = shared(node.attr, *parts)
+        else:
             raise Undecided
-        found: Array = _EVALUATE[node.op](node, self, at, *parts).astype(np.int32)
-        return found
+        return found.astype(np.int32)
 
     def _count(self, node: Node, at: Offset) -> Array:
         weights, wraps = node.attr
@@ -385,22 +389,10 @@ _EVALUATE: dict[str, Callable[..., Any]] = {
     "xor": lambda node, cases, at, a, b: a ^ b,
     "in_set": lambda node, cases, at, a: np.isin(a, sorted(node.attr)),
     "table": lambda node, cases, at, a: np.asarray(node.attr, np.int32)[np.clip(a, 0, len(node.attr) - 1)],
-    "eq": lambda node, cases, at, a, b: a == b,
-    "lt": lambda node, cases, at, a, b: a < b,
-    "le": lambda node, cases, at, a, b: a <= b,
-    "add": lambda node, cases, at, a, b: a + b,
-    "sub": lambda node, cases, at, a, b: a - b,
-    "mul": lambda node, cases, at, a, b: a * b,
-    "quotient": lambda node, cases, at, a, b: np.where(b == 0, 0, a // np.where(b == 0, 1, b)),
-    "neg": lambda node, cases, at, a: -a,
-    "abs": lambda node, cases, at, a: np.abs(a),
-    "min": lambda node, cases, at, a, b: np.minimum(a, b),
-    "max": lambda node, cases, at, a, b: np.maximum(a, b),
-    "mod": lambda node, cases, at, a: np.mod(a, node.attr),
     "select": lambda node, cases, at, c, a, b: np.where(c != 0, a, b),
     "swap": lambda node, cases, at, moves, there, target, back, rest: np.where(
         moves != 0, there, np.where(target != 0, back, rest)
     ),
     "arrive": lambda node, cases, at, target, back, rest: np.where(target != 0, back, rest),
 }
-"""Exact evaluation of the operations on integers and flags."""
+"""Exact evaluation of the operations that read cells, look up values, or work on flags; `OPS` has the arithmetic."""
