@@ -28,6 +28,7 @@ from powderdsl.model.packs import read_file
 from powderdsl.model.types import Kind, Param, Ruleset, Value
 from powderdsl.syntax.sources import path_beside, read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.system.memory import collection_paused
 from powderdsl.system.reading import inside, is_path
 
 if TYPE_CHECKING:
@@ -485,6 +486,7 @@ def param_value(param: Param, value: Any) -> Value:
     return int(number) if param.kind.name in ("int", "flag") else number
 
 
+@collection_paused()
 def lower(ruleset: Ruleset) -> Program:
     """The checked model as optimized IR."""
     from powderdsl.ir.lower.rules import lower_ruleset

@@ -9,6 +9,7 @@ from operator import or_
 from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPP, plan
+from powderdsl.system.memory import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
@@ -21,6 +22,7 @@ DRIVER = ("driver", "views")
 """What stands behind them."""
 
 
+@collection_paused()
 def native_source(program: Program) -> tuple[str, Layout]:
     """The whole translation unit, and its layout."""
     layout = layout_of(program)

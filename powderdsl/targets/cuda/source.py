@@ -9,6 +9,7 @@ from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.barriers import Pending, barriers
 from powderdsl.schedule.buffers import Pool, buffers
 from powderdsl.schedule.stages import CUDA, plan
+from powderdsl.system.memory import collection_paused
 from powderdsl.targets.cuda.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
@@ -48,6 +49,7 @@ class KernelSource:
     """Bytes of global memory a block: what did not fit."""
 
 
+@collection_paused()
 def cuda_source(program: Program, height: int, width: int, shared_limit: int) -> KernelSource:
     """The kernel of a program on planes for one size of grid.
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
+from powderdsl.system.memory import collection_paused
 from powderdsl.targets.job import Job, Runnable
 from powderdsl.targets.laps import profile_of
 from powderdsl.targets.torch.program import TorchProgram
@@ -47,6 +48,7 @@ class MixedProgram:
         return seconds
 
 
+@collection_paused()
 def packed_program(program: Program, device: torch.device, make: MakePacked) -> Runnable:
     """A program on planes by `make`, except for the passes that planes cannot carry."""
     return mixed_program(segments(program), device, make)
