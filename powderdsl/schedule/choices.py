@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import replace
 
 from powderdsl.ir.ops import REAL, Graph, Node
-from powderdsl.schedule.types import CELLS, PLACES, Compute, Schedule, Statement, map_blocks, ordered
+from powderdsl.schedule.types import CELLS, PLACES, Compute, Schedule, map_computes, ordered, with_args
 
 _UPDATES = ("add", "sub", "mul")
 
@@ -17,14 +17,7 @@ def choices(schedule: Schedule) -> Schedule:
     `select(m, a, b)` → `choose(cells(m), a, b)`; `select(m, b + c, b)` → `update(places(m), b, c)`; where mask and
     change are read at the same neighbor, `select(m[o], b + c[o], b)` → `carry(places(m), moved(places(m)), b, c)`.
     """
-
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        return tuple(
-            _changed(statement, schedule.graph) if isinstance(statement, Compute) else statement
-            for statement in block
-        )
-
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_computes(schedule, lambda statement: [_changed(statement, schedule.graph)])
 
 
 def _changed(statement: Compute, graph: Graph) -> Compute:
@@ -38,8 +31,7 @@ def _changed(statement: Compute, graph: Graph) -> Compute:
         if _is_choice(node):
             done[id(node)] = _choice(node, done, users, graph)
             continue
-        args = tuple(done[id(arg)] for arg in node.args)
-        done[id(node)] = graph.node(node.op, node.type, args, node.attr, node.places)
+        done[id(node)] = with_args(node, tuple(done[id(arg)] for arg in node.args), graph)
     return replace(statement, outs=tuple(replace(out, value=done[id(out.value)]) for out in statement.outs))
 
 

@@ -21,8 +21,8 @@ from powderdsl.schedule.costs import (
     sources_of,
     stored_parts,
 )
-from powderdsl.schedule.draws import DRAWS, all_of, asked_for
-from powderdsl.schedule.floats import conjuncts, is_comparison, of_floats
+from powderdsl.schedule.draws import DRAWS, asked_for
+from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -33,6 +33,8 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Var,
+    combined,
+    conjuncts,
     defined_by,
     flat,
     load,
@@ -200,7 +202,9 @@ class Cutter:
             self.ask(lazy, guard)
             return
         # Whether the cheap parts hold anywhere: only then are the others, and what they need, computed.
-        first = [all_of(cheap[node.attr], graph) if node.attr in cheap else node for node in guard.when]
+        first = [
+            combined("and", cheap[node.attr], graph) if node.attr in cheap else node for node in guard.when
+        ]
         outer, self.statements = self.statements, []
         scope = dict(self.known), set(self.there)
         self.ensure([need for out in lazy for need in self.needs(out.value)], place)
@@ -228,9 +232,7 @@ class Cutter:
 
     def answer(self, flags: Sequence[Node]) -> Out:
         """Whether one of some flags holds in any cell."""
-        some = self.word(flags[0])
-        for flag in flags[1:]:
-            some = self.graph.node("or", FLAG, (some, self.word(flag)))
+        some = combined("or", [self.word(flag) for flag in flags], self.graph)
         return Out(self.namer.var(ANSWER), self.graph.node("any", ANSWER, (some,)))
 
     def split(self, mask: Node) -> tuple[list[Node], list[Node]]:
@@ -246,8 +248,8 @@ class Cutter:
     def lazily(self, cheap: list[Node], rest: list[Node]) -> Node:
         """The conjunction; the rest is computed only in words where the cheap parts hold somewhere."""
         if not rest or not cheap:
-            return all_of([*cheap, *rest], self.graph)
-        return self.under(all_of(cheap, self.graph), rest)
+            return combined("and", [*cheap, *rest], self.graph)
+        return self.under(combined("and", cheap, self.graph), rest)
 
     def under(self, first: Node, rest: list[Node]) -> Node:
         """What holds under a condition: draws last, each asked for where all before them holds."""
@@ -255,7 +257,7 @@ class Cutter:
         for part in sorted(rest, key=lambda part: part.op in DRAWS):
             if part.op in DRAWS and not self.have(part):
                 part = asked_for(part, value, self.graph)
-            value = all_of([value, part], self.graph)
+            value = combined("and", [value, part], self.graph)
         return self.graph.node("when", FLAG, (first, value))
 
     # What must be stored

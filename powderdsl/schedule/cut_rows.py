@@ -13,7 +13,7 @@ from dataclasses import replace
 from powderdsl.ir.ops import FLAG, REAL, Node, walk
 from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant
 from powderdsl.schedule.cut import Cutter, Pairs
-from powderdsl.schedule.draws import DRAWS, all_of
+from powderdsl.schedule.draws import DRAWS
 from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.moves import is_movement
 from powderdsl.schedule.types import (
@@ -26,6 +26,7 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Var,
+    combined,
     load,
 )
 
@@ -143,7 +144,7 @@ class _RowCutter(Cutter):
         for out in outs:
             cheap, rest = split[id(out)]
             var = self.namer.var(FLAG) if rest else out.var
-            candidates.append(Out(var, self.word(all_of(cheap, graph))))
+            candidates.append(Out(var, self.word(combined("and", cheap, graph))))
         self.emit(Compute(tuple(candidates), place, "words", when=masks.when))
         asked = [load(graph, out.var) for out in candidates]
         mine = {out.var.name for out in outs}

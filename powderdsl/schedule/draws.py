@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node
@@ -14,9 +13,13 @@ from powderdsl.schedule.types import (
     Out,
     Schedule,
     Statement,
+    combined,
+    conjuncts,
     load,
     map_blocks,
+    map_computes,
     ordered,
+    with_args,
 )
 
 FEW_BITS = 2
@@ -87,15 +90,7 @@ def conditions(schedule: Schedule) -> Schedule:
 
     `busy & chance(s)` → `busy & chance(s, busy)`.
     """
-    graph = schedule.graph
-
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        return tuple(
-            _with_conditions(statement, graph) if isinstance(statement, Compute) else statement
-            for statement in block
-        )
-
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_computes(schedule, lambda statement: [_with_conditions(statement, schedule.graph)])
 
 
 def _with_conditions(statement: Compute, graph: Graph) -> Compute:
@@ -123,9 +118,8 @@ def _with_conditions(statement: Compute, graph: Graph) -> Compute:
         args = [done[id(arg)] for arg in node.args]
         asked = [done[id(flag)] for flag in where.get(id(node), {}).values()]
         if node.op in DRAWS and takes_bits(node) and asked:
-            args.append(all_of(asked, graph))
-        same = len(args) == len(node.args) and all(a is b for a, b in zip(args, node.args, strict=True))
-        done[id(node)] = node if same else graph.node(node.op, node.type, tuple(args), node.attr, node.places)
+            args.append(combined("and", asked, graph))
+        done[id(node)] = with_args(node, tuple(args), graph)
     return replace(statement, outs=tuple(replace(out, value=done[id(out.value)]) for out in statement.outs))
 
 
@@ -143,28 +137,8 @@ def takes_bits(node: Node) -> bool:
     return node.op in ("below_planes", "below_param", "draw")
 
 
-def conjuncts(node: Node) -> list[Node]:
-    """What must hold for a flag to hold, in order."""
-    seen: dict[int, Node] = {}
-    stack = [node]
-    while stack:
-        top = stack.pop()
-        if id(top) not in seen:
-            seen[id(top)] = top
-            stack.extend(reversed(top.args) if top.op == "and" else ())
-    return [part for part in seen.values() if part.op != "and"]
-
-
-def all_of(flags: Iterable[Node], graph: Graph) -> Node:
-    """The conjunction of one or more flags."""
-    first, *rest = flags
-    for flag in rest:
-        first = graph.node("and", FLAG, (first, flag))
-    return first
-
-
 def _without_draws(mask: Node, graph: Graph) -> Node | None:
     """The part of a mask that takes no draws; None if that is all of it, or nothing."""
     parts = [(part, any(map(takes_bits, ordered([part])))) for part in conjuncts(mask)]
     cheap = [part for part, random in parts if not random]
-    return all_of(cheap, graph) if 0 < len(cheap) < len(parts) else None
+    return combined("and", cheap, graph) if 0 < len(cheap) < len(parts) else None

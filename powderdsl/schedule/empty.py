@@ -6,7 +6,17 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node
-from powderdsl.schedule.types import ANSWER, Compute, Schedule, Statement, map_blocks, ordered
+from powderdsl.schedule.types import (
+    ANSWER,
+    Compute,
+    Schedule,
+    Statement,
+    combined,
+    conjuncts,
+    in_order,
+    map_computes,
+    ordered,
+)
 
 
 def empty(schedule: Schedule) -> Schedule:
@@ -16,20 +26,15 @@ def empty(schedule: Schedule) -> Schedule:
     """
     graph = schedule.graph
 
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        result: list[Statement] = []
-        for statement in block:
-            if isinstance(statement, Compute) and statement.over == "words":
-                whole = [out for out in statement.outs if is_whole(out.value)]
-                rest = tuple(out for out in statement.outs if not is_whole(out.value))
-                result += [replace(statement, outs=(out,), when=None) for out in whole]
-                if rest:
-                    result.append(_asked(replace(statement, outs=rest), graph))
-            else:
-                result.append(statement)
-        return tuple(result)
+    def change(loop: Compute) -> list[Statement]:
+        if loop.over != "words":
+            return [loop]
+        whole = [out for out in loop.outs if is_whole(out.value)]
+        rest = tuple(out for out in loop.outs if not is_whole(out.value))
+        alone = [replace(loop, outs=(out,), when=None) for out in whole]
+        return [*alone, _asked(replace(loop, outs=rest), graph)] if rest else [*alone]
 
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_computes(schedule, change)
 
 
 def is_whole(value: Node) -> bool:
@@ -58,41 +63,25 @@ def _asked(loop: Compute, graph: Graph) -> Compute:
         conditions = [_any(names, loads, graph) for names in _conditions(out.value, memo)]
         if not conditions:
             return loop
-        way = conditions[0]
-        for other in conditions[1:]:
-            way = graph.node("and", ANSWER, (way, other))
+        way = combined("and", conditions, graph)
         ways[id(way)] = way
-    first, *rest = ways.values()
-    for way in rest:
-        first = graph.node("or", ANSWER, (first, way))
-    if loop.when is not None:
-        first = graph.node("and", ANSWER, (loop.when, first))
-    return replace(loop, when=first)
+    asked = combined("or", ways.values(), graph)
+    return replace(loop, when=asked if loop.when is None else combined("and", [loop.when, asked], graph))
 
 
 def _conditions(value: Node, memo: dict[int, frozenset[str] | None]) -> list[frozenset[str]]:
     """Sets of planes, of each of which one must hold something for the value to do so."""
     if value.op == "when":
         candidates, rest = value.args
-        parts = [candidates]
-        stack = [rest]
-        while stack:
-            part = stack.pop()
-            if part.op == "and":
-                stack.extend(reversed(part.args))
-            else:
-                parts.append(part)
+        parts = [candidates, *conjuncts(rest)]
     else:
         parts = [value]
     return list(dict.fromkeys(found for part in parts if (found := holders(part, memo)) is not None))
 
 
 def _any(names: Iterable[str], loads: dict[str, Node], graph: Graph) -> Node:
-    result: Node | None = None
-    for name in sorted(names, key=lambda name: int(name[1:])):
-        one = graph.node("any", ANSWER, (loads[name],))
-        result = one if result is None else graph.node("or", ANSWER, (result, one))
-    return result if result is not None else graph.node("const", ANSWER, (), False)
+    found = [graph.node("any", ANSWER, (loads[name],)) for name in in_order(names)]
+    return combined("or", found, graph) if found else graph.node("const", ANSWER, (), False)
 
 
 def holders(node: Node, memo: dict[int, frozenset[str] | None]) -> frozenset[str] | None:

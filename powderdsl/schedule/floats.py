@@ -13,6 +13,7 @@ from powderdsl.schedule.types import (
     Out,
     Schedule,
     Statement,
+    conjuncts,
     flat,
     load,
     ordered,
@@ -121,10 +122,3 @@ def _covered(root: Node, node: Node, leader: Node) -> bool:
                 continue
         stack.extend(top.args)
     return True
-
-
-def conjuncts(node: Node) -> list[Node]:
-    """The parts of nested conjunctions."""
-    if node.op != "and":
-        return [node]
-    return [part for arg in node.args for part in conjuncts(arg)]

@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from powderdsl.ir.ops import Graph, Node, PassGraph, Step, Type, nodes_of
-from powderdsl.schedule.types import Compute, Guard, Namer, Out, Schedule, Statement, Var, load
+from powderdsl.schedule.types import (
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    Var,
+    load,
+    over_variables,
+)
 
 
 def lower(pass_: PassGraph) -> Schedule:
@@ -79,20 +89,9 @@ class _Lowering:
 
     def value(self, root: Node) -> Node:
         """A node of the pass over the variables that are there."""
-        done: dict[int, Node] = {}
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in done:
-                continue
-            if node.op == "input":
-                done[id(node)] = load(self.graph, self.find(str(node.attr), node.type))
-            elif id(node) in self.vars:
-                done[id(node)] = load(self.graph, self.vars[id(node)])
-            elif ready:
-                args = tuple(done[id(arg)] for arg in node.args)
-                done[id(node)] = self.graph.node(node.op, node.type, args, node.attr, node.places)
-            else:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-        return done[id(root)]
+        return over_variables(root, self.graph, self.stored)
+
+    def stored(self, node: Node) -> Node | None:
+        if node.op == "input":
+            return load(self.graph, self.find(str(node.attr), node.type))
+        return load(self.graph, self.vars[id(node)]) if id(node) in self.vars else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, Node, Offset
+from powderdsl.ir.ops import FLAG, Graph, Node, Offset
 from powderdsl.schedule.types import (
     Carried,
     Compute,
@@ -16,8 +16,9 @@ from powderdsl.schedule.types import (
     Statement,
     Var,
     load,
-    map_blocks,
+    map_computes,
     ordered,
+    over_variables,
 )
 
 
@@ -27,26 +28,15 @@ def moves(schedule: Schedule) -> Schedule:
     `x = swap(a, m, a); y = swap(b, m, b)` → `swap by m: x = a, y = b`.
     """
     namer = Namer(schedule)
-
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        return tuple(
-            new
-            for statement in block
-            for new in (
-                _moved(statement, schedule, namer) if isinstance(statement, Compute) else (statement,)
-            )
-        )
-
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_computes(schedule, lambda statement: _moved(statement, schedule.graph, namer))
 
 
 def is_movement(node: Node) -> bool:
     return node.op in ("swap", "arrive") and node.type == FLAG
 
 
-def _moved(statement: Compute, schedule: Schedule, namer: Namer) -> list[Statement]:
+def _moved(statement: Compute, graph: Graph, namer: Namer) -> list[Statement]:
     """A statement as statements: what movements need, the movements, what needs them."""
-    graph = schedule.graph
     nodes = ordered(out.value for out in statement.outs)
     movements = [node for node in nodes if is_movement(node)]
     if not movements:
@@ -56,15 +46,9 @@ def _moved(statement: Compute, schedule: Schedule, namer: Namer) -> list[Stateme
     own = {id(out.value): out.var for out in reversed(statement.outs) if is_movement(out.value)}
 
     def value(root: Node) -> Node:
-        done: dict[int, Node] = {}
-        for node in ordered_until(root, vars):
-            if id(node) in vars:
-                done[id(node)] = load(graph, vars[id(node)])
-                continue
-            args = tuple(done[id(arg)] for arg in node.args)
-            same = all(a is b for a, b in zip(args, node.args, strict=True))
-            done[id(node)] = node if same else graph.node(node.op, node.type, args, node.attr, node.places)
-        return done[id(root)]
+        return over_variables(
+            root, graph, lambda node: load(graph, vars[id(node)]) if id(node) in vars else None
+        )
 
     def store(wanted: Iterable[Node]) -> None:
         """Variables for what movements read in other cells."""
@@ -93,21 +77,6 @@ def _moved(statement: Compute, schedule: Schedule, namer: Namer) -> list[Stateme
     moved = {var.name for var in own.values()}
     rest = tuple(replace(out, value=value(out.value)) for out in statement.outs if out.var.name not in moved)
     return [*result, replace(statement, outs=rest)] if rest else result
-
-
-def ordered_until(root: Node, known: dict[int, Var]) -> list[Node]:
-    """Nodes below one, arguments first; what is known is not looked into."""
-    seen: dict[int, Node] = {}
-    stack = [(root, False)]
-    while stack:
-        node, ready = stack.pop()
-        if ready:
-            seen.setdefault(id(node), node)
-        elif id(node) not in seen:
-            stack.append((node, True))
-            if id(node) not in known:
-                stack.extend((arg, False) for arg in reversed(node.args))
-    return list(seen.values())
 
 
 def _groups(nodes: list[Node], movements: list[Node]) -> list[list[Node]]:

@@ -17,8 +17,9 @@ from powderdsl.schedule.types import (
     Out,
     Schedule,
     Statement,
+    combined,
     load,
-    map_blocks,
+    map_computes,
     ordered,
     rewritten,
 )
@@ -31,15 +32,11 @@ def narrow(schedule: Schedule) -> Schedule:
     """
     found = {var.name for _, var in schedule.finds}
 
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        return tuple(
-            _narrowed(statement, schedule.graph, found)
-            if isinstance(statement, Compute) and statement.over in ("cells", "choices")
-            else statement
-            for statement in block
-        )
+    def change(loop: Compute) -> list[Statement]:
+        cells = loop.over in ("cells", "choices")
+        return [_narrowed(loop, schedule.graph, found) if cells else loop]
 
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_computes(schedule, change)
 
 
 def ask_regions(schedule: Schedule) -> Schedule:
@@ -49,19 +46,15 @@ def ask_regions(schedule: Schedule) -> Schedule:
     """
     namer, graph = Namer(schedule), schedule.graph
 
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        result: list[Statement] = []
-        for loop in block:
-            if not isinstance(loop, Compute) or loop.region is None:
-                result.append(loop)
-                continue
-            question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (_anywhere(loop.region, graph),)))
-            keeps = tuple((out.var, out.otherwise) for out in loop.outs if out.otherwise is not None)
-            result.append(Compute((question,), loop.place, "words"))
-            result.append(Guard((load(graph, question.var),), (loop,), keeps, loop.place))
-        return tuple(result)
+    def change(loop: Compute) -> list[Statement]:
+        if loop.region is None:
+            return [loop]
+        question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (_anywhere(loop.region, graph),)))
+        keeps = tuple((out.var, out.otherwise) for out in loop.outs if out.otherwise is not None)
+        asking = Compute((question,), loop.place, "words")
+        return [asking, Guard((load(graph, question.var),), (loop,), keeps, loop.place)]
 
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_computes(schedule, change)
 
 
 def _narrowed(loop: Compute, graph: Graph, found: set[str]) -> Compute:
@@ -93,10 +86,8 @@ def _with_region(loop: Compute, region: Node, rest: Iterable[Node]) -> Compute:
 
 
 def _any_of(flags: Iterable[Node], graph: Graph) -> Node:
-    result: Node | None = None
-    for flag in dict.fromkeys(flags):
-        result = flag if result is None else graph.node("or", FLAG, (result, flag))
-    return result if result is not None else graph.node("const", FLAG, (), False)
+    found = dict.fromkeys(flags)
+    return combined("or", found, graph) if found else graph.node("const", FLAG, (), False)
 
 
 def _live(field: Node, dy: int, reach: int, graph: Graph) -> Node:

@@ -16,6 +16,7 @@ from powderdsl.schedule.types import (
     Guard,
     Schedule,
     Statement,
+    combined,
     flat,
     ordered,
     values_of,
@@ -138,15 +139,10 @@ def _asked(masks: list[Node], bits: dict[str, int], graph: Graph) -> Node | None
     ways = dict.fromkeys(needs.of(mask) for mask in masks)
     if not ways or frozenset() in ways:
         return None
-    answer: Node | None = None
-    for sets in sorted(ways, key=sorted):
-        way: Node | None = None
-        for ids in sorted(sets):
-            one = graph.node("present", ANSWER, (), ids)
-            way = one if way is None else graph.node("and", ANSWER, (way, one))
-        assert way is not None
-        answer = way if answer is None else graph.node("or", ANSWER, (answer, way))
-    return answer
+    present = [
+        [graph.node("present", ANSWER, (), ids) for ids in sorted(sets)] for sets in sorted(ways, key=sorted)
+    ]
+    return combined("or", [combined("and", nodes, graph) for nodes in present], graph)
 
 
 def asked_ids(schedule: Schedule) -> int:

@@ -20,6 +20,7 @@ from powderdsl.schedule.types import (
     load,
     loaded,
     ordered,
+    over_variables,
 )
 
 _CHEAP = ("const", "param", "coordinate", "inside", "load")
@@ -121,24 +122,12 @@ def _inserted(
 
     def value(root: Node, path: Path, *, itself: bool) -> Node:
         """A value over the variables, with one for itself or not."""
-        done: dict[int, Node] = {}
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in done:
-                continue
-            if shared(node, path) and (itself or node is not root):
-                done[id(node)] = load(graph, vars[id(node)][1])
-            elif ready or not node.args:
-                args = tuple(done[id(arg)] for arg in node.args)
-                same = all(a is b for a, b in zip(args, node.args, strict=True))
-                done[id(node)] = (
-                    node if same else graph.node(node.op, node.type, args, node.attr, node.places)
-                )
-            else:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in node.args)
-        return done[id(root)]
+
+        def known(node: Node) -> Node | None:
+            other = itself or node is not root
+            return load(graph, vars[id(node)][1]) if other and shared(node, path) else None
+
+        return over_variables(root, graph, known)
 
     def block(body: Sequence[Statement], outer: Path) -> tuple[Statement, ...]:
         result: list[Statement] = []

@@ -184,15 +184,58 @@ def ordered(roots: Iterable[Node]) -> list[Node]:
     return list(seen.values())
 
 
+def with_args(node: Node, args: tuple[Node, ...], graph: Graph) -> Node:
+    """The same operation on other arguments."""
+    same = len(args) == len(node.args) and all(a is b for a, b in zip(args, node.args, strict=True))
+    return node if same else graph.node(node.op, node.type, args, node.attr, node.places)
+
+
 def rewritten(roots: Iterable[Node], graph: Graph, rule: Callable[[Node], Node | None]) -> dict[int, Node]:
     """Values rebuilt bottom-up in a graph, by the id of the old node; `rule` sees nodes with their new arguments."""
     done: dict[int, Node] = {}
     for node in ordered(roots):
-        args = tuple(done[id(arg)] for arg in node.args)
-        same = all(a is b for a, b in zip(args, node.args, strict=True))
-        new = node if same else graph.node(node.op, node.type, args, node.attr, node.places)
+        new = with_args(node, tuple(done[id(arg)] for arg in node.args), graph)
         done[id(node)] = rule(new) or new
     return done
+
+
+def over_variables(root: Node, graph: Graph, known: Callable[[Node], Node | None]) -> Node:
+    """A value rebuilt top-down, maybe in another graph: what `known` gives replaces a node with all below it."""
+    done: dict[int, Node] = {}
+    stack = [(root, False)]
+    while stack:
+        node, ready = stack.pop()
+        if id(node) in done:
+            continue
+        if ready:
+            args = tuple(done[id(arg)] for arg in node.args)
+            done[id(node)] = graph.node(node.op, node.type, args, node.attr, node.places)
+        elif (found := known(node)) is not None:
+            done[id(node)] = found
+        else:
+            stack.append((node, True))
+            stack.extend((arg, False) for arg in reversed(node.args))
+    return done[id(root)]
+
+
+def combined(op: Literal["and", "or"], nodes: Iterable[Node], graph: Graph) -> Node:
+    """The conjunction or disjunction of flags or answers, of which there is one at least."""
+    first, *rest = nodes
+    for node in rest:
+        first = graph.node(op, first.type, (first, node))
+    return first
+
+
+def conjuncts(node: Node) -> list[Node]:
+    """What must hold for a flag to hold, each once, in order."""
+    seen: dict[int, Node] = {}
+    stack = [node]
+    while stack:
+        top = stack.pop()
+        if id(top) not in seen:
+            seen[id(top)] = top
+            stack.extend(reversed(top.args) if top.op == "and" else ())
+    return [part for part in seen.values() if part.op != "and"]
 
 
 # Statements
@@ -266,6 +309,15 @@ def map_blocks(
     return change(inner)
 
 
+def map_computes(schedule: Schedule, change: Callable[[Compute], Iterable[Statement]]) -> Schedule:
+    """The schedule with other statements for every `Compute`, wherever it stands."""
+
+    def block(body: tuple[Statement, ...]) -> tuple[Statement, ...]:
+        return tuple(new for one in body for new in (change(one) if isinstance(one, Compute) else (one,)))
+
+    return replace(schedule, body=map_blocks(schedule.body, block))
+
+
 class Namer:
     """Makes variables with new names."""
 
@@ -281,5 +333,6 @@ class Namer:
 __all__ = [
     "ANSWER", "BLOCK", "CELLS", "FLAG", "PLACES", "REAL",
     "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
-    "defined_by", "flat", "in_order", "load", "loaded", "map_blocks", "ordered", "rewritten", "values_of", "variables",
+    "combined", "conjuncts", "defined_by", "flat", "in_order", "load", "loaded", "map_blocks", "map_computes", "ordered",
+    "over_variables", "rewritten", "values_of", "variables", "with_args",
 ]  # fmt: skip
