@@ -43,12 +43,13 @@ def parser() -> Lark:
 
 def reserved_words() -> frozenset[str]:
     """Words of the grammar that cannot be names."""
-    words = set()
-    for terminal in parser().terminals:
-        pattern = terminal.pattern
-        if pattern.type == "str" and pattern.value.isalpha():
-            words.add(pattern.value)
-    return frozenset(words)
+    return words_of(parser())
+
+
+def words_of(grammar: Lark) -> frozenset[str]:
+    """The keywords of a grammar."""
+    patterns = [terminal.pattern for terminal in grammar.terminals]
+    return frozenset(one.value for one in patterns if one.type == "str" and one.value.isalpha())
 
 
 def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | None:

@@ -10,10 +10,9 @@ from powderdsl.model.state import slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.tasks.drawings import choice_ids
-from powderdsl.tasks.statement_lists import text_span
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene.statements import read_choice
+from powderdsl.worlds.scene.statements import read_choice, text_span
 
 MAX_ACTIONS = 1_000_000
 MAX_STEPS = 100_000

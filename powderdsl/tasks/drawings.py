@@ -9,9 +9,8 @@ from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.statement_lists import BROKEN, Item, Repeat
 from powderdsl.tasks.task import MAX_NUMBER, MAX_REPEATS, Drawing, Generator, Group, Region, Stamp, Target
-from powderdsl.worlds.raster import Size, mask
-from powderdsl.worlds.scene.amounts import Amount, Interval, filled_in, interval, number
-from powderdsl.worlds.scene.fixed import shape_of
+from powderdsl.worlds.raster import Shape, Size, mask
+from powderdsl.worlds.scene.amounts import Amount, Interval, filled_in, integers, interval, number
 from powderdsl.worlds.scene.statements import NUMBERS, RANGES, ElementChoice, Statement, Word
 
 MAX_DRAWINGS = 4_096
@@ -228,10 +227,9 @@ class Drawer:
             high = self.size[i] if stop is None else self.bounds(stop, names)[1]
             if low >= high or start == stop or low >= self.size[i] or high <= 0:
                 never = "rows" if i == 0 else "columns"
-        if all(one is None or one.is_number for one in amounts) and drawing.kind not in ("scatter", "stamp"):
-            values = [None if one is None else int(one.value or 0) for one in amounts]
-            if not mask(shape_of(drawing.kind, values), self.size).any():
-                never = never or "cells"
+        values = integers(amounts) if drawing.kind not in ("scatter", "stamp") else None
+        if values is not None and not mask(Shape(drawing.kind, values), self.size).any():
+            never = never or "cells"
         if never:
             rows, columns = self.size
             self.reporter.error(
@@ -265,11 +263,11 @@ def choice_ids(
     if choice.how == "first":
         assert choice.count is not None
         count = filled_in(choice.count, knobs)
-        if not count.is_number or not 1 <= int(count.value or 0) <= len(ids):
+        if not count.is_number or not 1 <= count.integer <= len(ids):
             label = f"a number from 1 to {len(ids)}, or knobs"
             reporter.error("PD606", "how many of them must be fixed", choice.count.span, label)
             return ()
-        ids = ids[: int(count.value or 0)]
+        ids = ids[: count.integer]
     if not ids and not choice.names:
         reporter.error("PD604", "a choice among no elements", choice.span, "nothing is left")
     if not ids and choice.how == "any" and choice.names:

@@ -24,11 +24,18 @@ from powderdsl.tasks.drawings import Drawer, DrawingPlan, element_ids
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.keys import TASK_KEYS
 from powderdsl.tasks.stamps import read_stamp
-from powderdsl.tasks.statement_lists import BROKEN, read_items, read_lets, text_span
+from powderdsl.tasks.statement_lists import BROKEN, read_items, read_lets
 from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Stamp, Task
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene.amounts import filled_in
-from powderdsl.worlds.scene.statements import Statement, Word, read_amount, read_statement, reserved_words
+from powderdsl.worlds.scene.statements import (
+    Statement,
+    Word,
+    read_amount,
+    read_shape,
+    reserved_words,
+    text_span,
+)
 
 Entries = dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]]
 
@@ -244,7 +251,7 @@ class _TaskReader:
                 self.reporter.error("PD803", f"the default of `{key.text}`", default.span, label, helps=helps)
                 continue
             about = self.reader.text(entries, "about")
-            usual = int(value.value or 0)
+            usual = value.integer
             chosen = int(self.given.get(key.text, usual))
             for one, span in (
                 (usual, default.span),
@@ -275,7 +282,7 @@ class _TaskReader:
                 if not isinstance(item, yaml_tree.Scalar):
                     self.reader.shape(item, "a shape, such as `box rows 1:5 columns 2:8`")
                 elif span is not None:
-                    shapes.append(read_statement(span, self.reporter, shape=True))
+                    shapes.append(read_shape(span, self.reporter))
             found[key.text] = tuple(one for one in shapes if one is not None)
         return found
 
@@ -346,7 +353,7 @@ class _TaskReader:
                     continue
                 filled = filled_in(amount, plan.knobs)
                 if filled.is_number:
-                    values[word.text] = int(filled.value or 0)
+                    values[word.text] = filled.integer
                 else:
                     self.reporter.error("PD803", "a knob is one number", amount.span, "no draws here")
             changes["knobs"] = values

@@ -8,7 +8,8 @@ from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.schema import Reader, first_line
 from powderdsl.syntax import yaml_tree
 from powderdsl.worlds.scene.amounts import Amount
-from powderdsl.worlds.scene.statements import Statement, Word, read_amount, read_statement
+from powderdsl.worlds.scene.read import not_a_statement
+from powderdsl.worlds.scene.statements import Statement, Word, read_amount, read_statement, text_span
 
 BROKEN = Amount("broken")
 """A number whose mistake has been reported: what depends on it is not a second one."""
@@ -30,16 +31,6 @@ class Repeat:
 Item = Statement | Repeat
 
 
-def text_span(node: yaml_tree.Node, reporter: Reporter) -> Span | None:
-    """The place of a line of text, or None after reporting that it is none."""
-    if not isinstance(node, yaml_tree.Scalar):
-        return None
-    if node.style == "quoted" and node.content.text.split() != node.text.split():
-        reporter.error("PD605", "escapes in a quoted statement", node.span, "escaped or doubled quotes")
-        return None
-    return node.content
-
-
 def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = False) -> tuple[Item, ...]:
     """The items of a list of statements. `nested` lists, those of a repetition, hold no repetitions."""
     reporter = reader.reporter
@@ -52,26 +43,22 @@ def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = Fa
         message = f"a list of {len(node.items):,} statements"
         reporter.error("PD508", message, first_line(node), f"the limit is {MAX_STATEMENTS:,}")
         return ()
-    found: list[Item] = []
+    found: list[Item | None] = []
     for item in node.items:
-        if isinstance(item, yaml_tree.Scalar):
-            span = text_span(item, reporter)
-            statement = read_statement(span, reporter) if span is not None else None
-            if statement is not None:
-                found.append(statement)
-        elif isinstance(item, yaml_tree.Mapping):
-            repeat = None if nested else _repeat(item, reader)
-            if repeat is not None:
-                found.append(repeat)
-            elif nested and not _is_let(item):
+        if isinstance(item, yaml_tree.Mapping):
+            if not nested:
+                found.append(_repeat(item, reader))
+            elif not _is_let(item):
                 _not_a_statement(item, reporter, nested)
-        else:
+        elif isinstance(item, yaml_tree.Sequence):
             reader.shape(item, "a statement")
-    return tuple(found)
+        elif span := text_span(item, reporter):
+            found.append(read_statement(span, reporter))
+    return tuple(item for item in found if item is not None)
 
 
-def _is_let(item: yaml_tree.Node) -> bool:
-    return isinstance(item, yaml_tree.Mapping) and [key.text for key, _ in item.entries] == ["let"]
+def _is_let(item: yaml_tree.Mapping) -> bool:
+    return [key.text for key, _ in item.entries] == ["let"]
 
 
 def _repeat(item: yaml_tree.Mapping, reader: Reader) -> Repeat | None:
@@ -105,15 +92,11 @@ def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Word, A
 
 
 def _not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, nested: bool) -> None:
-    key = item.entries[0][0] if item.entries else None
-    word = key.text.split(maxsplit=1)[0] if key is not None and key.text else ""
+    word = next(iter(item.entries[0][0].text.split()), "") if item.entries else ""
     if nested and word == "repeat":
         fix = "repetitions do not stand in repetitions: multiply the counts"
     elif word == "let":
         fix = "`let:` stands at the top of the file, or in a repetition"
     else:
         fix = "say `48:end` for `48:`, or quote the statement; `repeat 0..5:` has a list below it"
-    message = "YAML reads this statement as a mapping"
-    reporter.error(
-        "PD605", message, first_line(item), "a `:` at the end of a word makes it a key", helps=[fix]
-    )
+    not_a_statement(item, reporter, fix)

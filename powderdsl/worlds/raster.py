@@ -1,13 +1,15 @@
 """Shapes, and which cells of a grid they cover. Rows come first and count downwards; everything is exact.
 
-Shapes are data and name no element: `Paint` puts one on a world, a task can use the same shapes as regions.
+In each column a shape covers one run of rows, so its formula gives the first row and the one after the last. The
+formulas use only what NumPy and torch call by the same names: one shape of a scene, or one for each world of a batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,98 +22,26 @@ MAX_CELLS = 1 << 24
 MAX_COORDINATE = 1 << 24
 """Coordinates, widths and radii lie within ±MAX_COORDINATE, so that int64 holds every product below."""
 
+FAR = 1 << 40
+"""Beyond every row."""
+
 Size = tuple[int, int]
 """(rows, columns)."""
 
-Point = tuple[int, int]
-"""(row, column); it may lie outside the grid."""
-
-Slice = tuple[int, int | None]
-"""First row or column, and the one after the last; None reaches to the end of the grid."""
+Rows = tuple[Any, Any]
+"""In each column the first row, and the one after the last. Without rows the first is not smaller."""
 
 
 @dataclass(frozen=True)
-class Line:
-    """A thick line from `start` to `end`, both included.
+class Shape:
+    """A set of cells. `numbers` stand in the order of `scene.statements.NUMBERS`; None is an open end of a range.
 
-    It covers, at every whole step along its longer axis (the columns, where both are equally long), the cells
-    whose distance from the exact line, along the shorter one, is below ``1 + width·√(1 + slope²)/4``.
-    A line along an axis is thus three cells thick at widths 1 to 4, five at widths 5 to 8.
+    Kinds: ``line``, ``disk``, ``square``, ``box``, ``ramp``, ``arch``, ``container`` and ``wave``, as the functions of
+    these names below say; ``frame``, the outermost cells of the grid, whatever its size; ``fill``, all cells.
     """
 
-    start: Point
-    end: Point
-    width: int
-
-
-@dataclass(frozen=True)
-class Disk:
-    """The cells nearer to `center` than `radius`: a disk of radius 1 is one cell."""
-
-    center: Point
-    radius: int
-
-
-@dataclass(frozen=True)
-class Box:
-    """Rows a ≤ r < b of columns c ≤ k < d, clipped to the grid."""
-
-    rows: Slice = (0, None)
-    columns: Slice = (0, None)
-
-
-@dataclass(frozen=True)
-class Frame:
-    """The outermost cells of the grid, whatever its size."""
-
-
-@dataclass(frozen=True)
-class Square:
-    """Rows and columns from `half` before the center up to, and without, `half` behind it: a side of 2·half."""
-
-    center: Point
-    half: int
-
-
-@dataclass(frozen=True)
-class Ramp:
-    """Between the columns of two points, both included: what lies on or below the straight line from one to the
-    other, down to the lower one's row. Points in one column make a bar."""
-
-    start: Point
-    end: Point
-
-
-@dataclass(frozen=True)
-class Arch:
-    """The cells of a box that are fewer than `width` from its upper edge or its sides: open below."""
-
-    rows: Slice
-    columns: Slice
-    width: int
-
-
-@dataclass(frozen=True)
-class Container:
-    """The cells of a box that are fewer than `width` from its lower edge or its sides: open above."""
-
-    rows: Slice
-    columns: Slice
-    width: int
-
-
-@dataclass(frozen=True)
-class Wave:
-    """What lies on or below a zigzag: at column c it is in row ``row + height·u // length``, where t is c + phase
-    modulo `length` and u is the smaller of 2·t and 2·(length − t)."""
-
-    row: int
-    height: int
-    length: int
-    phase: int
-
-
-Shape = Line | Disk | Square | Box | Ramp | Arch | Container | Wave | Frame
+    kind: str
+    numbers: tuple[int | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -139,105 +69,175 @@ class Setting:
 def mask(shape: Shape, size: Size) -> NDArray[np.bool_]:
     """The cells of a shape in a grid of `size`, bool [H, W]. What lies outside the grid is cut off."""
     cells = np.zeros(size, dtype=np.bool_)
-    rows, columns = window(shape, size)
-    cells[rows, columns] = _covered(shape, rows, columns, size)
+    window, covered = _in_window(shape, size)
+    cells[window] = covered
     return cells
 
 
 def paint(size: Size, fill: int, paints: Iterable[Paint], ids: Mapping[str, int]) -> NDArray[np.uint8]:
-    """A world uint8 [H, W]: `fill` everywhere, then each statement over what stands already.
+    """A world uint8 [H, W]: `fill` everywhere, then the statements in order, each over the ones before.
 
     `ids` gives the id of every element name that the statements use.
     """
     world = np.full(size, fill, dtype=np.uint8)
     for statement in paints:
-        rows, columns = window(statement.shape, size)
-        world[rows, columns][_covered(statement.shape, rows, columns, size)] = ids[statement.element]
+        window, covered = _in_window(statement.shape, size)
+        world[window][covered] = ids[statement.element]
     return world
 
 
-def window(shape: Shape, size: Size) -> tuple[slice, slice]:
-    """Rows and columns of the grid outside of which the shape covers nothing. May be empty."""
-    height, width = size
-    match shape:
-        case Line(start, end, thickness):
+def _in_window(shape: Shape, size: Size) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+    """The rows and columns of the grid outside of which a shape covers nothing, and the cells that it covers there."""
+    if shape.kind == "frame":
+        edge = np.ones(size, dtype=np.bool_)
+        edge[1:-1, 1:-1] = False
+        return (slice(None), slice(None)), edge
+    columns = _columns(shape, size[1])
+    runs = covered_rows(np, shape.kind, shape.numbers, np.arange(columns.start, columns.stop), size)
+    first, last = (np.clip(one, 0, size[0]) for one in runs)
+    if not (first < last).any():
+        return (slice(0), slice(0)), np.zeros((0, 0), dtype=np.bool_)
+    row = np.arange(first.min(), last.max())[:, None]
+    window = (slice(row[0, 0], row[-1, 0] + 1), slice(columns.start, columns.stop))
+    return window, (row >= first) & (row < last)
+
+
+def _columns(shape: Shape, width: int) -> range:
+    """The columns of the grid outside of which a shape covers nothing: a wide grid has many."""
+    first, last = 0, width
+    match shape.kind, shape.numbers:
+        case "line", (_, int(left), _, int(end), int(thickness)):
             # 2 + width bounds 1 + width·√(1 + slope²)/4, as no slope is steeper than 1.
-            reach = thickness + 2
-            return (
-                _clip(min(start[0], end[0]) - reach, max(start[0], end[0]) + reach + 1, height),
-                _clip(min(start[1], end[1]) - reach, max(start[1], end[1]) + reach + 1, width),
-            )
-        case Disk((row, column), radius):
-            return _clip(row - radius, row + radius + 1, height), _clip(
-                column - radius, column + radius + 1, width
-            )
-        case Box(rows, columns):
-            return _clip(rows[0], rows[1], height), _clip(columns[0], columns[1], width)
-        case Square((row, column), half):
-            return _clip(row - half, row + half, height), _clip(column - half, column + half, width)
-        case Ramp(start, end):
-            return (
-                _clip(min(start[0], end[0]), max(start[0], end[0]) + 1, height),
-                _clip(min(start[1], end[1]), max(start[1], end[1]) + 1, width),
-            )
-        case Arch(rows, columns) | Container(rows, columns):
-            return _clip(rows[0], rows[1], height), _clip(columns[0], columns[1], width)
-        case Wave(row):
-            return _clip(row, None, height), slice(0, width)
-        case Frame():
-            return slice(0, height), slice(0, width)
+            first, last = min(left, end) - thickness - 2, max(left, end) + thickness + 3
+        case "ramp", (_, int(left), _, int(end)):
+            first, last = min(left, end), max(left, end) + 1
+        case "disk" | "square", (_, int(center), int(reach)):
+            first, last = center - reach, center + reach
+        case "box" | "arch" | "container", (_, _, int(left), end, *_):
+            first, last = left, width if end is None else end
+    return range(max(first, 0), max(min(last, width), 0))
 
 
-def _clip(start: int, stop: int | None, length: int) -> slice:
-    first = min(max(start, 0), length)
-    return slice(first, length if stop is None else min(max(stop, first), length))
+def covered_rows(xp: Any, kind: str, numbers: Sequence[Any], column: Any, size: Size) -> Rows:
+    """The rows that a shape covers in each column. A frame has no such rows.
 
+    Args:
+        xp: numpy or torch. numbers: integers, or int64 tensors [..., 1]. column: int64 [W], of the same library.
 
-def _covered(shape: Shape, rows: slice, columns: slice, size: Size) -> NDArray[np.bool_]:
-    """Which cells of a window the shape covers."""
-    row = np.arange(rows.start, rows.stop, dtype=np.int64)[:, None]
-    column = np.arange(columns.start, columns.stop, dtype=np.int64)[None, :]
-    match shape:
-        case Line():
-            return _line(shape, row, column)
-        case Disk(center, radius):
-            return (row - center[0]) ** 2 + (column - center[1]) ** 2 < radius * radius
-        case Box() | Square():
-            return np.ones((row.size, column.size), dtype=np.bool_)
-        case Ramp((top, left), (bottom, right)):
-            if left == right:
-                return np.ones((row.size, column.size), dtype=np.bool_)
-            over = 1 if right > left else -1
-            return (row - top) * abs(right - left) >= (column - left) * over * (bottom - top)
-        case Arch(_, (left, right), thickness):
-            end = size[1] if right is None else right
-            roof = row < shape.rows[0] + thickness
-            return roof | (column < left + thickness) | (column >= end - thickness)
-        case Container((_, bottom_row), (left, right), thickness):
-            end = size[1] if right is None else right
-            floor = row >= (size[0] if bottom_row is None else bottom_row) - thickness
-            return floor | (column < left + thickness) | (column >= end - thickness)
-        case Wave(first, height, length, phase):
-            turn = (column + phase) % length
-            return row >= first + height * np.minimum(2 * turn, 2 * (length - turn)) // length
-        case Frame():
-            last_row, last_column = size[0] - 1, size[1] - 1
-            return (row == 0) | (row == last_row) | (column == 0) | (column == last_column)
-
-
-def _line(line: Line, row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """The cells of a line. The cross product with its direction is the distance times the longer length.
-
-    |cross|/length < 1 + width·√(1 + slope²)/4 is 4·(|cross| − length) < √(width²·(down² + right²)): whole
-    numbers on the left, so the root may be rounded, and no cell depends on floating point.
+    Returns:
+        two values that broadcast to int64 [..., W].
     """
-    (top, left), (bottom, end_column) = line.start, line.end
-    down, right = bottom - top, end_column - left
-    along_rows = abs(down) > abs(right)
-    place, first, last = (row, top, bottom) if along_rows else (column, left, end_column)
-    if down == right == 0:
-        right = 1  # a single point: a level line one step long
-    length = max(abs(down), abs(right))
-    cross = (column - left) * down - (row - top) * right
-    bound = 4 * length + isqrt(line.width**2 * (down**2 + right**2) - 1)
-    return (place >= min(first, last)) & (place <= max(first, last)) & (4 * np.abs(cross) <= bound)
+    # An open end of rows or columns reaches to the end of the grid.
+    ends = (0, size[0], 0, size[1])
+    n = [numbers[0] * 0 + ends[place] if one is None else one for place, one in enumerate(numbers)]
+    return _SHAPES[kind](xp, column, n, size)
+
+
+def _line(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """A thick line from a point to another, both included.
+
+    It covers, at every whole step along its longer axis (the columns, where both are equally long), the cells
+    whose distance from the exact line, along the shorter one, is below ``1 + width·√(1 + slope²)/4``.
+    A line along an axis is thus three cells thick at widths 1 to 4, five at widths 5 to 8.
+
+    The cross product of a cell with the direction is the distance times the longer length, so a cell is covered where
+    4·(|cross| − length) < √(width²·(down² + right²)): integers on the left, so the root may be rounded down.
+    """
+    top, left, bottom, end, width = n
+    down, right = bottom - top, end - left
+    point = (down == 0) & (right == 0)  # a level line one step long
+    longer = right + point
+    length = xp.maximum(abs(down), abs(longer))
+    bound = length + root(xp, width * width * (down * down + longer * longer) - 1) // 4
+    # Turning the line round changes nothing, so the slope may be taken to the right.
+    across = (column - left) * down * xp.where(right < 0, -1, 1)
+    divisor = xp.clip(abs(longer), 1, None)
+    upright, hit = longer == 0, abs(across) <= bound
+    first = xp.where(upright, xp.where(hit, -FAR, FAR), top - (bound - across) // divisor)
+    last = xp.where(upright, xp.where(hit, FAR, -FAR), top + (across + bound) // divisor)
+    steep, level = abs(down) > abs(right), abs(down) <= abs(right)
+    first = xp.where(steep, xp.maximum(first, xp.minimum(top, bottom)), first)
+    last = xp.where(steep, xp.minimum(last, xp.maximum(top, bottom)), last)
+    beside = level & ((column < xp.minimum(left, end)) | (column > xp.maximum(left, end)))
+    return xp.where(beside, FAR, first), last + 1
+
+
+def _disk(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """The cells nearer to the center than the radius: a disk of radius 1 is one cell."""
+    row, center, radius = n
+    left = radius * radius - 1 - (column - center) ** 2
+    reach = root(xp, xp.clip(left, 0, None))
+    return xp.where(left < 0, FAR, row - reach), row + reach + 1
+
+
+def _square(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """Rows and columns from `half` before the center up to, and without, `half` behind it: a side of 2·half."""
+    row, center, half = n
+    return _box(xp, column, (row - half, row + half, center - half, center + half), size)
+
+
+def _box(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """Rows a ≤ r < b of columns c ≤ k < d."""
+    top, bottom, left, end = n[:4]
+    return xp.where((column < left) | (column >= end), FAR, top), bottom
+
+
+def _arch(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """The cells of a box that are fewer than `width` from its upper edge or its sides: open below."""
+    top, bottom, left, end, width = n
+    leg = (column < left + width) | (column >= end - width)
+    first, _ = _box(xp, column, n, size)
+    return first, xp.where(leg, bottom, xp.minimum(top + width, bottom))
+
+
+def _container(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """The cells of a box that are fewer than `width` from its lower edge or its sides: open above."""
+    _, bottom, left, end, width = n
+    leg = (column < left + width) | (column >= end - width)
+    first, _ = _box(xp, column, n, size)
+    return xp.where(leg, first, xp.maximum(first, bottom - width)), bottom
+
+
+def _ramp(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """Between the columns of two points, both included: what lies on or below the straight line from one to the
+    other, down to the lower one's row. Points in one column make a bar."""
+    top, left, bottom, end = n
+    wide = abs(end - left)
+    climb = (column - left) * xp.where(end > left, 1, -1) * (bottom - top)
+    first = xp.where(wide == 0, xp.minimum(top, bottom), top - (-climb) // xp.clip(wide, 1, None))
+    beside = (column < xp.minimum(left, end)) | (column > xp.maximum(left, end))
+    return xp.where(beside, FAR, first), xp.maximum(top, bottom) + 1
+
+
+def _wave(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    """What lies on or below a zigzag: at column c it is in row ``row + height·u // length``, where t is c + phase
+    modulo `length` and u is the smaller of 2·t and 2·(length − t)."""
+    row, height, length, phase = n
+    turn = (column + phase) % length
+    return row + height * xp.minimum(2 * turn, 2 * (length - turn)) // length, row * 0 + size[0]
+
+
+def _fill(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
+    return column * 0, column * 0 + size[0]
+
+
+_SHAPES: dict[str, Callable[[Any, Any, Sequence[Any], Size], Rows]] = {
+    "line": _line,
+    "disk": _disk,
+    "square": _square,
+    "box": _box,
+    "ramp": _ramp,
+    "arch": _arch,
+    "container": _container,
+    "wave": _wave,
+    "fill": _fill,
+}
+
+
+def root(xp: Any, x: Any) -> Any:
+    """The square root of integers of 0 or more, rounded down: of one, or of arrays of numbers up to 2⁵²."""
+    if isinstance(x, int):
+        return isqrt(x)
+    found = xp.asarray(xp.sqrt(xp.asarray(x, dtype=xp.float64)), dtype=xp.int64)
+    found = found - (found * found > x) * 1
+    return found + ((found + 1) ** 2 <= x) * 1

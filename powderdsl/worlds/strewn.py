@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from powderdsl.analysis.reactions import moved_ids, unchanging_ids
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
-from powderdsl.worlds.raster import MAX_CELLS, Box, Disk, Frame, Line, Shape, Size, mask
+from powderdsl.worlds.raster import MAX_CELLS, Shape, Size, mask
 
 MAX_TOTAL = 16 * MAX_CELLS
 """Cells of all worlds that are made at once."""
@@ -36,7 +36,7 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
     if not others:
         return worlds
     frame = _frame_element(ruleset, ground) if min(size) >= 3 else None
-    edge = mask(Frame(), size)
+    edge = mask(Shape("frame"), size)
     for index, world in enumerate(worlds):
         random = np.random.default_rng([seed, index])
         for _ in range(24):
@@ -55,12 +55,12 @@ def random_shape(random: np.random.Generator, size: Size, reach: int) -> Shape:
     row, column = (int(random.integers(side)) for side in size)
     match random.integers(3):
         case 0:
-            return Disk((row, column), int(random.integers(1, reach + 2)))
+            return Shape("disk", (row, column, int(random.integers(1, reach + 2))))
         case 1:
             rows, columns = (int(number) for number in random.integers(1, 2 * reach + 1, 2))
-            return Box((row, row + rows), (column, column + columns))
+            return Shape("box", (row, row + rows, column, column + columns))
     down, right = (int(number) for number in random.integers(-2 * reach, 2 * reach + 1, 2))
-    return Line((row, column), (row + down, column + right), 1)
+    return Shape("line", (row, column, row + down, column + right, 1))
 
 
 def _frame_element(ruleset: Ruleset, ground: int) -> int | None:

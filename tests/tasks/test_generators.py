@@ -12,9 +12,8 @@ from powderdsl.diagnostics import Reporter, Source
 from powderdsl.tasks.file import read_task
 from powderdsl.tasks.names import shipped_tasks
 from powderdsl.tasks.shipped import load_task
-from powderdsl.worlds.raster import mask
+from powderdsl.worlds.raster import Shape, mask
 from powderdsl.worlds.scene import load_scenes
-from powderdsl.worlds.scene.fixed import shape_of
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\nagent: {may: any, actions: 3}\n"
@@ -136,7 +135,7 @@ def test_drawn_numbers_are_those_of_their_statement(torch):
     """Each world is what worlds/raster.py makes of one of the shapes that the statement allows."""
     text = "let: {row: 8..53}\ngenerate:\n  - disk sand at (row, row + 2) radius 3 * (1..3)\n"
     allowed = {
-        (mask(shape_of("disk", [row, row + 2, 3 * k]), (64, 64))).tobytes()
+        (mask(Shape("disk", (row, row + 2, 3 * k)), (64, 64))).tobytes()
         for row in range(8, 54)
         for k in (1, 2, 3)
     }
@@ -205,7 +204,7 @@ def test_the_hand_made_worlds(torch):
         return world
 
     def line(world, start, end):
-        world[mask(shape_of("line", [*start, *end, 25 if start != (0, 0) else 15]), (64, 64))] = 0
+        world[mask(Shape("line", (*start, *end, 25 if start != (0, 0) else 15)), (64, 64))] = 0
         return world
 
     every = slice(None)

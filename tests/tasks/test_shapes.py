@@ -1,4 +1,4 @@
-"""Shapes of whole batches cover the cells that worlds/raster.py says, one world at a time."""
+"""Shapes cover the cells that their definitions say, one at a time and in whole batches."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from powderdsl.worlds.raster import Arch, Container, Ramp, Square, Wave, mask
-from powderdsl.worlds.scene.fixed import shape_of
+from powderdsl.worlds.raster import Shape, mask
 
 PLACE = st.integers(-12, 90)
 SIZES = st.sampled_from([(1, 1), (7, 9), (64, 64), (65, 30), (130, 12)])
@@ -22,13 +21,18 @@ def picture(cells: np.ndarray) -> list[str]:
 
 def test_the_shapes_of_generators():
     ramp = ["......", "...x..", "..xx..", ".xxx..", "......"]
-    assert picture(mask(Ramp((3, 1), (1, 3)), (5, 6))) == ramp
-    assert picture(mask(Ramp((1, 3), (3, 1)), (5, 6))) == ramp
-    assert picture(mask(Ramp((1, 1), (3, 1)), (5, 3))) == ["...", ".x.", ".x.", ".x.", "..."]
-    assert picture(mask(Square((2, 2), 1), (4, 4))) == ["....", ".xx.", ".xx.", "...."]
-    assert picture(mask(Arch((1, 4), (0, 4), 1), (4, 5))) == [".....", "xxxx.", "x..x.", "x..x."]
-    assert picture(mask(Container((0, None), (1, None), 1), (3, 5))) == [".x..x", ".x..x", ".xxxx"]
-    assert picture(mask(Wave(1, 2, 4, 0), (4, 8))) == ["........", "x...x...", "xx.xxx.x", "xxxxxxxx"]
+    assert picture(mask(Shape("ramp", (3, 1, 1, 3)), (5, 6))) == ramp
+    assert picture(mask(Shape("ramp", (1, 3, 3, 1)), (5, 6))) == ramp
+    assert picture(mask(Shape("ramp", (1, 1, 3, 1)), (5, 3))) == ["...", ".x.", ".x.", ".x.", "..."]
+    assert picture(mask(Shape("square", (2, 2, 1)), (4, 4))) == ["....", ".xx.", ".xx.", "...."]
+    assert picture(mask(Shape("arch", (1, 4, 0, 4, 1)), (4, 5))) == [".....", "xxxx.", "x..x.", "x..x."]
+    assert picture(mask(Shape("container", (0, None, 1, None, 1)), (3, 5))) == [".x..x", ".x..x", ".xxxx"]
+    assert picture(mask(Shape("wave", (1, 2, 4, 0)), (4, 8))) == [
+        "........",
+        "x...x...",
+        "xx.xxx.x",
+        "xxxxxxxx",
+    ]
 
 
 def ranges() -> st.SearchStrategy[list[int | None]]:
@@ -51,9 +55,47 @@ NUMBERS: dict[str, st.SearchStrategy[Any]] = {
 }
 
 
+def between(one: Any, first: int, last: int) -> Any:
+    return (one >= min(first, last)) & (one <= max(first, last))
+
+
+def definition(kind: str, n: list[Any], size: tuple[int, int]) -> np.ndarray:
+    """The cells of a shape, each by itself, bool [H, W]."""
+    row, column = np.arange(size[0])[:, None], np.arange(size[1])
+    if kind in ("box", "arch", "container"):
+        top, bottom, left, end, *rest = (one if one is not None else size[i // 2] for i, one in enumerate(n))
+        box = (row >= top) & (row < bottom) & (column >= left) & (column < end)
+        if kind == "box":
+            return box
+        lid = row < top + rest[0] if kind == "arch" else row >= bottom - rest[0]
+        return box & (lid | (column < left + rest[0]) | (column >= end - rest[0]))
+    if kind == "disk":
+        return (row - n[0]) ** 2 + (column - n[1]) ** 2 < n[2] ** 2
+    if kind == "square":
+        return (np.maximum(row - n[0], n[0] - row - 1) < n[2]) & (
+            np.maximum(column - n[1], n[1] - column - 1) < n[2]
+        )
+    if kind == "wave":
+        turn = (column + n[3]) % n[2]
+        return row >= n[0] + n[1] * np.minimum(2 * turn, 2 * (n[2] - turn)) // n[2]
+    top, left, bottom, end = n[:4]
+    down, right = bottom - top, end - left
+    if kind == "ramp":
+        over = (row - top) * abs(right) >= (column - left) * down * (1 if right > 0 else -1)
+        return (
+            between(column, left, end)
+            & (over if right else row >= min(top, bottom))
+            & (row <= max(top, bottom))
+        )
+    within = between(row, top, bottom) if abs(down) > abs(right) else between(column, left, end)
+    right = 1 if down == right == 0 else right
+    excess = 4 * (np.abs((column - left) * down - (row - top) * right) - max(abs(down), abs(right)))
+    return within & ((excess < 0) | (excess**2 < n[4] ** 2 * (down**2 + right**2)))
+
+
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_batches_cover_the_same_cells(torch, kind):
-    from powderdsl.tasks.tensors.shapes import covered_rows, unpack, words_of_rows
+    from powderdsl.tasks.tensors.shapes import shape_words, unpack
 
     @settings(max_examples=60, deadline=None, derandomize=True)
     @given(batch=st.lists(NUMBERS[kind], min_size=1, max_size=6), size=SIZES)
@@ -61,10 +103,11 @@ def test_batches_cover_the_same_cells(torch, kind):
         opens = [batch[0][i] is None for i in range(len(batch[0]))]
         batch = [one for one in batch if [n is None for n in one] == opens]
         columns = [None if n[0] is None else torch.tensor(n) for n in zip(*batch, strict=True)]
-        words = words_of_rows(covered_rows(kind, columns, size), size)
-        found = unpack([words], size[0]).bool().numpy()
+        found = unpack([shape_words(kind, columns, size)], size[0]).bool().numpy()
         for one, numbers in zip(found, batch, strict=True):
-            assert np.array_equal(one, mask(shape_of(kind, numbers), size)), (numbers, size)
+            expected = definition(kind, numbers, size)
+            assert np.array_equal(one, expected), (numbers, size)
+            assert np.array_equal(mask(Shape(kind, tuple(numbers)), size), expected), (numbers, size)
 
     compare()
 
@@ -82,8 +125,8 @@ def test_bits_and_cells_are_the_same(seed, size):
 
 
 def test_whole_roots_are_exact(torch):
-    from powderdsl.tasks.tensors.shapes import root
+    from powderdsl.worlds.raster import root
 
     n = torch.tensor([0, 1, 2, 3, 4, 2**26, 2**25 - 1, 67_108_863])
-    assert torch.equal(root(n * n), n)
-    assert torch.equal(root((n * n - 1).clamp(min=0)), (n - 1).clamp(min=0))
+    assert torch.equal(root(torch, n * n), n)
+    assert torch.equal(root(torch, (n * n - 1).clamp(min=0)), (n - 1).clamp(min=0))

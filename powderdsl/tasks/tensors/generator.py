@@ -16,10 +16,9 @@ from torch import Tensor
 
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.tasks.task import Drawing, Generator, Group, Region
-from powderdsl.tasks.tensors.shapes import covered_rows, pack, unpack, words_of_rows
-from powderdsl.worlds.raster import Size, mask
-from powderdsl.worlds.scene.amounts import Amount, calculate
-from powderdsl.worlds.scene.fixed import shape_of
+from powderdsl.tasks.tensors.shapes import pack, shape_words, unpack
+from powderdsl.worlds.raster import Shape, Size, mask
+from powderdsl.worlds.scene.amounts import CALCULATE, Amount, integers
 
 NOTHING = 255
 """In targets and stamps: no element."""
@@ -116,7 +115,7 @@ class _Draws:
 
     def value(self, amount: Amount) -> Tensor | int:
         if amount.op == "number":
-            return int(amount.value or 0)
+            return amount.integer
         if amount.op == "name":
             return self.names[str(amount.value)]
         parts = [self.value(arg) for arg in amount.args]
@@ -124,10 +123,8 @@ class _Draws:
             return self.uniform(parts[0], parts[1])
         if amount.op == "neg":
             return -parts[0]
-        if amount.op in ("div", "mod") and any(isinstance(part, Tensor) for part in parts):
-            a, b = (torch.as_tensor(part, device=self.device) for part in parts)
-            return torch.div(a, b, rounding_mode="floor") if amount.op == "div" else torch.remainder(a, b)
-        return calculate(amount.op, parts[0], parts[1])  # type: ignore[arg-type]
+        found: Tensor | int = CALCULATE[amount.op](parts[0], parts[1])
+        return found
 
     def tensor(self, amount: Amount | None) -> Tensor | None:
         """int64 that broadcasts to [B, R]."""
@@ -257,13 +254,13 @@ class WorldMaker:
         """The words of a shape whose numbers broadcast to [B, R]: broadcasts to [B, R, W, K]."""
         if drawing.kind in ("frame", "fill"):
             return self.fixed_words(drawing)
-        return words_of_rows(covered_rows(drawing.kind, numbers, self.size), self.size)
+        return shape_words(drawing.kind, numbers, self.size)
 
     def fixed_words(self, drawing: Drawing) -> Tensor:
         """The words [W, K] of a shape of plain numbers."""
         if drawing not in self.fixed:
-            numbers = [None if one is None else int(one.value or 0) for one in drawing.amounts]
-            cells = torch.as_tensor(mask(shape_of(drawing.kind, numbers), self.size), device=self.device)
+            shape = Shape(drawing.kind, integers(drawing.amounts) or ())
+            cells = torch.as_tensor(mask(shape, self.size), device=self.device)
             self.fixed[drawing] = pack(cells)
         return self.fixed[drawing]
 
@@ -319,7 +316,7 @@ class _Painter:
             bits = maker.fixed_bits(drawing.ids[0] if drawing.ids else 0, planes)
         self.bits = bits.unbind(2) if bits.shape[2] > 1 else bits.unbind(2) * repeats
         self.numbers: list[Tensor | None] = []
-        if all(one is None or one.is_number for one in drawing.amounts) and drawing.kind not in _LIMITED:
+        if integers(drawing.amounts) is not None and drawing.kind not in _LIMITED:
             words = maker.fixed_words(drawing) & once
         else:
             numbers = [draws.tensor(one) for one in drawing.amounts]

@@ -15,10 +15,18 @@
 `draw` may also be a `|` block, one statement a line. A file with several scenes has a list under `scenes`.
 """
 
-from powderdsl.worlds.scene.fixed import parse_statement
-from powderdsl.worlds.scene.load import draw_scene, find_scene, load_scene, load_scenes, shipped_scenes
-from powderdsl.worlds.scene.read import Scene, read_scenes
-from powderdsl.worlds.scene.start import FieldValues, Start, draw_start, load_start
+from powderdsl.worlds.scene.load import (
+    FieldValues,
+    Start,
+    draw_scene,
+    draw_start,
+    find_scene,
+    load_scene,
+    load_scenes,
+    load_start,
+    shipped_scenes,
+)
+from powderdsl.worlds.scene.read import Scene, parse_statement, read_scenes
 from powderdsl.worlds.scene.statements import STATEMENTS
 
 __all__ = [

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from powderdsl.diagnostics import Span
 
@@ -34,25 +36,32 @@ class Amount:
     def is_number(self) -> bool:
         return self.op == "number"
 
+    @property
+    def integer(self) -> int:
+        """The value of a number; of others 0."""
+        return self.value if isinstance(self.value, int) else 0
+
+
+def integers(amounts: Iterable[Amount | None]) -> tuple[int | None, ...] | None:
+    """The values of numbers that are written out, None for open ends; None if one is drawn or named."""
+    found = list(amounts)
+    if not all(one is None or one.is_number for one in found):
+        return None
+    return tuple(None if one is None else one.integer for one in found)
+
 
 def number(value: int, span: Span | None = None) -> Amount:
     return Amount("number", (), value, span)
 
 
-def calculate(op: str, a: int, b: int) -> int:
-    """The value of an operation. Raises ZeroDivisionError."""
-    match op:
-        case "add":
-            return a + b
-        case "sub":
-            return a - b
-        case "mul":
-            return a * b
-        case "div":
-            return a // b
-        case "mod":
-            return a % b
-    raise AssertionError(op)
+CALCULATE: dict[str, Callable[[Any, Any], Any]] = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.floordiv,
+    "mod": operator.mod,
+}
+"""What operations do with integers, or tensors of them. The divisor 0 raises ZeroDivisionError for integers."""
 
 
 def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
@@ -61,11 +70,11 @@ def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
         return number(values[str(amount.value)], amount.span)
     args = tuple(filled_in(arg, values) for arg in amount.args)
     if args and all(arg.is_number for arg in args):
-        first, *rest = (int(arg.value or 0) for arg in args)
+        first, *rest = (arg.integer for arg in args)
         if amount.op == "neg":
             return number(-first, amount.span)
         if amount.op != "draw":
-            return number(calculate(amount.op, first, rest[0]), amount.span)
+            return number(CALCULATE[amount.op](first, rest[0]), amount.span)
         if first == rest[0]:
             return number(first, amount.span)
     return Amount(amount.op, args, amount.value, amount.span)
@@ -74,8 +83,7 @@ def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
 def interval(amount: Amount, names: Mapping[str, Interval]) -> Interval:
     """Bounds of what the amount can be. Raises KeyError for an unknown name, ZeroDivisionError if a divisor may be 0."""
     if amount.op == "number":
-        value = int(amount.value or 0)
-        return value, value
+        return amount.integer, amount.integer
     if amount.op == "name":
         return names[str(amount.value)]
     first, *rest = (interval(arg, names) for arg in amount.args)
@@ -88,5 +96,5 @@ def interval(amount: Amount, names: Mapping[str, Interval]) -> Interval:
         raise ZeroDivisionError
     if amount.op == "mod":
         return (0, second[1] - 1) if second[0] > 0 else (second[0] + 1, 0)
-    corners = [calculate(amount.op, a, b) for a in first for b in second]
+    corners = [CALCULATE[amount.op](a, b) for a in first for b in second]
     return min(corners), max(corners)

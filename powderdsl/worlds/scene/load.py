@@ -1,19 +1,22 @@
-"""Scenes by file or name -> start worlds of a ruleset."""
+"""Scenes by file or name -> start worlds of a ruleset: elements, and fields in shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.diagnostics import Reporter, suggest
-from powderdsl.model.types import Element
+from powderdsl.model.fields.words import WordProblem, read_word
+from powderdsl.model.state import Slot, slot_name, slots
+from powderdsl.model.types import Element, Ruleset
 from powderdsl.syntax.sources import read_source
 from powderdsl.system.writing import failure
-from powderdsl.worlds.raster import MAX_CELLS, Paint, Size, paint
+from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Size, mask, paint
 from powderdsl.worlds.scene.read import SIZE_RULE, Scene, read_scenes
 
 
@@ -22,6 +25,22 @@ class HasElements(Protocol):
 
     @property
     def elements(self) -> Sequence[Element]: ...
+
+
+@dataclass(frozen=True)
+class FieldValues:
+    """Values of a field, [H, W] or [2, H, W], and the cells bool [H, W] that have them; others have the default."""
+
+    values: NDArray[Any]
+    where: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start world: element ids uint8 [H, W], and the fields that the scene sets, by name."""
+
+    ids: NDArray[np.uint8]
+    fields: Mapping[str, FieldValues]
 
 
 def load_scene(
@@ -37,6 +56,11 @@ def load_scene(
     return draw_scene(find_scene(path_or_name), ruleset, size=size)
 
 
+def load_start(path_or_name: str | Path, ruleset: Ruleset, *, size: Size | None = None) -> Start:
+    """The start world of a scene: as `load_scene`, and the fields that it sets. Raises CompileError."""
+    return draw_start(find_scene(path_or_name), ruleset, size=size)
+
+
 def load_scenes(
     path: str | Path, ruleset: HasElements, *, size: Size | None = None
 ) -> dict[str, NDArray[np.uint8]]:
@@ -44,7 +68,7 @@ def load_scenes(
     reporter = Reporter()
     drawn = {scene.name: _draw(scene, ruleset, size, reporter) for scene in _read_file(Path(path))}
     reporter.raise_if_errors()
-    return {name: ids for name, ids in drawn.items() if ids is not None}
+    return drawn
 
 
 def find_scene(path_or_name: str | Path) -> Scene:
@@ -101,26 +125,97 @@ def draw_scene(scene: Scene, ruleset: HasElements, *, size: Size | None = None) 
     reporter = Reporter()
     ids = _draw(scene, ruleset, size, reporter)
     reporter.raise_if_errors()
-    assert ids is not None
     return ids
 
 
-def _draw(
-    scene: Scene, ruleset: HasElements, size: Size | None, reporter: Reporter
-) -> NDArray[np.uint8] | None:
+def _draw(scene: Scene, ruleset: HasElements, size: Size | None, reporter: Reporter) -> NDArray[np.uint8]:
+    """The ids of a scene; unknown elements are reported, and painted as 0."""
     height, width = size or scene.size
     if not (height >= 1 and width >= 1 and height * width <= MAX_CELLS):
         raise failure("PD607", f"a world of {height}×{width} cells", helps=(SIZE_RULE,))
     ids = element_ids(ruleset)
     paints = [one for one in scene.paints if isinstance(one, Paint)]
     used = [(scene.fill, scene.fill_span), *((one.element, one.element_span) for one in paints)]
-    unknown = [(name, span) for name, span in used if name not in ids]
-    for name, span in unknown:
-        reporter.error(
-            "PD604",
-            f"unknown element `{name}`",
-            span,
-            "not an element of this ruleset",
-            helps=suggest(name, {element.name for element in ruleset.elements}, "its elements"),
-        )
-    return None if unknown else paint((height, width), ids[scene.fill], paints, ids)
+    names = {element.name for element in ruleset.elements}
+    for name, span in used:
+        if name not in ids:
+            helps, label = suggest(name, names, "its elements"), "not an element of this ruleset"
+            reporter.error("PD604", f"unknown element `{name}`", span, label, helps=helps)
+    known = {name: ids.get(name, 0) for name, _ in used}
+    return paint((height, width), known[scene.fill], paints, known)
+
+
+def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
+    """The start world of a scene.
+
+    Statements follow one another: a field is set in the cells of its shape whose element can have it, and an
+    element that is painted later is fresh there.
+
+    Raises:
+        CompileError: unknown elements (PD604) or fields (PD301), values of another kind (PD110) or out of range
+            (PD402), settings that no cell can have (PD608), a bad `size` (PD607).
+    """
+    ids = draw_scene(scene, ruleset, size=size)
+    # Scenes may use qualified names of fields, worlds do not.
+    paints = [
+        replace(one, name=slot_name(ruleset, one.name)) if isinstance(one, Setting) else one
+        for one in scene.paints
+    ]
+    reporter, words = Reporter(), element_ids(ruleset)
+    held = {slot.name: slot for slot in slots(ruleset) if slot.name != "element"}
+    values = {one: _value(one, held, words, ruleset, reporter) for one in paints if isinstance(one, Setting)}
+    reporter.raise_if_errors()
+    found = {one.name: _unset(held[one.name], ids.shape) for one in values}
+    now = np.full(ids.shape, words[scene.fill], dtype=np.uint8)
+    for one in paints if values else ():
+        cells = mask(one.shape, ids.shape)
+        if isinstance(one, Paint):
+            now[cells] = words[one.element]
+            for name, field in found.items():
+                if held[name].travels:
+                    field.where[cells] = False
+            continue
+        limited = _limited(held[one.name], ruleset)
+        if limited is not None:
+            cells &= np.isin(now, sorted(limited))
+        if not cells.any():
+            names = ", ".join(f"`{e.name}`" for e in ruleset.elements if e.id in (limited or ()))
+            label, fix = (
+                f"the shape holds nothing that has `{one.name}`",
+                f"only these have it: {names}; paint them before",
+            )
+            reporter.error("PD608", f"`{one.name}` is set in no cell", one.span, label, helps=[fix])
+        found[one.name].values[..., cells] = np.array(values[one])[:, None]
+        found[one.name].where[cells] = True
+    reporter.raise_if_errors()
+    return Start(ids, found)
+
+
+def _value(
+    one: Setting, held: Mapping[str, Slot], ids: Mapping[str, int], ruleset: Ruleset, reporter: Reporter
+) -> tuple[float, ...]:
+    slot = held.get(one.name)
+    if slot is None:
+        if ruleset.property(one.name) is not None:
+            label = "it follows from the element"
+            reporter.error("PD407", f"no rule assigns `{one.name}`", one.name_span, label)
+        else:
+            helps, label = suggest(one.name, held, "its fields"), "not a field of this ruleset"
+            reporter.error("PD301", f"unknown field `{one.name}`", one.name_span, label, helps=helps)
+        return ()
+    try:
+        return tuple(low for low, _ in read_word(one.value, slot.kind, ids))
+    except WordProblem as wrong:
+        reporter.error(wrong.code, wrong.message, one.value_span, wrong.label, helps=wrong.helps)
+        return ()
+
+
+def _unset(slot: Slot, shape: tuple[int, ...]) -> FieldValues:
+    dtype = np.dtype(slot.dtype)
+    return FieldValues(np.zeros((2, *shape) if slot.planes == 2 else shape, dtype), np.zeros(shape, np.bool_))
+
+
+def _limited(slot: Slot, ruleset: Ruleset) -> frozenset[int] | None:
+    """The elements whose cells can have the slot's field; None for all."""
+    prop = ruleset.property(slot.name)
+    return slot.of if prop is None else prop.stored

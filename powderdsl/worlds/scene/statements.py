@@ -1,11 +1,9 @@
-"""Drawing statements: the text of one line -> a `Statement`; one without names and draws is also a `Paint`.
-
-Which cells a shape covers, raster.py says.
-"""
+"""Drawing statements: the text of one line -> a `Statement`. `worlds.raster` says which cells its shape covers."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -13,11 +11,14 @@ from typing import Any
 
 from lark import Lark, Token, Tree
 from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
+from lark.tree import Meta
 from lark.utils import TextSlice
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.diagnostics.printable import shown_character
-from powderdsl.syntax.hints import CUT, was_cut
+from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.hints import CUT, TERMINAL_WORDS, was_cut
+from powderdsl.syntax.parse import words_of
 from powderdsl.worlds.raster import MAX_COORDINATE
 from powderdsl.worlds.scene.amounts import Amount, number
 
@@ -44,10 +45,10 @@ GENERATOR_STATEMENTS = {
     "stamp": "stamp NAME at (ROW, COLUMN)",
     "part": "part NAME",
 }
-"""Those of a generator: besides, cells at random, pictures, and lists of statements with a name."""
+"""Those of a generator, which also has random cells, pictures, and named lists of statements."""
 
 SETTING = "FIELD := VALUE in SHAPE"
-"""How a scene gives cells a field's value. Without `in` it is given everywhere."""
+"""How a scene gives cells a field's value; without `in`, all cells."""
 
 _POINT = (("a row", -MAX_COORDINATE), ("a column", -MAX_COORDINATE))
 _ROWS = (("the start of a range", 0), ("the end of a range", 0))
@@ -66,10 +67,10 @@ NUMBERS: dict[str, tuple[tuple[str, int], ...]] = {
     "stamp": _POINT,
     "part": (),
 }
-"""The numbers of each statement in order: what they are called, and the lowest that will do."""
+"""The numbers of each statement in order: what they are called, and their lowest value."""
 
 RANGES = {"box": 2, "arch": 2, "container": 2}
-"""Statements whose first numbers are that many ranges: pairs of a start and an end, None for an open end."""
+"""How many ranges the first numbers of a statement are: pairs of a start and an end, None for an open end."""
 
 
 @dataclass(frozen=True)
@@ -103,17 +104,20 @@ class Statement:
     over: ElementChoice | None = None
 
 
-_TERMINAL_WORDS = {
-    "NAME": "a name",
+@dataclass(frozen=True)
+class WrittenSetting:
+    """A field and its value as written; without a `shape` all cells are meant."""
+
+    name: Word
+    value: Word
+    shape: Statement | None
+    span: Span = field(compare=False, repr=False)
+
+
+_WORDS = {
+    **TERMINAL_WORDS,
     "NUMBER": "a number",
-    "LPAR": "`(`",
-    "RPAR": "`)`",
-    "COMMA": "`,`",
     "COLON": "`:`",
-    "PLUS": "`+`",
-    "MINUS": "`-`",
-    "STAR": "`*`",
-    "SLASH": "`/`",
     "PERCENT": "`%`",
     "__ANON_0": "`..`",
     "ASSIGN": "`:=`",
@@ -137,228 +141,201 @@ def _parser() -> Lark:
 @lru_cache(maxsize=1)
 def reserved_words() -> frozenset[str]:
     """Words of statements, which cannot name knobs, draws or regions."""
-    patterns = [terminal.pattern for terminal in _parser().terminals]
-    return frozenset(one.value for one in patterns if one.type == "str" and one.value.isalpha())
+    return words_of(_parser())
 
 
-def read_statement(span: Span, reporter: Reporter, *, shape: bool = False) -> Statement | None:
-    """The statement (or a region's shape) that stands at `span`, or None after reporting PD605 or PD606."""
-    tree = _parse(span, "shape" if shape else "statement", reporter)
-    if tree is None:
+def text_span(node: yaml_tree.Node | None, reporter: Reporter) -> Span | None:
+    """The place of a line of text; None if the node is not one, or after reporting escapes, where carets would be wrong."""
+    if not isinstance(node, yaml_tree.Scalar):
         return None
-    reading = _Reading(span.source, reporter)
-    found = reading.statement(tree, shape)
-    return None if reading.failed else found
+    if node.style == "quoted" and node.content.text.split() != node.text.split():
+        reporter.error("PD605", "escapes in a quoted statement", node.span, "escaped or doubled quotes")
+        return None
+    return node.content
 
 
-@dataclass(frozen=True)
-class WrittenSetting:
-    """A field and its value as written; without a `shape` it is meant everywhere."""
+def read_statement(span: Span, reporter: Reporter) -> Statement | None:
+    """The statement at `span`, or None after reporting PD605 or PD606."""
+    return _read("statement", span, reporter)
 
-    name: Word
-    value: Word
-    shape: Statement | None
-    span: Span = field(compare=False, repr=False)
+
+def read_shape(span: Span, reporter: Reporter) -> Statement | None:
+    """The shape of a region at `span`: a statement without an element. None after reporting PD605 or PD606."""
+    return _read("shape", span, reporter)
 
 
 def read_setting(span: Span, reporter: Reporter) -> WrittenSetting | None:
-    """The `FIELD := VALUE in SHAPE` that stands at `span`, or None after reporting PD605 or PD606."""
-    tree = _parse(span, "setting", reporter)
-    if tree is None:
-        return None
-    reading = _Reading(span.source, reporter)
-    parts: list[Any] = tree.children
-    name, _, worth, *shapes = parts
-    shape = reading.statement(shapes[0], True) if shapes else None
-    place = _token_span(span.source, worth.meta)
-    value = Word("".join(place.text.split()), place)
-    written = WrittenSetting(reading.word(name), value, shape, _token_span(span.source, tree.meta))
-    return None if reading.failed else written
+    """The `FIELD := VALUE in SHAPE` at `span`, or None after reporting PD605 or PD606."""
+    return _read("setting", span, reporter)
 
 
 def read_amount(span: Span, reporter: Reporter, *, repeat: bool = False) -> Amount | None:
     """A number as written, or the one after ``repeat``. None after reporting PD605 or PD606."""
-    tree = _parse(span, "repeat" if repeat else "amount", reporter)
-    if tree is None:
-        return None
-    reading = _Reading(span.source, reporter)
-    part: Any = tree.children[0] if repeat else tree
-    found = reading.amount(part, "a number", -MAX_COORDINATE)
-    return None if reading.failed else found
+    return _read("repeat" if repeat else "amount", span, reporter)
 
 
 def read_choice(span: Span, reporter: Reporter) -> ElementChoice | None:
     """A choice among elements as written. None after reporting PD605."""
-    tree = _parse(span, "choice", reporter)
-    return None if tree is None else _Reading(span.source, reporter).choice(tree)
+    return _read("choice", span, reporter)
 
 
-def _parse(span: Span, start: str, reporter: Reporter) -> Tree | None:
+def _read(start: str, span: Span, reporter: Reporter) -> Any:
+    """What stands at `span`, by the start symbol of the grammar; None after a report."""
     if len(span.text) > MAX_STATEMENT:
         first = Span(span.source, span.start, span.start + 1)
         label = f"longer than {MAX_STATEMENT} characters"
         reporter.error("PD605", "a statement that never ends", first, label)
         return None
     try:
-        tree = _parser().parse(TextSlice(span.source.text, span.start, span.end), start=start)
+        tree: Any = _parser().parse(TextSlice(span.source.text, span.start, span.end), start=start)
     except UnexpectedInput as error:
         _report_syntax(error, span, reporter)
         return None
-    if max((depth for depth, _ in _depths(tree)), default=0) > MAX_DEPTH:
+    if _depth(tree) > MAX_DEPTH:
         reporter.error("PD605", "numbers nested too deep", span, f"more than {MAX_DEPTH} deep")
         return None
-    return tree
+    reading = _Reading(span.source, reporter)
+    found = getattr(reading, start)(tree)
+    return None if reading.failed else found
 
 
-def _depths(tree: Tree) -> list[tuple[int, Tree]]:
-    """Every part of a tree and how deep it lies, without recursion."""
-    found, stack = [], [(0, tree)]
-    while stack:
-        depth, part = stack.pop()
-        found.append((depth, part))
-        stack += [(depth + 1, child) for child in part.children if isinstance(child, Tree)]
-    return found
-
-
-def _token_span(source: Source, token) -> Span:  # type: ignore[no-untyped-def]
-    """The place of a token, or of a tree's meta."""
-    return Span(source, token.start_pos, token.end_pos)
+def _depth(tree: Tree) -> int:
+    """How many parts of a tree lie inside one another, without recursion."""
+    depth, level = 0, [tree]
+    while level := [child for part in level for child in part.children if isinstance(child, Tree)]:
+        depth += 1
+    return depth
 
 
 class _Reading:
-    """Turns one parse tree into a statement; reports numbers that will not do and remembers that it did."""
+    """Turns one parse tree into what was written, a method for each start symbol. `failed`: after a report."""
 
     def __init__(self, source: Source, reporter: Reporter):
         self.source = source
         self.reporter = reporter
         self.failed = False
 
-    def statement(self, tree: Tree, shape: bool) -> Statement:
-        painted: Any = tree if shape else tree.children[0]
-        rest: list[Any] = [] if shape else tree.children[1:]
-        kind = str(painted.data)
-        parts: list[Any] = list(painted.children)
-        choice = self.choice(parts.pop(0)) if not shape and kind not in ("stamp", "part") else None
-        name = self.word(parts.pop(0)) if kind in ("stamp", "part") else None
-        where = next((self.word(one.children[0]) for one in rest if one.data == "where"), None)
-        over = next((self.choice(one.children[0]) for one in rest if one.data == "over"), None)
-        span = _token_span(self.source, tree.meta)
-        return Statement(kind, self.numbers(kind, parts), span, choice, name, where, over)
+    def span(self, place: Token | Meta) -> Span:
+        return Span(self.source, place.start_pos or 0, place.end_pos or 0)
 
-    def word(self, token: Token) -> Word:
-        return Word(str(token), _token_span(self.source, token))
+    def statement(self, tree: Any) -> Statement:
+        painted, *rest = tree.children
+        kind, parts = str(painted.data), list(painted.children)
+        named = kind in ("stamp", "part")
+        first = parts.pop(0)
+        clauses = {str(one.data): one.children[0] for one in rest}
+        return Statement(
+            kind,
+            self.numbers(kind, parts),
+            self.span(tree.meta),
+            None if named else self.choice(first),
+            self.word(first) if named else None,
+            self.word(clauses["where"]) if "where" in clauses else None,
+            self.choice(clauses["over"]) if "over" in clauses else None,
+        )
+
+    def shape(self, tree: Tree) -> Statement:
+        kind = str(tree.data)
+        return Statement(kind, self.numbers(kind, tree.children), self.span(tree.meta))
+
+    def setting(self, tree: Tree) -> WrittenSetting:
+        name, _, worth, *shapes = tree.children
+        span = self.span(worth.meta)
+        value = Word("".join(span.text.split()), span)
+        shape = self.shape(shapes[0]) if shapes else None
+        return WrittenSetting(self.word(name), value, shape, self.span(tree.meta))
+
+    def word(self, token: Any) -> Word:
+        return Word(str(token), self.span(token))
 
     def choice(self, tree: Tree) -> ElementChoice:
-        parts: list[Any] = list(tree.children)
-        how = str(tree.data)
+        how, parts = str(tree.data), list(tree.children)
         count = self.amount(parts.pop(0), "how many", 0) if how == "first" else None
-        tokens = [parts[0]] if how == "one" else parts[0].children if parts else []
-        words = tuple(self.word(token) for token in tokens)
-        return ElementChoice(how, words, _token_span(self.source, tree.meta), count)
+        tokens = parts if how == "one" else parts[0].children if parts else []
+        return ElementChoice(how, tuple(map(self.word, tokens)), self.span(tree.meta), count)
 
-    def numbers(self, kind: str, parts: list[Any]) -> tuple[Amount | None, ...]:
+    def numbers(self, kind: str, parts: Sequence[Any]) -> tuple[Amount | None, ...]:
         """The numbers of a statement in the order of NUMBERS; ranges that are not written are open at both ends."""
-        table = NUMBERS[kind]
         found: list[Amount | None] = []
-        if kind in RANGES:
-            written = {str(one.data): one.children[0] for one in parts if one.data in ("rows", "columns")}
-            for axis in ("rows", "columns"):
-                found += self.range(written[axis], axis) if axis in written else (number(0), None)
-            parts = [one for one in parts if one.data not in ("rows", "columns")]
+        ranges = {str(one.data): one.children[0] for one in parts if one.data in ("rows", "columns")}
+        for axis in ("rows", "columns")[: RANGES.get(kind, 0)]:
+            found += self.range(ranges[axis], axis) if axis in ranges else (number(0), None)
         for part in parts:
-            for child in part.children if part.data == "point" else (part,):
-                found.append(self.amount(child, *table[len(found)]))
+            if part.data not in ranges:
+                for one in part.children if part.data == "point" else (part,):
+                    found.append(self.amount(one, *NUMBERS[kind][len(found)]))
         return tuple(found)
 
     def range(self, tree: Tree, axis: str) -> tuple[Amount, Amount | None]:
         parts: list[Any] = tree.children
         if tree.data == "single":
             start = self.amount(parts[0], "a row or column", 0)
-            return start, Amount(
-                "add", (start, number(1)), None, start.span
-            ) if not start.is_number else number(int(start.value or 0) + 1, start.span)
+            if start.is_number:
+                return start, number(start.integer + 1, start.span)
+            return start, Amount("add", (start, number(1)), None, start.span)
         colon = next(i for i, part in enumerate(parts) if getattr(part, "type", "") == "COLON")
         start = self.amount(parts[0], "the start of a range", 0) if colon == 1 else number(0)
-        stop = None
-        if colon + 1 < len(parts) and getattr(parts[-1], "type", "") != "END":
-            stop = self.amount(parts[-1], "the end of a range", 0)
-        if (
-            stop is not None
-            and stop.is_number
-            and start.is_number
-            and int(stop.value or 0) <= int(start.value or 0)
-            and not self.failed
-        ):
+        if colon + 1 == len(parts) or getattr(parts[-1], "type", "") == "END":
+            return start, None
+        stop = self.amount(parts[-1], "the end of a range", 0)
+        if stop.is_number and start.is_number and stop.integer <= start.integer and not self.failed:
             label = "the end must be above the start: a:b leaves b out"
-            self._refuse(_token_span(self.source, tree.meta), f"a range without {axis}", label)
+            self.refuse(self.span(tree.meta), f"a range without {axis}", label)
         return start, stop
 
-    def amount(self, tree: Any, what: str, lowest: int) -> Amount:
+    def amount(self, tree: Tree, what: str = "a number", lowest: int = -MAX_COORDINATE) -> Amount:
         """An amount. If it is a number as written, it must be at least `lowest`."""
-        found = self._amount(tree, what, max(lowest, 0))
-        if found.is_number and not lowest <= int(found.value or 0) <= MAX_COORDINATE:
+        found = self.any_amount(tree, what, max(lowest, 0))
+        if found.is_number and not lowest <= found.integer <= MAX_COORDINATE:
             assert found.span is not None
-            self._refuse(found.span, f"{what} must lie in {lowest}..{MAX_COORDINATE}", "out of range")
+            self.refuse(found.span, f"{what} must lie in {lowest}..{MAX_COORDINATE}", "out of range")
         return found
 
-    def _amount(self, tree: Tree, what: str, instead: int) -> Amount:
-        span = _token_span(self.source, tree.meta)
-        op = str(tree.data)
-        token: Any = tree.children[0]
-        if op == "name":
-            return Amount("name", (), str(token), span)
-        if op != "number":
-            parts: list[Any] = tree.children
-            args = tuple(self._amount(part, what, instead) for part in parts)
-            if op == "neg" and args[0].is_number:
-                return number(-int(args[0].value or 0), span)
-            if op == "draw" and args[0].is_number and args[1].is_number:
-                low, high = (int(arg.value or 0) for arg in args)
-                if low > high:
-                    self._refuse(span, "a range without numbers", "the first must not be above the second")
-            return Amount(op, args, None, span)
-        if not re.fullmatch(r"[0-9]{1,9}", token):
-            message = f"{what} must be an integer"
-            label = "not an integer" if not token.isdecimal() or not token.isascii() else "too large"
-            self._refuse(span, message, label)
-            return number(instead, span)
-        return number(int(token), span)
+    def repeat(self, tree: Any) -> Amount:
+        return self.amount(tree.children[0])
 
-    def _refuse(self, span: Span, message: str, label: str) -> None:
+    def any_amount(self, tree: Tree, what: str, instead: int) -> Amount:
+        span, op = self.span(tree.meta), str(tree.data)
+        parts: list[Any] = tree.children
+        if op == "name":
+            return Amount("name", (), str(parts[0]), span)
+        if op == "number":
+            return self.written(parts[0], span, what, instead)
+        args = tuple(self.any_amount(part, what, instead) for part in parts)
+        if op == "neg" and args[0].is_number:
+            return number(-args[0].integer, span)
+        if op == "draw" and all(arg.is_number for arg in args) and args[0].integer > args[1].integer:
+            self.refuse(span, "a range without numbers", "the first must not be above the second")
+        return Amount(op, args, None, span)
+
+    def written(self, token: str, span: Span, what: str, instead: int) -> Amount:
+        """An integer as written; `instead` after a report."""
+        if re.fullmatch(r"[0-9]{1,9}", token):
+            return number(int(token), span)
+        label = "not an integer" if not token.isdecimal() or not token.isascii() else "too large"
+        self.refuse(span, f"{what} must be an integer", label)
+        return number(instead, span)
+
+    def refuse(self, span: Span, message: str, label: str) -> None:
         self.failed = True
         self.reporter.error("PD606", message, span, label)
 
 
 def _report_syntax(error: UnexpectedInput, statement: Span, reporter: Reporter) -> None:
-    source = statement.source
+    source, label = statement.source, ""
     if isinstance(error, UnexpectedCharacters):
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
-        char = source.text[start]
-        reporter.error(
-            "PD605",
-            f"unexpected character {shown_character(char)}",
-            Span(source, start, start + 1),
-            helps=_usage(statement),
-        )
-        return
-    assert isinstance(error, UnexpectedToken)
-    token, accepted = error.token, set(error.accepts or error.expected or ())
-    expected = ", ".join(sorted({_TERMINAL_WORDS.get(name, f"`{name.lower()}`") for name in accepted}))
-    if token.type == "$END":
-        # Point behind the last character, which is where the missing word belongs.
-        start = statement.start + len(statement.text.split("#")[0].rstrip())
-        place = Span(source, start, start + 1)
-        reporter.error(
-            "PD605", "the statement ends too early", place, f"expected {expected}", helps=_usage(statement)
-        )
-        return
-    reporter.error(
-        "PD605",
-        f"unexpected `{token}`",
-        _token_span(source, token),
-        f"expected {expected}",
-        helps=_usage(statement),
-    )
+        end, message = start + 1, f"unexpected character {shown_character(source.text[start])}"
+    else:
+        assert isinstance(error, UnexpectedToken)
+        token, accepted = error.token, set(error.accepts or error.expected or ())
+        label = "expected " + ", ".join(sorted({_WORDS.get(name, f"`{name.lower()}`") for name in accepted}))
+        start, end, message = token.start_pos or 0, token.end_pos or 0, f"unexpected `{token}`"
+        if token.type == "$END":
+            # Point behind the last character, which is where the missing word belongs.
+            start = statement.start + len(statement.text.split("#")[0].rstrip())
+            end, message = start + 1, "the statement ends too early"
+    reporter.error("PD605", message, Span(source, start, end), label, helps=_usage(statement))
 
 
 def _usage(statement: Span) -> tuple[str, ...]:
