@@ -97,7 +97,7 @@ class CommandGroup(GuardedCommand, click.Group):
 @click.group(
     cls=CommandGroup,
     name="powderdsl",
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
 )
 @click.version_option(version(), prog_name="powderdsl", message="%(prog)s %(version)s")
 def main() -> None:

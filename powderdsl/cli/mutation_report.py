@@ -119,12 +119,7 @@ def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
     )
 
 
-WORDS = {
-    "check": "`check`",
-    "invariant": "invariants",
-    "test": "tests",
-    "generated": "generated tests",
-}
+WORDS = {"check": "`check`", "invariant": "invariants", "test": "tests", "generated": "generated tests"}
 
 
 def _write(found: list[tuple[Mutant, Outcome]]) -> None:

@@ -48,7 +48,10 @@ def layout_options(about: str, *more: tuple[str, str]) -> Callable[[Decorated], 
     return decorate
 
 
-class WholeType(click.ParamType):
+PATH = click.Path(path_type=Path)
+
+
+class Integer(click.ParamType):
     """An integer from `low` to `high`."""
 
     name = "N"
@@ -197,13 +200,7 @@ def renamed_backend(name: str) -> str:
 def backend_option(
     default: str, about: str = "Backend that runs the rules."
 ) -> Callable[[Decorated], Decorated]:
-    return click.option(
-        "--backend",
-        type=BackendType(),
-        default=default,
-        show_default=True,
-        help=about,
-    )
+    return click.option("--backend", type=BackendType(), default=default, help=about)
 
 
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:

@@ -12,7 +12,7 @@ import click
 
 from powderdsl.cli.dispatch import GuardedCommand
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
-from powderdsl.cli.options import WholeType, renamed_backend
+from powderdsl.cli.options import Integer, renamed_backend
 from powderdsl.cli.progress import progress
 from powderdsl.system.interrupts import Terminated
 
@@ -64,14 +64,14 @@ class BackendsType(click.ParamType):
 
 @click.command("fuzz", cls=GuardedCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--seeds", type=SeedsType(), help="Which rulesets, or damaged files.  [default: 0..200]")
-@click.option("--seconds", type=WholeType(1, 10_000_000), help="Run so long, with as many seeds as it takes.")
+@click.option("--seconds", type=Integer(1, 10_000_000), help="Run so long, with as many seeds as it takes.")
 @click.option(
     "--backends",
     type=BackendsType(),
     help=f"What is compared: {', '.join(NAMES)}.  [default: all; those that need a C++ compiler if there is one]",
 )
-@click.option("--worlds", type=WholeType(1, 100), default=4, show_default=True, help="Worlds of a ruleset.")
-@click.option("--steps", type=WholeType(1, 10_000), default=3, show_default=True, help="Steps of a world.")
+@click.option("--worlds", type=Integer(1, 100), default=4, show_default=True, help="Worlds of a ruleset.")
+@click.option("--steps", type=Integer(1, 10_000), default=3, show_default=True, help="Steps of a world.")
 @click.option(
     "--level",
     type=click.Choice(LEVELS),
@@ -89,7 +89,7 @@ class BackendsType(click.ParamType):
 )
 @click.option("--resume", is_flag=True, help="Continue where the run in that folder ended.")
 @click.option("--front-end", is_flag=True, help="Damage rule files instead, and load them.")
-@click.option("--jobs", type=WholeType(1, 256), help="Processes.  [default: one a processor]")
+@click.option("--jobs", type=Integer(1, 256), help="Processes.  [default: one a processor]")
 @click.option(
     "--replay",
     type=click.Path(path_type=Path, dir_okay=False),

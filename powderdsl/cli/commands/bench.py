@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from powderdsl.cli.exits import OK, user_values
-from powderdsl.cli.options import BackendType, SizeType, WholeType, check_writable, load_rules, set_option
+from powderdsl.cli.options import PATH, BackendType, Integer, SizeType, check_writable, load_rules, set_option
 from powderdsl.cli.progress import progress
 from powderdsl.experiments.bench.figures import Event, Report, Started, make_report, report_data
 from powderdsl.experiments.bench.machine import load_average, this_machine
@@ -41,65 +41,29 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     help="Backend that runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
 )
 @click.option(
-    "--batch",
-    "batches",
-    type=WholeType(1, 1 << 20),
-    multiple=True,
-    default=(1, 32),
-    show_default=True,
-    help="Worlds at once.",
+    "--batch", "batches", type=Integer(1, 1 << 20), multiple=True, default=(1, 32), help="Worlds at once."
 )
 @click.option("--size", "sizes", type=SizeType(), multiple=True, help="Rows and columns.  [default: 64]")
 @click.option(
-    "--elements", type=WholeType(1, 256), multiple=True, help="Only the first N elements in the worlds."
+    "--elements", type=Integer(1, 256), multiple=True, help="Only the first N elements in the worlds."
 )
 @click.option("--only", metavar="NAME,NAME", callback=_names, help="Only these elements in the worlds.")
+@click.option("--threads", type=Integer(1, 1024), multiple=True, default=(1,), help="CPU threads.")
 @click.option(
-    "--threads",
-    type=WholeType(1, 1024),
-    multiple=True,
-    default=(1,),
-    show_default=True,
-    help="CPU threads.",
+    "--workload", type=click.Choice(list(WORKLOADS)), default="gusts", help="The worlds to start from."
 )
+@click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
+@click.option("--steps", type=Integer(1, 1 << 20), default=16, help="Steps a call, at most.")
+@click.option("--seconds", type=float, default=2.0, help="Measured time of each combination.")
 @click.option(
-    "--workload",
-    type=click.Choice(list(WORKLOADS)),
-    default="gusts",
-    show_default=True,
-    help="The worlds to start from.",
+    "--rounds", type=Integer(1, 1000), default=5, help="Parts it is measured in, in turn with the others."
 )
-@click.option("--device", default="cpu", show_default=True, help="A torch device: cpu, cuda, cuda:1.")
-@click.option(
-    "--steps", type=WholeType(1, 1 << 20), default=16, show_default=True, help="Steps a call, at most."
-)
-@click.option(
-    "--seconds", type=float, default=2.0, show_default=True, help="Measured time of each combination."
-)
-@click.option(
-    "--rounds",
-    type=WholeType(1, 1000),
-    default=5,
-    show_default=True,
-    help="Parts it is measured in, in turn with the others.",
-)
-@click.option("--seed", type=WholeType(0, 2**63 - 1), default=0, show_default=True, help="Of the worlds.")
+@click.option("--seed", type=Integer(0, 2**63 - 1), default=0, help="Of the worlds.")
 @set_option
 @click.option("--profile", is_flag=True, help="Time of each pass.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of tables.")
-@click.option(
-    "--out",
-    "data",
-    type=click.Path(path_type=Path),
-    metavar="FILE.json",
-    help="Where else to write the JSON object.",
-)
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    metavar="FILE.png",
-    help="Draw rates against batches. Needs matplotlib.",
-)
+@click.option("--out", "data", type=PATH, metavar="FILE.json", help="Where else to write the JSON object.")
+@click.option("--plot", type=PATH, metavar="FILE.png", help="Draw rates against batches. Needs matplotlib.")
 def command(
     rules: str,
     backends: tuple[str, ...],

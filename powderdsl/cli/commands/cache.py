@@ -61,7 +61,11 @@ def list_entries(as_json: bool) -> None:
 
 @command.command("clear")
 @click.option(
-    "--older-than", type=AgeType(), default=0.0, help="Only what was not used for so long, such as 30d."
+    "--older-than",
+    type=AgeType(),
+    default=0.0,
+    show_default=False,
+    help="Only what was not used for so long, such as 30d.",
 )
 def clear_entries(older_than: float) -> None:
     """Remove compiled code. What still runs continues; it will be compiled again when it is next needed."""

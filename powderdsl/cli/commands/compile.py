@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import backend_option, check_writable, load_rules, rules_argument, set_option
+from powderdsl.cli.options import PATH, backend_option, check_writable, load_rules, rules_argument, set_option
 from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.declarations import Block, PackDecl, PassDecl
@@ -37,7 +37,7 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
     "--after", metavar="STAGE", help="The schedule after this stage of the planner; default: the last."
 )
 @click.option("--pass", "pass_name", metavar="NAME", help="Only this pass of the rules.")
-@click.option("-o", "--out", type=click.Path(path_type=Path), metavar="FILE", help="Where to write it.")
+@click.option("-o", "--out", type=PATH, metavar="FILE", help="Where to write it.")
 @set_option
 def command(
     rules: str,

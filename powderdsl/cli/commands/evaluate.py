@@ -10,9 +10,10 @@ import click
 
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import (
+    PATH,
     BackendType,
+    Integer,
     ManyWords,
-    WholeType,
     check_writable,
     layout_options,
     packs_option,
@@ -40,30 +41,18 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @click.option(
     "--policies", callback=_names, metavar="A,B", help="Of trained, random, nothing.  [default: all]"
 )
+@click.option("--episodes", type=Integer(1, 10**6), default=256, help="On each split, for each policy.")
 @click.option(
-    "--episodes",
-    type=WholeType(1, 10**6),
-    default=256,
-    show_default=True,
-    help="On each split, for each policy.",
+    "--deterministic/--sampled", default=False, help="The likeliest action, or one drawn as in training."
 )
-@click.option(
-    "--deterministic/--sampled",
-    default=False,
-    help="The likeliest action, or one drawn as in training.  [default: sampled]",
-)
-@click.option(
-    "--seed", type=WholeType(0, 2**32 - 1), default=0, show_default=True, help="Of what policies draw."
-)
+@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Of what policies draw.")
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
 @set_option
 @packs_option
 @click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @layout_options("One JSON object instead of a table.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), metavar="FILE.json", help="Where else to write the JSON object."
-)
+@click.option("--out", type=PATH, metavar="FILE.json", help="Where else to write the JSON object.")
 def command(
     run: str,
     knobs: tuple[str, ...],

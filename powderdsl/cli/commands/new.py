@@ -10,7 +10,7 @@ from string import Template
 import click
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import check_writable
+from powderdsl.cli.options import PATH, check_writable
 from powderdsl.compiler import read, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.model.check import check
@@ -25,14 +25,7 @@ TEMPLATE = Path(__file__).with_name("first_pack.yaml")
 
 @click.command("new")
 @click.argument("name")
-@click.option(
-    "--dir",
-    "folder",
-    default=".",
-    show_default=True,
-    type=click.Path(path_type=Path),
-    help="The folder of the new file.",
-)
+@click.option("--dir", "folder", default=".", type=PATH, help="The folder of the new file.")
 def command(name: str, folder: Path) -> None:
     """Write NAME.yaml, a first pack: an element, a rule and a test.
 

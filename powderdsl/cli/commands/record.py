@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, counted, user_values, write_diagnostics
-from powderdsl.cli.options import ManyWords, WholeType, backend_option, packs_option, set_option
+from powderdsl.cli.options import PATH, Integer, ManyWords, backend_option, packs_option, set_option
 from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
@@ -25,53 +25,42 @@ SCRIPTED = ("random", "nothing")
 
 @click.command("record", cls=ManyWords)
 @click.argument("task", required=False)
-@click.option("--out", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the dataset goes.")
-@click.option("--episodes", type=WholeType(1, 1 << 32), help="How many are recorded.")
-@click.option("--split", default="train", show_default=True, help="Split: which worlds.")
+@click.option("--out", type=PATH, metavar="FOLDER", help="Where the dataset goes.")
+@click.option("--episodes", type=Integer(1, 1 << 32), help="How many are recorded.")
+@click.option("--split", default="train", help="Split: which worlds.")
 @click.option(
     "--policy",
     metavar="random|nothing|RUN",
     default="random",
-    show_default=True,
     help="What acts in them: every action equally likely, one that does nothing, or a trained agent.",
 )
 @click.option(
     "--observation",
     type=click.Choice(("ids", "compact")),
     default="ids",
-    show_default=True,
     help="Elements, or everything that lasts.",
 )
 @click.option(
     "--seed",
-    type=WholeType(0, (1 << 61) - 1),
+    type=Integer(0, (1 << 61) - 1),
     default=0,
-    show_default=True,
     help="The first episode's world, and the policy's draws.",
 )
 @click.option(
     "--worlds",
-    type=WholeType(1, (1 << 61) - 1),
+    type=Integer(1, (1 << 61) - 1),
     default=1_000_000,
-    show_default=True,
     help="How many worlds there are: their numbers lie below.",
 )
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another value for a knob.")
 @set_option
 @packs_option
-@click.option("--shard", type=WholeType(1, 1 << 32), help="Episodes a file.  [default: 256, or 256 MiB]")
+@click.option("--shard", type=Integer(1, 1 << 32), help="Episodes a file.  [default: 256, or 256 MiB]")
 @click.option("--compress", is_flag=True, help="Smaller files, slower to read.")
-@click.option(
-    "--envs", type=WholeType(1, 1 << 20), default=256, show_default=True, help="Episodes at once, at most."
-)
+@click.option("--envs", type=Integer(1, 1 << 20), default=256, help="Episodes at once, at most.")
 @backend_option("auto")
-@click.option("--device", default="cpu", show_default=True, help="A torch device: cpu, cuda, cuda:1.")
-@click.option(
-    "--verify",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Record nothing: read every byte of a dataset.",
-)
+@click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
+@click.option("--verify", type=PATH, metavar="FOLDER", help="Record nothing: read every byte of a dataset.")
 def command(
     task: str | None,
     out: Path | None,
@@ -225,9 +214,7 @@ def _require_gymnasium() -> None:
         from powderdsl.system.writing import failure
 
         raise failure(
-            "PD612",
-            f"recording needs the package {error.name}",
-            helps=("pip install 'powderdsl[rl]'",),
+            "PD612", f"recording needs the package {error.name}", helps=("pip install 'powderdsl[rl]'",)
         ) from None
 
 

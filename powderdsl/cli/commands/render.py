@@ -7,15 +7,15 @@ from pathlib import Path
 import click
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import SizeType, WholeType, check_writable, load_rules
+from powderdsl.cli.options import PATH, Integer, SizeType, check_writable, load_rules
 
 
 @click.command("render")
 @click.argument("world", metavar="WORLD")
 @click.option("--rules", required=True, metavar="RULES", help="The rules whose elements the world has.")
-@click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="x.png.")
+@click.option("--out", required=True, metavar="FILE", type=PATH, help="x.png.")
 @click.option("--size", type=SizeType(), help="Rows and columns of a scene, such as 48x64.")
-@click.option("--scale", type=WholeType(1, 64), help="Pixels a cell.  [default: about 400 a side]")
+@click.option("--scale", type=Integer(1, 64), help="Pixels a cell.  [default: about 400 a side]")
 def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
     """Draw a world as a picture, without running it.
 

@@ -12,8 +12,8 @@ import click
 
 from powderdsl.cli.exits import counted, user_values
 from powderdsl.cli.options import (
+    Integer,
     SizeType,
-    WholeType,
     backend_option,
     check_writable,
     load_rules,
@@ -62,18 +62,18 @@ def _out(ctx: click.Context, param: click.Parameter, value: str | None) -> Path 
 @rules_argument
 @click.option("--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml, or a scene's name.")
 @click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
-@click.option("--batch", type=WholeType(1, 1 << 20), help="How many worlds.  [default: 1]")
-@click.option("--steps", type=WholeType(0, 10**9), default=240, show_default=True, help="How many steps.")
-@click.option("--seed", type=WholeType(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
+@click.option("--batch", type=Integer(1, 1 << 20), help="How many worlds.  [default: 1]")
+@click.option("--steps", type=Integer(0, 10**9), default=240, help="How many steps.")
+@click.option("--seed", type=Integer(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
 @backend_option("auto")
-@click.option("--device", default="cpu", show_default=True, help="A torch device: cpu, cuda, cuda:1.")
+@click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 @set_option
 @click.option("--out", metavar="FILE", callback=_out, help="x.png, x.gif, x.mp4, or x.npz to save.")
-@click.option("--scale", type=WholeType(1, 64), help="Pixels a cell.  [default: about 400 a side]")
-@click.option("--every", type=WholeType(1, 10**6), default=1, show_default=True, help="Show every n-th step.")
-@click.option("--fps", type=WholeType(1, 240), default=30, show_default=True, help="Frames a second.")
+@click.option("--scale", type=Integer(1, 64), help="Pixels a cell.  [default: about 400 a side]")
+@click.option("--every", type=Integer(1, 10**6), default=1, help="Show every n-th step.")
+@click.option("--fps", type=Integer(1, 240), default=30, help="Frames a second.")
 @click.option("--watch", is_flag=True, help="Show the first world in the terminal while it runs.")
-@click.option("--threads", type=WholeType(1, 1024), help="CPU threads.  [default: 1 for small batches]")
+@click.option("--threads", type=Integer(1, 1024), help="CPU threads.  [default: 1 for small batches]")
 @click.option("-v", "--verbose", is_flag=True, help="Say how fast, and what became of it.")
 def command(
     rules: str,

@@ -12,7 +12,7 @@ import click
 
 from powderdsl.analysis.reactions import reactions
 from powderdsl.cli.exits import BadInput, color_wanted
-from powderdsl.cli.options import WholeType, layout_options, load_rules, set_option
+from powderdsl.cli.options import PATH, Integer, layout_options, load_rules, set_option
 from powderdsl.cli.plain_table import Painted, table
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
@@ -26,15 +26,10 @@ from powderdsl.tasks.names import is_task
 @layout_options("One JSON object instead of tables.")
 @set_option
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
-@click.option("--split", default="train", show_default=True, help="Of a task: which worlds.")
+@click.option("--split", default="train", help="Of a task: which worlds.")
+@click.option("--seeds", type=Integer(1, 256), default=16, help="Of a task: how many worlds.")
 @click.option(
-    "--seeds", type=WholeType(1, 256), default=16, show_default=True, help="Of a task: how many worlds."
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FILE.png",
-    help="Of a task: draw these worlds, with regions outlined.",
+    "--out", type=PATH, metavar="FILE.png", help="Of a task: draw these worlds, with regions outlined."
 )
 def command(
     rules: str,

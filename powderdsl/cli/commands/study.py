@@ -13,7 +13,7 @@ import click
 
 from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
-from powderdsl.cli.options import WholeType
+from powderdsl.cli.options import PATH, Integer
 from powderdsl.cli.progress import progress
 from powderdsl.cli.study.checks import check_study
 from powderdsl.diagnostics.printable import printable
@@ -77,25 +77,17 @@ def called(words: tuple[str, ...]) -> click.Command:
 @click.command("study")
 @click.argument("study", metavar="STUDY", required=False)
 @click.option(
-    "--size",
-    type=click.Choice(SIZES),
-    default="small",
-    show_default=True,
-    help="Size of the study: values of its settings.",
+    "--size", type=click.Choice(SIZES), default="small", help="Size of the study: values of its settings."
 )
 @click.option(
-    "--seeds", type=WholeType(1, 1000), help="How many runs of each combination, instead of the study's."
+    "--seeds", type=Integer(1, 1000), help="How many runs of each combination, instead of the study's."
 )
-@click.option("--jobs", type=WholeType(1, 256), default=2, show_default=True, help="Processes at a time.")
-@click.option(
-    "--threads", type=WholeType(1, 256), default=1, show_default=True, help="Threads of each process."
-)
+@click.option("--jobs", type=Integer(1, 256), default=2, help="Processes at a time.")
+@click.option("--threads", type=Integer(1, 256), default=1, help="Threads of each process.")
 @click.option(
     "--only", multiple=True, metavar="NAME=VALUE", help="Only combinations with this value. May be repeated."
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), metavar="FOLDER", help="studies/STUDY-SIZE by default."
-)
+@click.option("--out", type=PATH, metavar="FOLDER", help="studies/STUDY-SIZE by default.")
 @click.option("--dry-run", is_flag=True, help="Print the commands, and run none.")
 def command(
     study: str | None,

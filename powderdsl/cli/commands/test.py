@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
-from powderdsl.cli.options import WholeType, backend_option, check_writable, load_rules, set_option
+from powderdsl.cli.options import Integer, backend_option, check_writable, load_rules, set_option
 from powderdsl.compiler import shipped_tests
 from powderdsl.model.text import one_line, place_of
 
@@ -28,13 +28,13 @@ MAX_SECONDS = 24 * 3600
 @click.argument("rules", nargs=-1, metavar="[RULES]...")
 @backend_option("arrays")
 @set_option
-@click.option("--examples", type=WholeType(0, 10_000_000), default=1000, show_default=True,
+@click.option("--examples", type=Integer(0, 10_000_000), default=1000,
               help="Random worlds that each invariant is tried on.")  # fmt: skip
-@click.option("--drawn", type=WholeType(0, 1_000_000), default=100, show_default=True,
+@click.option("--drawn", type=Integer(0, 1_000_000), default=100,
               help="More worlds, drawn by Hypothesis.")  # fmt: skip
-@click.option("--seconds", type=WholeType(1, MAX_SECONDS), default=60, show_default=True,
+@click.option("--seconds", type=Integer(1, MAX_SECONDS), default=60,
               help="Time limit for random worlds, per RULES, in seconds.")  # fmt: skip
-@click.option("--seed", type=WholeType(0, 2**31 - 1), default=0, show_default=True,
+@click.option("--seed", type=Integer(0, 2**31 - 1), default=0,
               help="Other worlds for another seed, the same for the same.")  # fmt: skip
 @click.option(
     "--replay", type=click.Path(dir_okay=False, path_type=Path), help="Only try this counterexample again."
@@ -52,10 +52,10 @@ MAX_SECONDS = 24 * 3600
 )
 @click.option("--pack", "packs", multiple=True, metavar="PACK",
               help="With --mutate: only mistakes in this pack. May be repeated.")  # fmt: skip
-@click.option("--mutants", type=WholeType(1, 1_000_000), metavar="N",
+@click.option("--mutants", type=Integer(1, 1_000_000), metavar="N",
               help="With --mutate: maximum number of mutants, of each kind in proportion.")  # fmt: skip
 @click.option("--write", is_flag=True, help="With --mutate: add a test for each of them to its pack.")
-@click.option("--jobs", type=WholeType(1, 256), metavar="N",
+@click.option("--jobs", type=Integer(1, 256), metavar="N",
               help="With --mutate: processes.  [default: one a processor]")  # fmt: skip
 def command(
     rules: tuple[str, ...],

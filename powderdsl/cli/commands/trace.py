@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from powderdsl.cli.exits import BadInput, color_wanted, user_values
-from powderdsl.cli.options import SizeType, WholeType, backend_option, load_rules, rules_argument, set_option
+from powderdsl.cli.options import Integer, SizeType, backend_option, load_rules, rules_argument, set_option
 from powderdsl.diagnostics.printable import write_styled
 
 
@@ -34,13 +34,13 @@ class CellType(click.ParamType):
 @rules_argument
 @click.option("--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml, or a scene's name.")
 @click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
-@click.option("--seed", type=WholeType(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
+@click.option("--seed", type=Integer(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
 @click.option("--at", "cell", type=CellType(), required=True, help="The cell, counted from 0.")
-@click.option("--step", type=WholeType(1, 10**9), required=True, help="Step of the run, from 1.")
+@click.option("--step", type=Integer(1, 10**9), required=True, help="Step of the run, from 1.")
 @click.option(
     "--of", "names", multiple=True, metavar="NAME", help="Only the element, or this field. May be repeated."
 )
-@click.option("--number", type=WholeType(0, 1 << 20), default=0, help="World of a saved batch.  [default: 0]")
+@click.option("--number", type=Integer(0, 1 << 20), default=0, help="World of a saved batch.")
 @click.option("--all", "every_rule", is_flag=True, help="Every rule that did not happen, and why.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object.")
 @backend_option("auto", "Backend that runs the steps before it.")

@@ -9,8 +9,9 @@ import click
 
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import (
+    PATH,
+    Integer,
     ManyWords,
-    WholeType,
     backend_option,
     packs_option,
     set_option,
@@ -23,21 +24,13 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 
 @click.command("train", cls=ManyWords)
 @click.argument("task", metavar="TASK", required=False)
-@click.option(
-    "--run", "folder", type=click.Path(path_type=Path), metavar="DIR", help="[default: runs/TASK-seedN]"
-)
-@click.option(
-    "--resume",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Continue with a run, as it was asked for.",
-)
+@click.option("--run", "folder", type=PATH, metavar="DIR", help="[default: runs/TASK-seedN]")
+@click.option("--resume", type=PATH, metavar="DIR", help="Continue with a run, as it was asked for.")
 @click.option(
     "--preset",
     "preset_name",
     type=click.Choice(list(PRESETS)),
     default="paper",
-    show_default=True,
     help="Where other options start from: the paper's figures, or a few minutes on one core.",
 )
 @setting_options(TrainConfig)
@@ -48,11 +41,11 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
     metavar="NAME=N",
     help="Another value for a knob of the task. May be repeated.",
 )
-@click.option("--n-lines", type=WholeType(0, 10**6), help="Short for --knob lines=N.")
-@click.option("--n-disks", type=WholeType(0, 10**6), help="Short for --knob disks=N.")
+@click.option("--n-lines", type=Integer(0, 10**6), help="Short for --knob lines=N.")
+@click.option("--n-disks", type=Integer(0, 10**6), help="Short for --knob disks=N.")
 @click.option(
     "--complexity",
-    type=WholeType(0, 10**6),
+    type=Integer(0, 10**6),
     help="Short for --knob complexity=N: N of each, where the paper's tasks are.",
 )
 @set_option

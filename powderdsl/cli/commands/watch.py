@@ -7,7 +7,15 @@ from pathlib import Path
 import click
 
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import BackendType, ManyWords, WholeType, check_writable, packs_option, set_option
+from powderdsl.cli.options import (
+    PATH,
+    BackendType,
+    Integer,
+    ManyWords,
+    check_writable,
+    packs_option,
+    set_option,
+)
 from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.tasks.names import is_task
@@ -18,32 +26,23 @@ SUFFIXES = (".gif", ".mp4")
 @click.command("watch", cls=ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option("--split", help="Split: which worlds.  [default: test where the task has it, else train]")
-@click.option("--worlds", type=WholeType(1, 64), default=4, show_default=True, help="How many, side by side.")
-@click.option(
-    "--first", type=WholeType(0, 2**62), default=0, show_default=True, help="Number of the first one."
-)
+@click.option("--worlds", type=Integer(1, 64), default=4, help="How many, side by side.")
+@click.option("--first", type=Integer(0, 2**62), default=0, help="Number of the first one.")
 @click.option(
     "--policy",
     type=click.Choice(("trained", "random", "nothing")),
     help="Policy.  [default: trained; of a TASK: random]",
 )
-@click.option(
-    "--deterministic/--sampled", default=False, help="The likeliest action, or one drawn.  [default: sampled]"
-)
-@click.option(
-    "--seed", type=WholeType(0, 2**32 - 1), default=0, show_default=True, help="Of what the policy draws."
-)
+@click.option("--deterministic/--sampled", default=False, help="The likeliest action, or one drawn.")
+@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Of what the policy draws.")
 @click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
 @set_option
 @packs_option
 @click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="x.gif or x.mp4.  [default: watch.gif, in the run's folder]",
+    "--out", type=PATH, metavar="FILE", help="x.gif or x.mp4.  [default: watch.gif, in the run's folder]"
 )
-@click.option("--fps", type=WholeType(1, 240), default=15, show_default=True, help="Frames a second.")
-@click.option("--scale", type=WholeType(1, 32), default=4, show_default=True, help="Pixels a cell.")
+@click.option("--fps", type=Integer(1, 240), default=15, help="Frames a second.")
+@click.option("--scale", type=Integer(1, 32), default=4, help="Pixels a cell.")
 @click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
 def command(
     run: str,

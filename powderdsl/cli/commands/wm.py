@@ -13,9 +13,10 @@ import click
 
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import (
+    PATH,
     Decorated,
+    Integer,
     ManyWords,
-    WholeType,
     backend_option,
     check_writable,
     layout_options,
@@ -39,20 +40,20 @@ def _data_options(function: Decorated) -> Decorated:
         click.option("--rules", metavar="RULES", help="The rules of its worlds.  [default: the task's own]"),
         _words("--packs", "Keep these packs of the rules only, or add them."),
         _words("--held-out", "Leave these packs of the rules out."),
-        click.option("--elements", type=WholeType(0, 255), help="How many elements besides empty are drawn."),
-        click.option("--lines", type=WholeType(0, 256), help="Up to how many lines a world has."),
-        click.option("--disks", type=WholeType(0, 256), help="Up to how many disks."),
-        click.option("--squares", type=WholeType(0, 256), help="Up to how many squares."),
+        click.option("--elements", type=Integer(0, 255), help="How many elements besides empty are drawn."),
+        click.option("--lines", type=Integer(0, 256), help="Up to how many lines a world has."),
+        click.option("--disks", type=Integer(0, 256), help="Up to how many disks."),
+        click.option("--squares", type=Integer(0, 256), help="Up to how many squares."),
         click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another knob of the task."),
-        click.option("--states", type=WholeType(1, 1 << 32), help="How many start worlds there are."),
-        click.option("--buffer", "capacity", type=WholeType(1, 1 << 32), help="Pairs that the buffer holds."),
-        click.option("--refresh", type=WholeType(1, 1 << 20), help="Pairs that each iteration replaces."),
+        click.option("--states", type=Integer(1, 1 << 32), help="How many start worlds there are."),
+        click.option("--buffer", "capacity", type=Integer(1, 1 << 32), help="Pairs that the buffer holds."),
+        click.option("--refresh", type=Integer(1, 1 << 20), help="Pairs that each iteration replaces."),
         set_option,
         click.option(
-            "--rulesets", type=WholeType(0, 1024), help="Number of rulesets to draw around the rules."
+            "--rulesets", type=Integer(0, 1024), help="Number of rulesets to draw around the rules."
         ),
         click.option(
-            "--first-ruleset", type=WholeType(0, 1 << 31), help="The number of the first.  [default: 0]"
+            "--first-ruleset", type=Integer(0, 1 << 31), help="The number of the first.  [default: 0]"
         ),
         click.option("--chances", type=float, help="Their chances differ by up to this factor."),
         click.option("--swap", "swaps", multiple=True, metavar="PROPERTY", help="Two elements exchange it."),
@@ -66,36 +67,27 @@ def _data_options(function: Decorated) -> Decorated:
 def _training_options(function: Decorated) -> Decorated:
     rate = click.FloatRange(min=0, min_open=True)
     options = (
-        click.option("--iterations", type=WholeType(1, 10**9), help="Steps of Adam."),
-        click.option("--batch", type=WholeType(1, 1 << 20), help="Pairs in each."),
+        click.option("--iterations", type=Integer(1, 10**9), help="Steps of Adam."),
+        click.option("--batch", type=Integer(1, 1 << 20), help="Pairs in each."),
         click.option("--learning-rate", type=rate, help="Of Adam."),
-        click.option("--seed", type=WholeType(0, 2**63 - 1), help="Of weights, worlds and batches."),
-        click.option(
-            "--run", "folder", metavar="DIR", type=click.Path(path_type=Path), help="The run's folder."
-        ),
+        click.option("--seed", type=Integer(0, 2**63 - 1), help="Of weights, worlds and batches."),
+        click.option("--run", "folder", metavar="DIR", type=PATH, help="The run's folder."),
         click.option(
             "--store",
             type=click.Choice(["auto", "memory", "disk"]),
             default="auto",
-            show_default=True,
             help="Where the buffer is kept.",
         ),
         click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
-        click.option(
-            "--save-every",
-            type=WholeType(1, 10**6),
-            default=60,
-            show_default=True,
-            help="Seconds between checkpoints.",
-        ),
+        click.option("--save-every", type=Integer(1, 10**6), default=60, help="Seconds between checkpoints."),
     )
     return _machine_options(_all(options, function))
 
 
 def _machine_options(function: Decorated) -> Decorated:
     options = (
-        click.option("--threads", type=WholeType(1, 1024), default=1, show_default=True, help="CPU threads."),
-        click.option("--device", default="cpu", show_default=True, help="A torch device: cpu, cuda, cuda:1."),
+        click.option("--threads", type=Integer(1, 1024), default=1, help="CPU threads."),
+        click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1."),
         backend_option("auto"),
     )
     return _all(options, function)
@@ -123,14 +115,11 @@ def command() -> None:
     "--preset",
     type=click.Choice(["small", "paper"]),
     default="small",
-    show_default=True,
     help="What other options change: `small` is for a CPU, `paper` for a GPU.",
 )
 @_data_options
-@click.option("--width", type=WholeType(1, 1024), help="Features of the first block.")
-@click.option(
-    "--slots", type=WholeType(1, 256), help="Room for this many elements, for packs that come later."
-)
+@click.option("--width", type=Integer(1, 1024), help="Features of the first block.")
+@click.option("--slots", type=Integer(1, 256), help="Room for this many elements, for packs that come later.")
 @_training_options
 def train_command(
     preset: str,
@@ -213,25 +202,23 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @command.command("eval", cls=ManyWords)
 @click.argument("run", metavar="RUN")
 @click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
-@click.option(
-    "--split", metavar="SPLIT", default="designed", show_default=True, help="Its worlds to test on."
-)
+@click.option("--split", metavar="SPLIT", default="designed", help="Its worlds to test on.")
 @click.option("--rules", metavar="RULES", help="Other rules than the run's.")
 @_words("--only", "Draw elements of these packs only.  [default: the run's]")
 @click.option(
     "--knob", "knobs", multiple=True, metavar="NAME=N", help="Knobs of the task.  [default: the run's]"
 )
 @click.option(
-    "--worlds", type=WholeType(1, 1 << 20), help="Of a split, or futures of each stand.  [default: 32, 4]"
+    "--worlds", type=Integer(1, 1 << 20), help="Of a split, or futures of each stand.  [default: 32, 4]"
 )
 @click.option(
     "--rulesets",
-    type=WholeType(0, 1024),
+    type=Integer(0, 1024),
     default=0,
     help="Number of rulesets to test under that training never saw.",
 )
 @layout_options("One JSON object instead of a table.")
-@click.option("--out", metavar="FILE", type=click.Path(path_type=Path), help="[default: RUN/evaluation.json]")
+@click.option("--out", metavar="FILE", type=PATH, help="[default: RUN/evaluation.json]")
 @_machine_options
 def eval_command(
     run: str,
@@ -271,15 +258,13 @@ def eval_command(
 
 @command.command("show", cls=ManyWords)
 @click.argument("run", metavar="RUN")
-@click.option("--out", metavar="FILE", required=True, type=click.Path(path_type=Path), help="A .png file.")
-@click.option("--steps", type=WholeType(1, 4096), help="How far ahead.  [default: as it was trained]")
-@click.option(
-    "--after", type=WholeType(0, 10**6), default=0, show_default=True, help="Steps that worlds run before."
-)
+@click.option("--out", metavar="FILE", required=True, type=PATH, help="A .png file.")
+@click.option("--steps", type=Integer(1, 4096), help="How far ahead.  [default: as it was trained]")
+@click.option("--after", type=Integer(0, 10**6), default=0, help="Steps that worlds run before.")
 @click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
-@click.option("--split", metavar="SPLIT", default="designed", show_default=True, help="Its worlds.")
+@click.option("--split", metavar="SPLIT", default="designed", help="Its worlds.")
 @click.option("--rules", metavar="RULES", help="Other rules than the run's.")
-@click.option("--scale", type=WholeType(1, 16), default=2, show_default=True, help="Pixels a cell.")
+@click.option("--scale", type=Integer(1, 16), default=2, help="Pixels a cell.")
 @_machine_options
 def show_command(
     run: str,
