@@ -65,6 +65,13 @@ def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> Non
     write_styled(stream, "\n\n".join(render_text(one, color=color) for one in diagnostics) + "\n")
 
 
+def print_json(value: Any) -> None:
+    """Print a value as indented JSON."""
+    import json
+
+    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
 def counted(number: int, thing: str) -> str:
     """`no errors`, `1 error`, `2 errors`."""
     return f"{number or 'no'} {thing}{'' if number == 1 else 's'}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import FAILED, OK, BadInput, counted
+from powderdsl.cli.exits import FAILED, OK, BadInput, counted, print_json
 from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MutationPlan:
-    """What is asked: only these packs, at most so many mutants, in so many processes; add tests to the files."""
+    """What is mutated: `packs` alone, up to `mutants`, in `jobs` processes; `write` adds tests to the packs' files."""
 
     packs: tuple[str, ...]
     mutants: int | None
@@ -37,15 +36,13 @@ def report_mutants(names: Sequence[str], plan: MutationPlan) -> int:
     """Mutate each of some compositions; the exit code: 1 if a mutant survives."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
     data = {}
-    survived = False
     try:
         for name in names:
             data[name] = _report(name, plan)
-            survived |= bool(data[name]["survived"])
     finally:
         if plan.as_json:
-            click.echo(json.dumps(data, indent=2, ensure_ascii=False))
-    return FAILED if survived else OK
+            print_json(data)
+    return FAILED if any(one["survived"] for one in data.values()) else OK
 
 
 def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
@@ -92,7 +89,8 @@ def _tell(
         click.echo(f"survived  {mutant.place}: {mutant.operator}")
         click.echo(f"      {mutant.diff}")
         if outcome.size is None:
-            click.echo(f"      no world was found on which it differs{_because(outcome)}")
+            reason = f" ({outcome.verdict.detail})" if outcome.verdict.detail else ""
+            click.echo(f"      no world was found on which it differs{reason}")
         elif outcome.test is not None:
             click.echo("".join(f"        {line}\n" for line in outcome.test.text.splitlines()), nl=False)
     if interrupted:
@@ -101,10 +99,6 @@ def _tell(
         own = [(mutant, outcome) for mutant, outcome in found if mutant.pack == pack]
         click.echo(f"{pack}: {summary(own)}")
     click.echo(f"{name}: {summary(found)} in {seconds:.0f} s")
-
-
-def _because(outcome: Outcome) -> str:
-    return f" ({outcome.verdict.detail})" if outcome.verdict.detail else ""
 
 
 def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:

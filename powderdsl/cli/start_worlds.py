@@ -3,61 +3,42 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.model.types import Ruleset
 from powderdsl.model.world_sides import fitting
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene import FieldValues, Start, load_start
+from powderdsl.worlds.scene import Start, load_start
 from powderdsl.worlds.strewn import check_cells, strew
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import Simulator, World
+    from powderdsl.simulation.simulator import World
 
 DEFAULT_SIZE: Size = (64, 64)
 
 KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """What fresh worlds are made of: ids uint8 [B, H, W], and the fields that a scene sets in each of them."""
+def start(
+    ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None, **how: Any
+) -> World:
+    """The worlds that a run starts from; each has random numbers of its own.
 
-    ids: NDArray[np.uint8]
-    fields: Mapping[str, FieldValues] = field(default_factory=dict)
-
-
-def start_drawn(
-    ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None
-) -> Drawn | None:
-    """What a run starts from, or None for a saved world, which has everything.
-
-    A saved world continues as it was saved, random future included, so `size`, `batch` and `seed` do not go
-    with it. A drawn world stands `batch` times. Without a name every world is scattered by itself.
+    Args:
+        how: passed on to `compile`.
 
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
     """
-    if name is None:
-        size = size or (fitting(ruleset, DEFAULT_SIZE[0]), fitting(ruleset, DEFAULT_SIZE[1]))
-        return Drawn(strew(ruleset, size, batch or 1, seed or 0))
-    if name.lower().endswith(".npz"):
-        _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
-        return None
-    one = drawn_world(name, ruleset, size)
-    check_cells(batch or 1, one.ids.shape)
-    return Drawn(np.repeat(one.ids[None], batch or 1, axis=0), one.fields)
+    # A drawn world comes first: compiling imports torch, and whoever mistyped a name should not wait for that.
+    drawn = start_drawn(ruleset, name, size, batch, seed)
+    from powderdsl.simulation.simulator import compile
 
-
-def start_world(sim: Simulator, drawn: Drawn | None, name: str | None, seed: int | None) -> World:
-    """The worlds of what `start_drawn` gave for the same name; each has random numbers of its own."""
+    sim = compile(ruleset, **how)
     with user_values():
         if drawn is not None:
             world = sim.world(drawn.ids, seed=seed or 0)
@@ -69,6 +50,25 @@ def start_world(sim: Simulator, drawn: Drawn | None, name: str | None, seed: int
 
         assert name is not None
         return load_world(name, sim)
+
+
+def start_drawn(
+    ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None
+) -> Start | None:
+    """Fresh worlds, ids uint8 [B, H, W], or None for a saved world, which has everything.
+
+    A saved world continues as it was saved, random future included, so `size`, `batch` and `seed` do not go
+    with it. A drawn world stands `batch` times. Without a name every world is scattered by itself.
+    """
+    if name is None:
+        size = size or (fitting(ruleset, DEFAULT_SIZE[0]), fitting(ruleset, DEFAULT_SIZE[1]))
+        return Start(strew(ruleset, size, batch or 1, seed or 0), {})
+    if name.lower().endswith(".npz"):
+        _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
+        return None
+    one = drawn_world(name, ruleset, size)
+    check_cells(batch or 1, one.ids.shape)
+    return Start(np.repeat(one.ids[None], batch or 1, axis=0), one.fields)
 
 
 def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:

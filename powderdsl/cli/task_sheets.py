@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
-from powderdsl.cli.exits import BadInput
+from powderdsl.cli.exits import BadInput, print_json
 from powderdsl.cli.options import check_writable
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
 from powderdsl.cli.plain_table import table
 from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
+from powderdsl.tasks.names import is_task
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task
+
+if TYPE_CHECKING:
+    from powderdsl.experiments.runs import RunFolder
 
 
 def show_task(
@@ -37,7 +40,7 @@ def show_task(
             raise BadInput(f"`{out}`: a sheet is a .png file")
         check_writable(out)
     if layout == "json":
-        click.echo(json.dumps(_data(task), indent=2, ensure_ascii=False))
+        print_json(_data(task))
     else:
         click.echo("\n".join(_text(task)))
     if out is not None:
@@ -54,6 +57,19 @@ def knob_values(knobs: Sequence[str]) -> dict[str, int]:
             raise BadInput(f"`{one}`: write --knob NAME=N")
         found[match[1]] = int(match[2])
     return found
+
+
+def find_played(
+    name: str, knobs: Sequence[str], settings: dict[str, str], packs: Sequence[str]
+) -> Task | RunFolder:
+    """The task or the run of an agent that a command was given. Raises CompileError and BadInput."""
+    if is_task(name):
+        return load_task(name, knobs=knob_values(knobs), params=settings, packs=packs)
+    if knobs or settings:
+        raise BadInput("--knob and --set go with a task: a run has its own")
+    from powderdsl.experiments.runs import find_run
+
+    return find_run(name, "ppo")
 
 
 def _text(task: Task) -> Iterator[str]:

@@ -46,6 +46,12 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
             raise not_writable(path, error) from None
 
 
+def write_text(path: Path, text: str, *, follow: bool = False) -> None:
+    """Write a text as UTF-8, whole or not at all, as `replacing` does."""
+    with replacing(path, follow=follow) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def destination(path: Path, *, follow: bool) -> Path:
     """Where a file of this name is written: the path itself, or where a link leads.
 

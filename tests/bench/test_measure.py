@@ -11,9 +11,8 @@ import pytest
 import powderdsl
 from powderdsl.experiments.bench import make_plan, measure, report_data, report_text
 from powderdsl.experiments.bench.figures import Costs, Ready, Sample, Started, make_report
-from powderdsl.experiments.bench.machine import Machine
+from powderdsl.experiments.bench.machine import Machine, Memory, peak_growth
 from powderdsl.experiments.bench.measure import interleaved, measure_events
-from powderdsl.experiments.bench.memory import Memory, peak_growth
 from powderdsl.experiments.bench.tables import aligned, number
 from powderdsl.experiments.bench.workloads import start_worlds
 from powderdsl.model.state import slots

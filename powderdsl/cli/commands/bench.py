@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from powderdsl.cli.exits import OK, user_values
+from powderdsl.cli.exits import OK, print_json, user_values
 from powderdsl.cli.options import PATH, BackendType, Integer, SizeType, check_writable, load_rules, set_option
 from powderdsl.cli.progress import progress
 from powderdsl.experiments.bench.figures import Event, Report, Started, make_report, report_data
@@ -18,6 +18,7 @@ from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
 from powderdsl.experiments.bench.tables import report_text
 from powderdsl.model.world_sides import fitting
+from powderdsl.system.writing import write_text
 from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 
 
@@ -95,9 +96,13 @@ def command(
             **asked,
         )
     report, interrupt = _measured(plan)
-    click.echo(json.dumps(report_data(report), indent=2) if as_json else report_text(report))
+    if as_json:
+        print_json(report_data(report))
+    else:
+        click.echo(report_text(report))
     if data is not None:
-        _write_json(data, report)
+        text = json.dumps(report_data(report), indent=2, ensure_ascii=False)
+        write_text(data, f"{text}\n", follow=True)
     if plot is not None and report.cells:
         write_plot(plot, report)
     if interrupt is not None:
@@ -134,10 +139,3 @@ def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
         interrupt = caught
     report = make_report(plan, machine, events, load_average(), interrupted=interrupt is not None)
     return report, interrupt
-
-
-def _write_json(path: Path, report: Report) -> None:
-    from powderdsl.system.writing import replacing
-
-    with replacing(path, follow=True) as temporary:
-        temporary.write_text(json.dumps(report_data(report), indent=2, ensure_ascii=False) + "\n", "utf-8")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import click
 
-from powderdsl.cli.exits import counted
+from powderdsl.cli.exits import counted, print_json
 
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
 
@@ -47,7 +46,7 @@ def list_entries(as_json: bool) -> None:
     found = entries(_folder())
     if as_json:
         rows = [{"key": one.key, "used": one.used, **asdict(one.about)} for one in found]
-        click.echo(json.dumps(rows, indent=2))
+        print_json(rows)
         return
     for one in found:
         size = f"{one.about.size / 1e6:.1f} MB"

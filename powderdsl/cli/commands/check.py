@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,7 +12,7 @@ import click
 from powderdsl.analysis.ledger.account import ledger_data, ledger_text
 from powderdsl.analysis.ledger.book import Ledger
 from powderdsl.analysis.ledger.book import ledger as make_ledger
-from powderdsl.cli.exits import BAD_INPUT, FAILED, OK, counted, write_diagnostics
+from powderdsl.cli.exits import BAD_INPUT, FAILED, OK, counted, print_json, write_diagnostics
 from powderdsl.cli.options import layout_options
 from powderdsl.cli.plain_table import table
 from powderdsl.compiler import load_with_diagnostics, lower
@@ -30,6 +28,21 @@ if TYPE_CHECKING:
 
 ALWAYS_TOLD = ("PD515", "PD518")
 """Notes below the summary without `--notes` too, in a line each: what added packs change, what was not decided."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What was found in one RULES. `loaded` is None if there are errors; `cost` and `ledger` are what was asked for."""
+
+    name: str
+    diagnostics: tuple[Diagnostic, ...]
+    loaded: Ruleset | Task | None = None
+    cost: tuple[PassCost, ...] | None = None
+    ledger: Ledger | None = None
+
+    def number(self, severity: Severity) -> int:
+        """How many diagnostics have this severity."""
+        return sum(one.severity is severity for one in self.diagnostics)
 
 
 @click.command("check")
@@ -58,41 +71,27 @@ def command(
 
     Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
     """
+    checked = [_check(name, quick, cost, ledger) for name in rules]
     found: dict[Diagnostic, None] = {}
-    lines = []
-    expenses: dict[str, tuple[PassCost, ...]] = {}
-    ledgers: dict[str, Ledger] = {}
-    errors = warnings = 0
-    for name in rules:
-        found_task = _check_task(name) if is_task(name) else None
-        ruleset, diagnostics, book = (
-            _check(name, quick) if found_task is None else (None, found_task[1], None)
-        )
-        counts = Counter(one.severity for one in diagnostics)
-        errors += counts[Severity.ERROR]
-        warnings += counts[Severity.WARNING]
-        shown = [one for one in diagnostics if notes or one.severity is not Severity.NOTE]
-        differences = [one for one in diagnostics if one.code in ALWAYS_TOLD and not notes]
+    lines: list[str] = []
+    for one in checked:
+        shown = [each for each in one.diagnostics if notes or each.severity is not Severity.NOTE]
+        differences = [each for each in one.diagnostics if each.code in ALWAYS_TOLD and not notes]
         found |= dict.fromkeys(shown if layout == "text" else [*shown, *differences])
-        if found_task is not None:
-            lines.append(_task_summary(name, found_task[0], counts))
-            continue
-        lines.append(_summary(name, ruleset, counts, notes))
+        lines.append(_summary(one, notes))
         if layout == "text":
-            lines += [f"  {one.message}" for one in differences]
-        if cost and ruleset is not None:
-            expenses[name] = _costs(ruleset)
-            lines += ["", *_cost_lines(expenses[name])]
-        if ledger and ruleset is not None:
-            ledgers[name] = book or make_ledger(ruleset)
-            lines += ["", ledger_text(ledgers[name])]
+            lines += [f"  {each.message}" for each in differences]
+        if one.cost is not None:
+            lines += ["", *_cost_lines(one.cost)]
+        if one.ledger is not None:
+            lines += ["", ledger_text(one.ledger)]
     if layout == "json" and (cost or ledger):
         data: dict[str, Any] = {"diagnostics": [*map(diagnostic_data, found)]}
         if cost:
-            data["cost"] = {name: [asdict(one) for one in passes] for name, passes in expenses.items()}
+            data["cost"] = {one.name: [*map(asdict, one.cost)] for one in checked if one.cost is not None}
         if ledger:
-            data["ledger"] = {name: ledger_data(one) for name, one in ledgers.items()}
-        click.echo(json.dumps(data, indent=2, ensure_ascii=False))
+            data["ledger"] = {one.name: ledger_data(one.ledger) for one in checked if one.ledger}
+        print_json(data)
     elif layout == "json":
         click.echo(render_json(found))
     elif layout == "short":
@@ -102,68 +101,43 @@ def command(
             write_diagnostics(found, sys.stdout)
             click.echo()
         click.echo("\n".join(lines))
-    if errors:
+    if any(one.number(Severity.ERROR) for one in checked):
         return BAD_INPUT
-    return FAILED if warnings and warnings_as_errors else OK
+    warned = any(one.number(Severity.WARNING) for one in checked)
+    return FAILED if warned and warnings_as_errors else OK
 
 
-def _check(name: str, quick: bool) -> tuple[Ruleset | None, tuple[Diagnostic, ...], Ledger | None]:
-    """The rules if they can be loaded, all that is wrong with them, and their ledger if their invariants needed it."""
+def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
     try:
+        if is_task(name):
+            from powderdsl.tasks.shipped import load_task_with_diagnostics  # brings numpy
+
+            task, remarks = load_task_with_diagnostics(name)
+            return Checked(name, remarks, task)
         ruleset, remarks = load_with_diagnostics(name)
     except CompileError as error:
-        return None, error.diagnostics, None
-    if quick or not ruleset.invariants:
-        return ruleset, remarks, None
-    from powderdsl.testing.properties.refute import refuted  # brings numpy
+        return Checked(name, error.diagnostics)
+    book = None
+    if ruleset.invariants and not quick:
+        from powderdsl.testing.properties.refute import refuted  # brings numpy
 
-    book = make_ledger(ruleset)
-    return ruleset, (*remarks, *refuted(ruleset, book)), book
+        book = make_ledger(ruleset)
+        remarks = (*remarks, *refuted(ruleset, book))
+    expenses = None
+    if cost:
+        from powderdsl.ir.cost import costs
 
-
-def _check_task(name: str) -> tuple[Task | None, tuple[Diagnostic, ...]]:
-    from powderdsl.tasks.shipped import load_task_with_diagnostics  # brings numpy
-
-    try:
-        return load_task_with_diagnostics(name)
-    except CompileError as error:
-        return None, error.diagnostics
-
-
-def _task_summary(name: str, task: Task | None, counts: Counter[Severity]) -> str:
-    """`name: 3 splits, no errors`."""
-    parts = [counted(counts[Severity.ERROR], "error")]
-    if task is not None:
-        parts = [counted(len(task.splits), "split"), *parts]
-    if counts[Severity.WARNING]:
-        parts.append(counted(counts[Severity.WARNING], "warning"))
-    return f"{task.name if task else name}: {', '.join(parts)}"
-
-
-def _costs(ruleset: Ruleset) -> tuple[PassCost, ...]:
-    from powderdsl.ir.cost import costs
-
-    return costs(lower(ruleset))
+        expenses = costs(lower(ruleset))
+    return Checked(name, remarks, ruleset, expenses, (book or make_ledger(ruleset)) if ledger else None)
 
 
 def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
     """A table, a line for each pass that planes do not carry, and what the numbers are."""
-    heading = [
-        "pass",
-        "form",
-        "share (%)",
-        "moments",
-        "gates",
-        "shifts",
-        "moves",
-        "random bits",
-        "reals",
-        "neighbors",
-    ]
-    rows = [heading]
+    numbers = ("moments", "gates", "shifts", "moves", "random bits", "reals", "neighbors")
+    rows = [["pass", "form", "share (%)", *numbers]]
     for one in passes:
-        numbers = (one.moments, one.gates, one.shifts, one.moves, one.random_bits, one.reals, one.neighbors)
-        rows.append([one.name, one.form, f"{100 * one.share:.0f}", *map(str, numbers)])
+        values = (str(getattr(one, name.replace(" ", "_"))) for name in numbers)
+        rows.append([one.name, one.form, f"{100 * one.share:.0f}", *values])
     yield from table(rows)
     for one in passes:
         if one.form == "cells":
@@ -171,17 +145,17 @@ def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
     yield "For every cell and step, if nothing is skipped. Shares are estimates."
 
 
-def _summary(name: str, ruleset: Ruleset | None, counts: Counter[Severity], notes: bool) -> str:
-    """`name: 14 elements, 12 passes, no errors`, and what else there is."""
-    parts = [f"{counted(counts[Severity.ERROR], 'error')}"]
-    if ruleset is not None:
-        parts = [counted(len(ruleset.elements), "element"), _passes(len(ruleset.passes)), *parts]
-    if counts[Severity.WARNING]:
-        parts.append(counted(counts[Severity.WARNING], "warning"))
-    if counts[Severity.NOTE]:
-        parts.append(counted(counts[Severity.NOTE], "note") + ("" if notes else " (--notes shows them)"))
-    return f"{ruleset.name if ruleset else name}: {', '.join(parts)}"
-
-
-def _passes(number: int) -> str:
-    return "1 pass" if number == 1 else f"{number or 'no'} passes"
+def _summary(one: Checked, notes: bool) -> str:
+    """`name: 14 elements, 12 passes, no errors`, and how many warnings and notes there are."""
+    parts = [counted(one.number(Severity.ERROR), "error")]
+    if isinstance(one.loaded, Ruleset):
+        passes = len(one.loaded.passes)
+        passes_text = "1 pass" if passes == 1 else f"{passes or 'no'} passes"
+        parts = [counted(len(one.loaded.elements), "element"), passes_text, *parts]
+    elif one.loaded is not None:
+        parts = [counted(len(one.loaded.splits), "split"), *parts]
+    if warnings := one.number(Severity.WARNING):
+        parts.append(counted(warnings, "warning"))
+    if number := one.number(Severity.NOTE):
+        parts.append(counted(number, "note") + ("" if notes else " (--notes shows them)"))
+    return f"{one.loaded.name if one.loaded else one.name}: {', '.join(parts)}"

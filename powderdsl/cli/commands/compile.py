@@ -60,10 +60,9 @@ def command(
     if out is None:
         click.echo(text, nl=not text.endswith("\n"))
         return
-    from powderdsl.system.writing import replacing
+    from powderdsl.system.writing import write_text
 
-    with replacing(out, follow=True) as temporary:
-        temporary.write_text(text if text.endswith("\n") else text + "\n", encoding="utf-8")
+    write_text(out, text if text.endswith("\n") else text + "\n", follow=True)
 
 
 def _checked(

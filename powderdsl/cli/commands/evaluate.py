@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.cli.exits import print_json, user_values
 from powderdsl.cli.options import (
     PATH,
     BackendType,
@@ -20,8 +19,8 @@ from powderdsl.cli.options import (
     set_option,
 )
 from powderdsl.cli.plain_table import table
-from powderdsl.cli.task_sheets import knob_values
-from powderdsl.tasks.names import is_task
+from powderdsl.cli.task_sheets import find_played
+from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:
     from powderdsl.rl.evaluation import Evaluation, Score
@@ -66,26 +65,18 @@ def command(
 
     The result is also written to evaluation.json in the run's folder. Of a TASK, the policies that need no training.
     """
-    task = None
-    if is_task(run):
-        from powderdsl.tasks.shipped import load_task
-
-        task = load_task(run, knobs=knob_values(knobs), params=settings, packs=packs)
-    elif knobs or settings:
-        raise BadInput("--knob and --set go with a task: a run has its own")
+    played = find_played(run, knobs, settings, packs)
     if out is not None:
         check_writable(out)
-    from powderdsl.experiments.runs import find_run
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():
-        played = find_run(run, "ppo") if task is None else task
-        found = evaluate(played, packs=packs if task is None else (), **asked)
+        found = evaluate(played, packs=() if isinstance(played, Task) else packs, **asked)
     if out is not None:
         write_json(out, found.as_json(), follow=True)
     if layout == "json":
-        click.echo(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
+        print_json(found.as_json())
     else:
         click.echo("\n".join(_text(found)))
 

@@ -18,7 +18,7 @@ from powderdsl.model.declarations import ElementDecl, PackDecl
 from powderdsl.model.packs import read_file
 from powderdsl.model.schema import MAX_NAME, NAME
 from powderdsl.syntax.sources import read_source
-from powderdsl.system.writing import replacing
+from powderdsl.system.writing import write_text
 
 TEMPLATE = Path(__file__).with_name("first_pack.yaml")
 
@@ -45,8 +45,7 @@ def command(name: str, folder: Path) -> None:
     taken = [*shipped_elements, *_elements(folder.glob("*.yaml"))]
     text = _pack_text(name, taken)
     _check_names(name, text)
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, text)
     click.echo(f"wrote {path}: powderdsl run core+{path} --watch")
 
 

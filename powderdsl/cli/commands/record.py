@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shlex
 import sys
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -62,18 +62,7 @@ SCRIPTED = ("random", "nothing")
 @click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 @click.option("--verify", type=PATH, metavar="FOLDER", help="Record nothing: read every byte of a dataset.")
 def command(
-    task: str | None,
-    out: Path | None,
-    episodes: int | None,
-    split: str,
-    policy: str,
-    knobs: tuple[str, ...],
-    settings: dict[str, str],
-    packs: tuple[str, ...],
-    backend: str,
-    device: str,
-    verify: Path | None,
-    **asked: Any,
+    task: str | None, out: Path | None, episodes: int | None, policy: str, verify: Path | None, **how: Any
 ) -> int:
     """Record whole episodes of TASK: observations, actions, rewards, ends.
 
@@ -88,32 +77,26 @@ def command(
         if task is not None or out is not None or episodes is not None:
             raise BadInput("--verify takes a folder, and no TASK, --out or --episodes")
         return _verify(verify)
-    found = _checked(task, out, episodes, split, policy, knobs, settings, packs)
-    if found is None:
+    named = {name: how.pop(name) for name in ("knobs", "settings", "packs")}
+    found = _checked(task, out, episodes, policy, how["split"], **named)
+    if found is None or out is None or episodes is None:
         return BAD_INPUT
-    assert out is not None
-    assert episodes is not None
     _require_gymnasium()
     from powderdsl.datasets.recorder import record
 
     try:
         with user_values(), progress(found.name, episodes, lines=True) as show:
-            act = _policy(policy, found, split, backend, device)
+            acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, found, how)
             dataset = record(
                 found,
-                act.policy,
-                out,
+                folder=out,
                 episodes=episodes,
-                policy_name=act.name,
-                sees=act.sees,
                 progress=lambda done, total: show(done, "episodes"),
-                split=split,
-                backend=backend,
-                device=device,
-                **asked,
+                **acting,
+                **how,
             )
     except KeyboardInterrupt:
-        _say_how_to_go_on(out, episodes)
+        _report_interrupted(out, episodes)
         raise
     size = sum(row.bytes for row in dataset.manifest.shards)
     click.echo(
@@ -124,86 +107,91 @@ def command(
     return OK
 
 
+class _Mistakes:
+    """Everything that is wrong with a call."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.diagnostics: list[Diagnostic] = []
+
+    @contextmanager
+    def collected(self) -> Iterator[None]:
+        """Collect what the block raises, so that it can be reported together with the rest."""
+        try:
+            yield
+        except CompileError as error:
+            self.diagnostics.extend(error.diagnostics)
+        except (BadInput, ValueError) as error:
+            self.lines.append(str(error))
+
+    def report(self) -> bool:
+        """Print all mistakes; whether there are any."""
+        if self.diagnostics:
+            write_diagnostics(self.diagnostics, sys.stderr)
+        for line in self.lines:
+            click.echo(f"error: {line}", err=True)
+        return bool(self.lines or self.diagnostics)
+
+
 def _checked(
     task: str | None,
     out: Path | None,
     episodes: int | None,
-    split: str,
     policy: str,
+    split: str,
+    *,
     knobs: tuple[str, ...],
     settings: dict[str, str],
     packs: tuple[str, ...],
 ) -> Task | None:
-    """The task, or None after saying everything that is wrong, before anything is imported that takes long."""
-    missing = [
-        name for name, value in (("TASK", task), ("--out", out), ("--episodes", episodes)) if value is None
-    ]
-    wrong = [f"missing {', '.join(missing)}"] if missing else []
-    diagnostics: list[Diagnostic] = []
+    """The task; None after reporting everything that is wrong, before any import that takes long."""
+    mistakes = _Mistakes()
+    required = {"TASK": task, "--out": out, "--episodes": episodes}
+    if missing := [name for name, value in required.items() if value is None]:
+        mistakes.lines.append(f"missing {', '.join(missing)}")
     values: dict[str, int] = {}
     for knob in knobs:
-        try:
+        with mistakes.collected():
             values |= knob_values([knob])
-        except BadInput as error:
-            wrong.append(error.format_message())
-    found = None
-    try:
-        if out is not None:
+    if out is not None:
+        with mistakes.collected():
             check_place(out)
-    except CompileError as error:
-        diagnostics.extend(error.diagnostics)
     palette = None
     if policy not in SCRIPTED:
         from powderdsl.experiments.runs import find_run
         from powderdsl.rl.policies import recorded_palette
 
-        try:
+        with mistakes.collected():
             palette = recorded_palette(find_run(policy, "ppo"))
-        except CompileError as error:
-            diagnostics.extend(error.diagnostics)
-    try:
-        if task is not None:
+    found = None
+    if task is not None:
+        with mistakes.collected():
             found = load_task(task, knobs=values, params=settings, packs=packs, palette=palette)
             check_split(found, split)
-    except CompileError as error:
-        diagnostics.extend(error.diagnostics)
     if found is not None and policy == "nothing":
-        _require_gymnasium()
-        from powderdsl.datasets.scripted import still_action
+        with mistakes.collected():
+            _require_gymnasium()
+            from powderdsl.datasets.scripted import still_action
 
-        try:
             still_action(found)
-        except ValueError as error:
-            wrong.append(str(error))
-    if diagnostics:
-        write_diagnostics(diagnostics, sys.stderr)
-    for line in wrong:
-        click.echo(f"error: {line}", err=True)
-    return None if wrong or diagnostics else found
+    return None if mistakes.report() else found
 
 
-@dataclass(frozen=True)
-class _Act:
-    """What acts: see `record`."""
+def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:
+    """The policy of a run, its name and what it observes, as arguments of `record`.
 
-    policy: Any
-    name: str | None = None
-    sees: str | None = None
-
-
-def _policy(policy: str, task: Task, split: str, backend: str, device: str) -> _Act:
-    """A policy by name, or the one of a run. Raises CompileError (PD620), and ValueError if the run does not fit."""
-    if policy in SCRIPTED:
-        return _Act(policy)
+    Raises CompileError (PD620), and ValueError if the run does not fit.
+    """
     from powderdsl.envs.tensor_env import TensorEnv
     from powderdsl.experiments.runs import find_run
     from powderdsl.rl.policies import config_of, load_policy
 
-    run = find_run(policy, "ppo")
+    run = find_run(path, "ppo")
     sees = config_of(run).observation
-    env = TensorEnv(task, 1, split=split, observation=sees, backend=backend, device=device)
+    where = {name: how[name] for name in ("split", "backend", "device")}
+    env = TensorEnv(task, 1, observation=sees, **where)
     name = f"{run.path.name}, checkpoint {run.checkpoint().path.stem}"
-    return _Act(load_policy(run, env), name, sees)
+    return {"policy": load_policy(run, env), "policy_name": name, "sees": sees}
 
 
 def _require_gymnasium() -> None:
@@ -213,9 +201,8 @@ def _require_gymnasium() -> None:
     except ModuleNotFoundError as error:
         from powderdsl.system.writing import failure
 
-        raise failure(
-            "PD612", f"recording needs the package {error.name}", helps=("pip install 'powderdsl[rl]'",)
-        ) from None
+        helps = ("pip install 'powderdsl[rl]'",)
+        raise failure("PD612", f"recording needs the package {error.name}", helps=helps) from None
 
 
 def _verify(folder: Path) -> int:
@@ -232,12 +219,12 @@ def _verify(folder: Path) -> int:
     return OK
 
 
-def _say_how_to_go_on(out: Path, episodes: int) -> None:
-    there = 0
+def _report_interrupted(out: Path, episodes: int) -> None:
+    done = 0
     with suppress(CompileError):  # interrupted before anything was written
         manifest = read_manifest(out)
-        there = sum(len(manifest.recipe.episodes_of(row.number)) for row in manifest.shards)
+        done = sum(len(manifest.recipe.episodes_of(row.number)) for row in manifest.shards)
     click.echo(
-        f"stopped with {there:,} of {episodes:,} episodes in {shlex.quote(str(out))}: the same command continues",
+        f"stopped with {done:,} of {episodes:,} episodes in {shlex.quote(str(out))}: the same command continues",
         err=True,
     )

@@ -27,11 +27,9 @@ def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, sca
     ruleset = load_rules(rules, {})
     check_writable(out)
     from powderdsl.cli.pictures import pictures
-    from powderdsl.cli.start_worlds import start_drawn, start_world
+    from powderdsl.cli.start_worlds import start
     from powderdsl.simulation.media import write_png
-    from powderdsl.simulation.simulator import compile
 
-    drawn = start_drawn(ruleset, world, size, None, None)
     # Nothing runs, so the backend that takes no compiling will do.
-    start = start_world(compile(ruleset, backend="reference"), drawn, world, None)
-    write_png(out, pictures(start, most=len(start), factor=scale))
+    shown = start(ruleset, world, size, None, None, backend="reference")
+    write_png(out, pictures(shown, most=len(shown), factor=scale))

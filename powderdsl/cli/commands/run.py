@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,9 +24,11 @@ from powderdsl.cli.options import (
 from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import Simulator, World
+    from powderdsl.cli.terminal import LiveView
+    from powderdsl.simulation.simulator import World
 
-SUFFIXES = (".png", ".gif", ".mp4", ".npz")
+ANIMATIONS = (".gif", ".mp4")
+SUFFIXES = (".png", *ANIMATIONS, ".npz")
 MOST_PICTURES = 64
 """How many worlds of a batch a picture shows."""
 
@@ -80,18 +83,13 @@ def command(
     world: str | None,
     size: tuple[int, int] | None,
     batch: int | None,
-    steps: int,
     seed: int | None,
     backend: str,
     device: str,
     settings: dict[str, str],
-    out: Path | None,
-    scale: int | None,
-    every: int,
-    fps: int,
-    watch: bool,
     threads: int | None,
     verbose: bool,
+    **playback: Any,
 ) -> None:
     """Run rules on a world: watch it, or write what became of it.
 
@@ -99,35 +97,32 @@ def command(
     are scattered at random: the same ones for the same --seed and --size.
     """
     ruleset = load_rules(rules, settings)
-    if out is not None:
-        check_writable(out)
-    from powderdsl.cli.start_worlds import start_drawn, start_world
-    from powderdsl.simulation.simulator import compile
+    plan = Playback(**playback)
+    if plan.out is not None:
+        check_writable(plan.out)
+    from powderdsl.cli.start_worlds import start
 
-    # The world first: compiling imports torch, and whoever mistyped a name should not wait for that.
-    drawn = start_drawn(ruleset, world, size, batch, seed)
-    sim = compile(ruleset, backend=backend, device=device, threads=threads or 1)
-    start = start_world(sim, drawn, world, seed)
-    if out is not None and out.suffix.lower() == ".npz":
+    first = start(ruleset, world, size, batch, seed, backend=backend, device=device, threads=threads or 1)
+    if plan.out is not None and plan.suffix == ".npz":
         from powderdsl.worlds.store import check_saved
 
-        check_saved(out, start.shape)
-    used = _set_threads(threads, start)
-    plan = Playback(steps, every, fps, scale, out, watch)
+        check_saved(plan.out, first.shape)
+    used = _set_threads(threads, first)
     began = time.perf_counter()
-    end = _Run(sim, start, plan).go()
+    last = play(first, plan)
     took = time.perf_counter() - began
-    count, height, width = end.shape
-    many = "1 world" if count == 1 else f"{count} worlds"
-    head = f"{ruleset.name}: {many} of {height}×{width}, {steps} steps in {took:.2f} s"
+    count, height, width = last.shape
+    head = (
+        f"{ruleset.name}: {counted(count, 'world')} of {height}×{width}, {plan.steps} steps in {took:.2f} s"
+    )
     if verbose:
-        rate = count * height * width * steps / max(took, 1e-9)
-        head += f" ({rate:,.0f} cells/s; {sim.running} on {sim.device}, {counted(used, 'thread')})"
-    click.echo(head + (f" -> {out}" if out else ""), err=True)
+        rate = count * height * width * plan.steps / max(took, 1e-9)
+        head += f" ({rate:,.0f} cells/s; {last.sim.running} on {last.sim.device}, {counted(used, 'thread')})"
+    click.echo(head + (f" -> {plan.out}" if plan.out else ""), err=True)
     if verbose:
-        for note in sim.notes:
+        for note in last.sim.notes:
             click.echo(f"  {note}", err=True)
-        click.echo(_populations(start, end), err=True)
+        click.echo(_populations(first, last), err=True)
 
 
 def _set_threads(threads: int | None, world: World) -> int:
@@ -152,86 +147,78 @@ def _populations(start: World, end: World) -> str:
     return "\n".join(f"  {name:<{width}}  {old:>9,} -> {new:>9,}" for name, old, new in rows)
 
 
-class _Run:
-    """One run: a stream of worlds, shown and written as the plan says."""
+def play(start: World, plan: Playback) -> World:
+    """Run to the end; the last world. Nothing half-written stays behind when it is interrupted."""
+    from powderdsl.cli.pictures import first_world, pictures
+    from powderdsl.cli.terminal import LiveView
+    from powderdsl.simulation import media
 
-    def __init__(self, sim: Simulator, start: World, plan: Playback):
-        self.sim, self.plan = sim, plan
-        self.start = self.world = start
+    ruleset, world = start.sim.ruleset, start
 
-    def go(self) -> World:
-        """Run to the end; the last world. Nothing half-written stays behind when it is interrupted."""
-        from powderdsl.cli.pictures import first_world
-        from powderdsl.cli.terminal import LiveView
+    def stream() -> Iterator[World]:
+        nonlocal world
+        for step, world in _worlds(start, plan):
+            show(step, world)
+            yield world
 
-        if self.plan.watch:
-            with LiveView(self.sim.ruleset.elements) as self.view:
-                self._consume(self._watched(self._worlds()))
+    def picture(world: World) -> Any:
+        return pictures(world, most=MOST_PICTURES, factor=plan.scale)
+
+    with ExitStack() as stack:
+        if plan.watch:
+            show = _watcher(stack.enter_context(LiveView(ruleset.elements)), plan)
         else:
-            self._consume(self._with_progress(self._worlds()))
-        if self.plan.out is None and not self.plan.watch:
-            with LiveView(self.sim.ruleset.elements) as view:
-                view.show(**first_world(self.world))
-        return self.world
+            bar = stack.enter_context(progress(ruleset.name, plan.steps))
 
-    def _worlds(self) -> Iterator[int]:
-        """Advances the world; yields how many steps it has made each time it is to be seen."""
-        done, steps = 0, self.plan.steps
-        # Where nobody looks in between, short calls still let progress be shown and Ctrl-C be heard.
-        looking = self.plan.watch or self.plan.suffix in (".gif", ".mp4")
-        stride = self.plan.every if looking else max(1, min(64, steps // 50))
-        yield done
-        while done < steps:
-            count = min(stride, steps - done)
-            self.world = self.sim.step(self.world, steps=count)
-            done += count
-            yield done
+            def show(step: int, world: World) -> None:
+                bar(step)
 
-    def _consume(self, moments: Iterator[int]) -> None:
-        """Run the stream dry while writing the file."""
-        out, plan = self.plan.out, self.plan
-        if plan.suffix in (".gif", ".mp4"):
-            from powderdsl.simulation import media
-
+        if plan.out is not None and plan.suffix in ANIMATIONS:
             write = media.write_gif if plan.suffix == ".gif" else media.write_mp4
-            assert out is not None
             with user_values():
-                write(out, (self._picture() for _ in moments), fps=plan.fps)
-            return
-        for _ in moments:
-            pass
-        if out is None:
-            return
-        if plan.suffix == ".png":
-            from powderdsl.simulation.media import write_png
-
-            write_png(out, self._picture())
-            return
+                write(plan.out, map(picture, stream()), fps=plan.fps)
+        else:
+            for _ in stream():
+                pass
+    if plan.out is None:
+        if not plan.watch:
+            with LiveView(ruleset.elements) as view:
+                view.show(**first_world(world))
+    elif plan.suffix == ".png":
+        media.write_png(plan.out, picture(world))
+    elif plan.suffix == ".npz":
         from powderdsl.worlds.store import save
 
-        save(self.world, out)
+        save(world, plan.out)
+    return world
 
-    def _picture(self) -> Any:
-        from powderdsl.cli.pictures import pictures
 
-        return pictures(self.world, most=MOST_PICTURES, factor=self.plan.scale)
+def _worlds(world: World, plan: Playback) -> Iterator[tuple[int, World]]:
+    """The world each time it is shown, after the number of steps that it has made."""
+    # Where nobody looks in between, short calls still let progress be shown and Ctrl-C be heard.
+    looking = plan.watch or plan.suffix in ANIMATIONS
+    stride = plan.every if looking else max(1, min(64, plan.steps // 50))
+    done = 0
+    yield done, world
+    while done < plan.steps:
+        count = min(stride, plan.steps - done)
+        world = world.sim.step(world, steps=count)
+        done += count
+        yield done, world
 
-    def _watched(self, moments: Iterator[int]) -> Iterator[int]:
-        """Shows each substep, no faster than the frame rate on a terminal."""
-        from powderdsl.cli.pictures import first_world
 
-        due = time.perf_counter()
-        for step in moments:
-            caption = f"{self.sim.ruleset.name}  step {step} of {self.plan.steps}"
-            self.view.show(**first_world(self.world), caption=caption)
-            if self.view.in_place:
-                due = max(due + 1 / self.plan.fps, time.perf_counter())
-                time.sleep(max(due - time.perf_counter(), 0))
-            yield step
+def _watcher(view: LiveView, plan: Playback) -> Callable[[int, World], None]:
+    """A function that shows a world, no faster than the frame rate on a terminal."""
+    from powderdsl.cli.pictures import first_world
 
-    def _with_progress(self, moments: Iterator[int]) -> Iterator[int]:
-        """A progress bar on stderr, which goes when the run ends."""
-        with progress(self.sim.ruleset.name, self.plan.steps) as show:
-            for step in moments:
-                show(step)
-                yield step
+    due = time.perf_counter()
+
+    def show(step: int, world: World) -> None:
+        nonlocal due
+        caption = f"{world.sim.ruleset.name}  step {step} of {plan.steps}"
+        view.show(**first_world(world), caption=caption)
+        if view.in_place:
+            due = max(due + 1 / plan.fps, time.perf_counter())
+            time.sleep(max(due - time.perf_counter(), 0))
+
+    return show

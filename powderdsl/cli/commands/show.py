@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import click
 
 from powderdsl.analysis.reactions import reactions
-from powderdsl.cli.exits import BadInput, color_wanted
+from powderdsl.cli.exits import BadInput, color_wanted, print_json
 from powderdsl.cli.options import PATH, Integer, layout_options, load_rules, set_option
 from powderdsl.cli.plain_table import Painted, table
 from powderdsl.diagnostics import Span
@@ -53,7 +52,7 @@ def command(
         raise BadInput("--out and --knob go with a task")
     ruleset = load_rules(rules, settings)
     if layout == "json":
-        click.echo(json.dumps(_data(ruleset), indent=2, ensure_ascii=False))
+        print_json(_data(ruleset))
     else:
         write_styled(sys.stdout, "\n".join(_text(ruleset, color_wanted(sys.stdout))) + "\n")
 

@@ -160,12 +160,11 @@ def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> N
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.experiments.studies.figure import write_figure
     from powderdsl.experiments.studies.results import as_data, as_markdown
-    from powderdsl.system.writing import replacing
+    from powderdsl.system.writing import write_text
 
     text = printable(as_markdown(study, size, outcomes), lines=True)  # somebody will `cat` it
     write_json(folder / "results.json", as_data(study, size, outcomes))
-    with replacing(folder / "results.md") as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(folder / "results.md", text)
     sys.stdout.write(text)
     if find_spec("matplotlib") is None:
         click.echo("no figure: pip install 'powderdsl[plot]'", err=True)

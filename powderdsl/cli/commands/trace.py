@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from typing import Any
 
 import click
 
-from powderdsl.cli.exits import BadInput, color_wanted, user_values
+from powderdsl.cli.exits import BadInput, color_wanted, print_json, user_values
 from powderdsl.cli.options import Integer, SizeType, backend_option, load_rules, rules_argument, set_option
 from powderdsl.diagnostics.printable import write_styled
 
@@ -65,21 +64,19 @@ def command(
     `powderdsl run` with the same --world, --size and --seed.
     """
     ruleset = load_rules(rules, settings)
-    from powderdsl.cli.start_worlds import start_drawn, start_world
-    from powderdsl.simulation.simulator import compile
+    from powderdsl.cli.start_worlds import start
     from powderdsl.simulation.tracing.data import trace_data
     from powderdsl.simulation.tracing.text import trace_text
     from powderdsl.simulation.tracing.trace import trace
 
-    drawn = start_drawn(ruleset, world, size, None, seed)
-    start = start_world(compile(ruleset, backend=backend), drawn, world, seed)
+    begun = start(ruleset, world, size, None, seed, backend=backend)
     with user_values():
         try:
-            found = trace(start, *cell, step, number=number, of=names or None, every_rule=every_rule)
+            found = trace(begun, *cell, step, number=number, of=names or None, every_rule=every_rule)
         except IndexError as error:
             raise BadInput(str(error)) from error
     if as_json:
-        click.echo(json.dumps(trace_data(found), indent=2, ensure_ascii=False))
+        print_json(trace_data(found))
     else:
         text = trace_text(found, color=color_wanted(sys.stdout), every_rule=every_rule)
         write_styled(sys.stdout, f"{text}\n")

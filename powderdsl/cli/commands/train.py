@@ -41,8 +41,8 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
     metavar="NAME=N",
     help="Another value for a knob of the task. May be repeated.",
 )
-@click.option("--n-lines", type=Integer(0, 10**6), help="Short for --knob lines=N.")
-@click.option("--n-disks", type=Integer(0, 10**6), help="Short for --knob disks=N.")
+@click.option("--n-lines", "lines", type=Integer(0, 10**6), help="Short for --knob lines=N.")
+@click.option("--n-disks", "disks", type=Integer(0, 10**6), help="Short for --knob disks=N.")
 @click.option(
     "--complexity",
     type=Integer(0, 10**6),
@@ -69,9 +69,6 @@ def command(
     settings: dict[str, str],
     packs: tuple[str, ...],
     knobs: tuple[str, ...],
-    n_lines: int | None,
-    n_disks: int | None,
-    complexity: int | None,
     **given: Any,
 ) -> None:
     """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
@@ -80,19 +77,16 @@ def command(
     done. DIR gets checkpoints, metrics.jsonl and events for TensorBoard.
     """
     asked = {name: value for name, value in given.items() if ctx.get_parameter_source(name) is not _DEFAULT}
+    short = {name: asked.pop(name) for name in ("lines", "disks", "complexity") if name in asked}
     if resume is not None:
         if task is not None or folder is not None:
             raise BadInput("--resume goes without TASK and --run: the run knows its task")
-        config, folder = (
-            _config_of(resume, asked, settings or packs or knobs or n_lines or n_disks or complexity),
-            resume,
-        )
+        config, folder = _config_of(resume, asked, settings or packs or knobs or short), resume
     else:
         if task is None:
             raise BadInput("say which TASK, or --resume DIR")
-        short = {"lines": n_lines, "disks": n_disks, "complexity": complexity}
-        chosen = {**knob_values(knobs), **{name: one for name, one in short.items() if one is not None}}
         name = str(Path(task).absolute()) if Path(task).suffix else task
+        chosen = knob_values(knobs) | short
         config = preset(preset_name, name, **asked, knobs=chosen, params=settings, packs=packs)
         folder = folder or Path("runs") / f"{Path(task).stem}-seed{config.seed}"
     from powderdsl.rl.training import train

@@ -17,8 +17,9 @@ from powderdsl.cli.options import (
     set_option,
 )
 from powderdsl.cli.pictures import MAX_SIDE
-from powderdsl.cli.task_sheets import knob_values
-from powderdsl.tasks.names import is_task
+from powderdsl.cli.task_sheets import find_played
+from powderdsl.rl.config import TrainConfig
+from powderdsl.tasks.task import Task
 
 SUFFIXES = (".gif", ".mp4")
 
@@ -65,29 +66,19 @@ def command(
     Regions are outlined, and so is where the agent acts; below each world stand its return so far and the action. Of a
     TASK, at random or with nobody acting.
     """
-    from powderdsl.rl.config import TrainConfig
-    from powderdsl.simulation.media import write_gif, write_mp4
-    from powderdsl.tasks.shipped import load_task
-
-    found = None
-    if is_task(run):
-        config = TrainConfig(run)
-        task = load_task(run, knobs=knob_values(knobs), params=settings, packs=packs)
+    played = find_played(run, knobs, settings, packs)
+    if isinstance(played, Task):
+        if policy == "trained":
+            raise BadInput("a task has no trained policy: name a run, or choose --policy random")
+        task, config, folder = played, TrainConfig(run), Path()
     else:
-        if knobs or settings:
-            raise BadInput("--knob and --set go with a task: a run has its own")
-        from powderdsl.experiments.runs import find_run
         from powderdsl.rl.policies import config_of, task_of
 
-        found = find_run(run, "ppo")
-        config = config_of(found)
-        task = task_of(found, packs)
-    policy = policy or ("random" if found is None else "trained")
-    if policy == "trained" and found is None:
-        raise BadInput("a task has no trained policy: name a run, or choose --policy random")
+        task, config, folder = task_of(played, packs), config_of(played), played.path
+    policy = policy or ("random" if isinstance(played, Task) else "trained")
     names = [one.name for one in task.splits]
     split = split or ("test" if "test" in names else names[0])
-    out = out or (Path("watch.gif") if found is None else found.path / "watch.gif")
+    out = out or folder / "watch.gif"
     if out.suffix.lower() not in SUFFIXES:
         raise BadInput(f"`{out}` must end in one of {' '.join(SUFFIXES)}")
     if max(task.size) * scale * min(worlds, 4) > MAX_SIDE:
@@ -99,17 +90,18 @@ def command(
     from powderdsl.envs.tensor_env import TensorEnv
     from powderdsl.rl.films import film
     from powderdsl.rl.policies import load_policy
+    from powderdsl.simulation.media import write_gif, write_mp4
     from powderdsl.tasks.episodes import compile_task
 
     program = compile_task(task, split=split, backend=backend or config.backend)
     acts: Policy | None = None
     with user_values():
-        if policy == "trained" and found is not None:
+        if policy == "trained" and not isinstance(played, Task):
             env = TensorEnv(program, 1, observation=config.observation)
-            acts = load_policy(found, env, deterministic=deterministic)
+            acts = load_policy(played, env, deterministic=deterministic)
         elif policy == "random":
             acts = random_policy(program.action_nvec)
-    played, pictures = film(
+    episodes, pictures = film(
         program,
         acts,
         torch.arange(first, first + worlds),
@@ -119,7 +111,7 @@ def command(
     )
     write = write_gif if out.suffix.lower() == ".gif" else write_mp4
     write(out, pictures, fps=fps)
-    returns = ", ".join(f"{one:.2f}" for one in played.returns.tolist())
+    returns = ", ".join(f"{one:.2f}" for one in episodes.returns.tolist())
     click.echo(
         f"wrote {out}: {task.name}, {policy}, worlds {first} to {first + worlds - 1} of {split}: {returns}"
     )

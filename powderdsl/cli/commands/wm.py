@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.cli.exits import BadInput, print_json, user_values
 from powderdsl.cli.options import (
     PATH,
-    Decorated,
     Integer,
     ManyWords,
     backend_option,
@@ -29,74 +27,75 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.training import Machine, TrainConfig, TrainingProgress
 
 
-def _words(name: str, about: str) -> Callable[[Decorated], Decorated]:
+Option = Callable[[Any], Any]
+
+
+def _words(name: str, about: str) -> Option:
     return click.option(name, multiple=True, metavar="PACK…", help=about)
 
 
-def _data_options(function: Decorated) -> Decorated:
-    options = (
-        click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: world-model]"),
-        click.option("--split", metavar="SPLIT", help="The task's worlds to train on.  [default: train]"),
-        click.option("--rules", metavar="RULES", help="The rules of its worlds.  [default: the task's own]"),
-        _words("--packs", "Keep these packs of the rules only, or add them."),
-        _words("--held-out", "Leave these packs of the rules out."),
-        click.option("--elements", type=Integer(0, 255), help="How many elements besides empty are drawn."),
-        click.option("--lines", type=Integer(0, 256), help="Up to how many lines a world has."),
-        click.option("--disks", type=Integer(0, 256), help="Up to how many disks."),
-        click.option("--squares", type=Integer(0, 256), help="Up to how many squares."),
-        click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another knob of the task."),
-        click.option("--states", type=Integer(1, 1 << 32), help="How many start worlds there are."),
-        click.option("--buffer", "capacity", type=Integer(1, 1 << 32), help="Pairs that the buffer holds."),
-        click.option("--refresh", type=Integer(1, 1 << 20), help="Pairs that each iteration replaces."),
-        set_option,
-        click.option(
-            "--rulesets", type=Integer(0, 1024), help="Number of rulesets to draw around the rules."
-        ),
-        click.option(
-            "--first-ruleset", type=Integer(0, 1 << 31), help="The number of the first.  [default: 0]"
-        ),
-        click.option("--chances", type=float, help="Their chances differ by up to this factor."),
-        click.option("--swap", "swaps", multiple=True, metavar="PROPERTY", help="Two elements exchange it."),
-        click.option(
-            "--leave-out", type=float, metavar="CHANCE", help="How likely a pack is left out of one."
-        ),
-    )
-    return _all(options, function)
+def _options(*options: Option) -> Option:
+    """A decorator that stands for several, in their order."""
+
+    def decorate(function: Any) -> Any:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
 
 
-def _training_options(function: Decorated) -> Decorated:
-    rate = click.FloatRange(min=0, min_open=True)
-    options = (
-        click.option("--iterations", type=Integer(1, 10**9), help="Steps of Adam."),
-        click.option("--batch", type=Integer(1, 1 << 20), help="Pairs in each."),
-        click.option("--learning-rate", type=rate, help="Of Adam."),
-        click.option("--seed", type=Integer(0, 2**63 - 1), help="Of weights, worlds and batches."),
-        click.option("--run", "folder", metavar="DIR", type=PATH, help="The run's folder."),
-        click.option(
-            "--store",
-            type=click.Choice(["auto", "memory", "disk"]),
-            default="auto",
-            help="Where the buffer is kept.",
-        ),
-        click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
-        click.option("--save-every", type=Integer(1, 10**6), default=60, help="Seconds between checkpoints."),
-    )
-    return _machine_options(_all(options, function))
+KNOBS = ("kinds", "lines", "disks", "squares")
+"""Knobs of the shipped task that have options of their own."""
+DATA = ("task", "split", "states", "capacity", "refresh", "rulesets", "first_ruleset")
+VARIETY = ("chances", "swaps", "leave_out")
+TRAINING = ("iterations", "batch", "learning_rate", "seed")
+MACHINE = ("device", "threads", "backend", "store", "compiled")
 
-
-def _machine_options(function: Decorated) -> Decorated:
-    options = (
-        click.option("--threads", type=Integer(1, 1024), default=1, help="CPU threads."),
-        click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1."),
-        backend_option("auto"),
-    )
-    return _all(options, function)
-
-
-def _all(options: tuple[Callable[[Any], Any], ...], function: Decorated) -> Decorated:
-    for option in reversed(options):
-        function = option(function)
-    return function
+_data_options = _options(
+    click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: world-model]"),
+    click.option("--split", metavar="SPLIT", help="The task's worlds to train on.  [default: train]"),
+    click.option("--rules", metavar="RULES", help="The rules of its worlds.  [default: the task's own]"),
+    _words("--packs", "Keep these packs of the rules only, or add them."),
+    _words("--held-out", "Leave these packs of the rules out."),
+    click.option(
+        "--elements", "kinds", type=Integer(0, 255), help="How many elements besides empty are drawn."
+    ),
+    click.option("--lines", type=Integer(0, 256), help="Up to how many lines a world has."),
+    click.option("--disks", type=Integer(0, 256), help="Up to how many disks."),
+    click.option("--squares", type=Integer(0, 256), help="Up to how many squares."),
+    click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another knob of the task."),
+    click.option("--states", type=Integer(1, 1 << 32), help="How many start worlds there are."),
+    click.option("--buffer", "capacity", type=Integer(1, 1 << 32), help="Pairs that the buffer holds."),
+    click.option("--refresh", type=Integer(1, 1 << 20), help="Pairs that each iteration replaces."),
+    set_option,
+    click.option("--rulesets", type=Integer(0, 1024), help="Number of rulesets to draw around the rules."),
+    click.option("--first-ruleset", type=Integer(0, 1 << 31), help="The number of the first.  [default: 0]"),
+    click.option("--chances", type=float, help="Their chances differ by up to this factor."),
+    click.option("--swap", "swaps", multiple=True, metavar="PROPERTY", help="Two elements exchange it."),
+    click.option("--leave-out", type=float, metavar="CHANCE", help="How likely a pack is left out of one."),
+)
+_machine_options = _options(
+    click.option("--threads", type=Integer(1, 1024), default=1, help="CPU threads."),
+    click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1."),
+    backend_option("auto"),
+)
+_training_options = _options(
+    _machine_options,
+    click.option("--iterations", type=Integer(1, 10**9), help="Steps of Adam."),
+    click.option("--batch", type=Integer(1, 1 << 20), help="Pairs in each."),
+    click.option("--learning-rate", type=click.FloatRange(min=0, min_open=True), help="Of Adam."),
+    click.option("--seed", type=Integer(0, 2**63 - 1), help="Of weights, worlds and batches."),
+    click.option("--run", "folder", metavar="DIR", type=PATH, help="The run's folder."),
+    click.option(
+        "--store",
+        type=click.Choice(["auto", "memory", "disk"]),
+        default="auto",
+        help="Where the buffer is kept.",
+    ),
+    click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
+    click.option("--save-every", type=Integer(1, 10**6), default=60, help="Seconds between checkpoints."),
+)
 
 
 @click.group("wm")
@@ -123,18 +122,11 @@ def command() -> None:
 @_training_options
 def train_command(
     preset: str,
-    task: str | None,
-    split: str | None,
     rules: str | None,
     packs: tuple[str, ...],
     held_out: tuple[str, ...],
-    elements: int | None,
-    lines: int | None,
-    disks: int | None,
-    squares: int | None,
     knobs: tuple[str, ...],
     settings: dict[str, str],
-    swaps: tuple[str, ...],
     folder: Path | None,
     **values: Any,
 ) -> None:
@@ -148,32 +140,24 @@ def train_command(
 
     if packs and held_out:
         raise BadInput("--packs says what stays, --held-out what goes: give one of them")
-    named = {"kinds": elements, "lines": lines, "disks": disks, "squares": squares}
-    chosen = {name: value for name, value in named.items() if value is not None}
-    config = PRESETS[preset]
-    variety = _given(chances=values["chances"], swaps=swaps or None, leave_out=values["leave_out"])
+    variety = _given(values, VARIETY)
     if (variety or values["first_ruleset"]) and not values["rulesets"]:
         raise BadInput(
             "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
         )
+    config = PRESETS[preset]
     with user_values():
         differ = Variety(**variety)
     data = replace(
         config.data,
-        **_given(task=task, split=split),
-        rules=_rules_without(rules, task or config.data.task, packs, held_out),
-        knobs={**chosen, **knob_values(knobs)},
+        rules=_rules_without(rules, values["task"] or config.data.task, packs, held_out),
+        knobs={**_given(values, KNOBS), **knob_values(knobs)},
         params=settings,
         variety=differ,
-        **_given(
-            **{name: values[name] for name in ("states", "capacity", "refresh", "rulesets", "first_ruleset")}
-        ),
+        **_given(values, DATA),
     )
-    changes = _given(
-        **{name: values[name] for name in ("width", "iterations", "batch", "learning_rate", "seed", "slots")}
-    )
-    config = replace(config, data=data, **changes)
-    _run(config, folder or Path("runs") / _file_word(data.task), values)
+    config = replace(config, data=data, **_given(values, ("width", "slots", *TRAINING)))
+    _run(config, folder or Path("runs") / (Path(data.task).stem or "run"), values)
 
 
 @command.command("finetune", cls=ManyWords)
@@ -191,8 +175,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     if not packs:
         raise BadInput("--packs names what is to be learned")
     trained = load_trained(run, device="cpu")
-    names = ("iterations", "batch", "learning_rate", "seed")
-    config = finetuned(trained, packs, **_given(**{name: values[name] for name in names}))
+    config = finetuned(trained, packs, **_given(values, TRAINING))
     words = "-".join(config.data.only)
     target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
     note = {"parent": {"path": str(trained.run.path), "iterations": trained.checkpoint.step}}
@@ -224,12 +207,9 @@ def eval_command(
     run: str,
     only: tuple[str, ...],
     knobs: tuple[str, ...],
-    threads: int,
-    device: str,
-    backend: str,
     layout: str,
     out: Path | None,
-    **worlds: Any,
+    **values: Any,
 ) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
@@ -241,17 +221,17 @@ def eval_command(
     from powderdsl.worldmodel.scores import evaluate
     from powderdsl.worldmodel.training import load_trained
 
-    machine = _machine({"threads": threads, "device": device, "backend": backend})
+    machine = _machine(values)
     trained = load_trained(run, device=machine.device)
     drawn = knob_values(knobs) if knobs else None
-    tested = evaluate(trained, only=only or None, knobs=drawn, machine=machine, **worlds)
+    tested = evaluate(trained, only=only or None, knobs=drawn, machine=machine, **values)
     plain = tested.plain()
     if out is not None:
         write_json(out, plain, follow=True)
     else:
         trained.run.write_json("evaluation.json", plain)
     if layout == "json":
-        click.echo(json.dumps(plain, indent=2, ensure_ascii=False))
+        print_json(plain)
     else:
         click.echo("\n".join(_text(tested, plain)))
 
@@ -272,10 +252,7 @@ def show_command(
     steps: int | None,
     after: int,
     scale: int,
-    threads: int,
-    device: str,
-    backend: str,
-    **chosen: Any,
+    **values: Any,
 ) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
@@ -289,12 +266,12 @@ def show_command(
     from powderdsl.worldmodel.strips import sheet, strips
     from powderdsl.worldmodel.training import load_trained
 
-    machine = _machine({"threads": threads, "device": device, "backend": backend})
+    machine = _machine(values)
     trained = load_trained(run, device=machine.device)
     step = trained.config.data.steps
     if steps is not None and steps % step:
         raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
-    worlds = unseen_worlds(trained, machine=machine, **chosen)
+    worlds = unseen_worlds(trained, machine=machine, **values)
     found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after)
     write_png(out, sheet(found, worlds.rules, factor=scale))
     for number, strip in enumerate(found, 1):
@@ -303,24 +280,21 @@ def show_command(
         click.echo(f"left out: {name}, which needs {', '.join(lacking)}", err=True)
 
 
-def _given(**values: Any) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}
+def _given(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """The options of these names that were given."""
+    return {name: values[name] for name in names if values[name] not in (None, ())}
 
 
-def _file_word(task: str) -> str:
-    return Path(task).stem or "run"
+def _machine(values: dict[str, Any]) -> Machine:
+    """Where to compute, taken out of the options of a command."""
+    import torch
 
-
-def _machine(values: Mapping[str, Any]) -> Machine:
     from powderdsl.simulation.programs import find_device
     from powderdsl.worldmodel.training import Machine
 
     find_device(values["device"])
-    names = ("device", "threads", "backend", "store", "compiled")
-    import torch
-
     torch.set_num_threads(values["threads"])
-    return Machine(**{name: values[name] for name in names if name in values})
+    return Machine(**{name: values.pop(name) for name in MACHINE if name in values})
 
 
 def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
@@ -334,7 +308,7 @@ def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_ou
     return keep(base, packs) if packs else leave_out(base, held_out)
 
 
-def _run(config: TrainConfig, folder: Path, values: Mapping[str, Any], **more: Any) -> None:
+def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any) -> None:
     """Train, and say how it goes."""
     from powderdsl.worldmodel.training import train
 

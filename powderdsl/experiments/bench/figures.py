@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-from powderdsl.experiments.bench.machine import Machine
-from powderdsl.experiments.bench.memory import Memory
+from powderdsl.experiments.bench.machine import Machine, Memory
 from powderdsl.experiments.bench.plan import Cell, Plan
 
 FORMAT_VERSION = 1
@@ -68,6 +67,16 @@ class Spread:
     min: float
     max: float
 
+    @staticmethod
+    def of(values: Iterable[float]) -> Spread:
+        """The spread of one value a round."""
+        found = list(values)
+        return Spread(median(found), min(found), max(found))
+
+    def scaled(self, factor: float) -> dict[str, float]:
+        """The three numbers times a factor, by name."""
+        return {name: value * factor for name, value in asdict(self).items()}
+
 
 @dataclass(frozen=True)
 class CellFigures:
@@ -100,17 +109,17 @@ class CellFigures:
     @property
     def rate(self) -> Spread:
         """World-steps a second."""
-        return _spread(self.world_steps / seconds for seconds in self.seconds)
+        return Spread.of(self.world_steps / seconds for seconds in self.seconds)
 
     @property
     def world_step_seconds(self) -> Spread:
         """Seconds a world and step."""
-        return _spread(seconds / self.world_steps for seconds in self.seconds)
+        return Spread.of(seconds / self.world_steps for seconds in self.seconds)
 
     @property
     def processor_step_seconds(self) -> Spread:
         """The processor's seconds a world and step, all threads together: what others do hardly changes them."""
-        return _spread(seconds / self.world_steps for seconds in self.processor_seconds)
+        return Spread.of(seconds / self.world_steps for seconds in self.processor_seconds)
 
 
 @dataclass(frozen=True)
@@ -164,7 +173,7 @@ def report_data(report: Report) -> dict[str, Any]:
 
 def _cell_data(figures: CellFigures) -> dict[str, Any]:
     cell, ready = figures.cell, figures.ready
-    seconds = figures.world_step_seconds
+    seconds, growth, cells = figures.world_step_seconds, ready.memory.growth, cell.cells
     return {
         "backend": cell.backend,
         "batch": cell.batch,
@@ -174,21 +183,19 @@ def _cell_data(figures: CellFigures) -> dict[str, Any]:
         "threads": cell.threads,
         "compile_seconds": ready.compile_seconds,
         "first_step_seconds": ready.first_step_seconds,
-        "peak_memory_bytes": ready.memory.growth,
+        "peak_memory_bytes": growth,
         "peak_memory_how": ready.memory.how,
-        "peak_memory_bytes_per_cell": None
-        if ready.memory.growth is None
-        else ready.memory.growth / (cell.batch * cell.world_cells),
-        "state_bytes_per_cell": ready.state_bytes / (cell.batch * cell.world_cells),
+        "peak_memory_bytes_per_cell": None if growth is None else growth / cells,
+        "state_bytes_per_cell": ready.state_bytes / cells,
         "steps_per_call": ready.steps,
         "calls_per_round": ready.calls,
         "round_seconds": list(figures.seconds),
         "round_processor_seconds": list(figures.processor_seconds),
         "world_steps_per_second": asdict(figures.rate),
-        "cell_updates_per_second": asdict(_scaled(figures.rate, cell.world_cells)),
-        "microseconds_per_world_step": asdict(_scaled(seconds, 1e6)),
-        "processor_microseconds_per_world_step": asdict(_scaled(figures.processor_step_seconds, 1e6)),
-        "nanoseconds_per_cell_step": asdict(_scaled(seconds, 1e9 / cell.world_cells)),
+        "cell_updates_per_second": figures.rate.scaled(cell.world_cells),
+        "microseconds_per_world_step": seconds.scaled(1e6),
+        "processor_microseconds_per_world_step": figures.processor_step_seconds.scaled(1e6),
+        "nanoseconds_per_cell_step": seconds.scaled(1e9 / cell.world_cells),
         "passes": [
             {"name": name, "microseconds_per_world_step": spent * 1e6, "share": share}
             for name, spent, share in pass_shares(figures)
@@ -202,10 +209,8 @@ def pass_shares(figures: CellFigures) -> list[tuple[str, float, float]]:
     return [(name, spent, spent / total if total else 0.0) for name, spent in figures.passes]
 
 
-def _spread(values: Iterable[float]) -> Spread:
-    found = list(values)
-    return Spread(median(found), min(found), max(found))
-
-
-def _scaled(spread: Spread, factor: float) -> Spread:
-    return Spread(spread.median * factor, spread.min * factor, spread.max * factor)
+def extra_words(cell: Cell, among: Iterable[CellFigures]) -> list[str]:
+    """How many elements and threads a cell has, if that tells it from other cells."""
+    cells = [one.cell for one in among]
+    words = [f"{len(cell.elements)} elements"] if len({one.elements for one in cells}) > 1 else []
+    return words + ([f"{cell.threads} threads"] if len({one.threads for one in cells}) > 1 else [])

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from powderdsl.experiments.bench.figures import Costs, Event, Ready, Report, Sample, Started, make_report
-from powderdsl.experiments.bench.machine import load_average, this_machine
-from powderdsl.experiments.bench.memory import Memory, peak_growth
+from powderdsl.experiments.bench.machine import load_average, peak_growth, this_machine
 from powderdsl.experiments.bench.plan import Cell, Plan
 from powderdsl.experiments.bench.workloads import start_worlds
 
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
 
 Clock = Callable[[], float]
-"""Seconds since some substep."""
+"""Gives seconds."""
 
 
 def measure(plan: Plan, on_event: Callable[[Event], None] | None = None) -> Report:
@@ -51,7 +50,7 @@ def measure_events(plan: Plan) -> Iterator[Event]:
         runs = []
         for cell in plan.cells:
             yield Started(cell, "compile")
-            run, ready = _make_ready(plan, cell, simulators, time.perf_counter)
+            run, ready = _make_ready(plan, cell, simulators)
             runs.append(run)
             yield ready
         for number, index, seconds, busy in interleaved([run.sample for run in runs], plan.rounds):
@@ -77,15 +76,31 @@ def interleaved(
             yield number, index, clock() - began, processor() - used
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Run:
-    """A cell that is ready: `calls` calls of `steps` steps, each from the same worlds."""
+    """A cell that is ready: `calls` calls of `steps` steps, each from the same worlds. `first`: seconds of the first step."""
 
     sim: Simulator
     world: World
     threads: int
-    steps: int
-    calls: int
+    steps: int = 1
+    calls: int = 1
+    first: float = 0.0
+
+    def begin(self, most_steps: int, budget: float) -> None:
+        """Make the first step, and find out how many calls fit into `budget` seconds.
+
+        Samples start from the worlds after that step: they are in the backend's own form by then.
+        """
+        self.world, self.first = self._timed(1)
+        self.steps = max(1, min(most_steps, int(budget / self._timed(1)[1])))
+        self.calls = max(1, int(budget / self._timed(self.steps)[1]))
+
+    def _timed(self, steps: int) -> tuple[World, float]:
+        began = time.perf_counter()
+        after = self.sim.step(self.world, steps)
+        synchronize(self.sim)
+        return after, max(time.perf_counter() - began, 1e-9)
 
     def sample(self) -> None:
         import torch
@@ -96,7 +111,7 @@ class _Run:
         synchronize(self.sim)
 
     def costs(self) -> tuple[tuple[str, float], ...]:
-        """Seconds a world and step of each pass."""
+        """Seconds a world and step of each pass; empty if the backend cannot say."""
         import torch
 
         torch.set_num_threads(self.threads)
@@ -105,12 +120,10 @@ class _Run:
         for _ in range(self.calls):
             for name, spent in self.sim.profile(self.world, self.steps).items():
                 seconds[name] += spent
+        if not any(seconds.values()):
+            return ()
         world_steps = len(self.world) * self.steps * self.calls
-        return (
-            tuple((name, spent / world_steps) for name, spent in seconds.items())
-            if any(seconds.values())
-            else ()
-        )
+        return tuple((name, spent / world_steps) for name, spent in seconds.items())
 
 
 def synchronize(sim: Simulator) -> None:
@@ -122,12 +135,9 @@ def synchronize(sim: Simulator) -> None:
 
 
 def _make_ready(
-    plan: Plan, cell: Cell, simulators: dict[tuple[str, int], tuple[Simulator, float]], clock: Clock
+    plan: Plan, cell: Cell, simulators: dict[tuple[str, int], tuple[Simulator, float]]
 ) -> tuple[_Run, Ready]:
-    """Compile a cell's backend unless another cell has, run the first calls, and choose how many fit into a sample.
-
-    Samples start from the worlds after the first step: they are in the backend's own form by then.
-    """
+    """Compile a cell's backend unless another cell has, and run the first calls."""
     import torch
 
     from powderdsl.simulation.simulator import compile
@@ -135,36 +145,13 @@ def _make_ready(
     torch.set_num_threads(cell.threads)
     key = (cell.backend, cell.threads)
     if key not in simulators:
-        began = clock()
+        began = time.perf_counter()
         sim = compile(plan.ruleset, cell.backend, plan.device, cell.threads)
-        simulators[key] = (sim, clock() - began)
+        simulators[key] = (sim, time.perf_counter() - began)
     sim, compiling = simulators[key]
     start = start_worlds(sim, cell, plan.workload, plan.seed)
     state_bytes = sum(value.numel() * value.element_size() for value in start.state.values())
     synchronize(sim)
-    timed = _FirstCalls(sim, start, plan.steps, plan.seconds / plan.rounds, clock)
-    memory: Memory = peak_growth(timed.go, plan.device)
-    run = _Run(sim, timed.after, cell.threads, timed.steps, timed.calls)
-    ready = Ready(cell, compiling, timed.first, memory, state_bytes, timed.steps, timed.calls)
-    return run, ready
-
-
-class _FirstCalls:
-    """The first step, and calls to find out how many fit into `budget` seconds."""
-
-    def __init__(self, sim: Simulator, start: World, steps: int, budget: float, clock: Clock):
-        self._sim, self._clock, self._budget = sim, clock, budget
-        self.after, self.steps, self.calls, self.first = start, steps, 1, 0.0
-
-    def go(self) -> None:
-        self.first = self._seconds(1, keep=True)
-        self.steps = max(1, min(self.steps, int(self._budget / self._seconds(1))))
-        self.calls = max(1, int(self._budget / self._seconds(self.steps)))
-
-    def _seconds(self, steps: int, keep: bool = False) -> float:
-        began = self._clock()
-        after = self._sim.step(self.after, steps)
-        synchronize(self._sim)
-        if keep:
-            self.after = after
-        return max(self._clock() - began, 1e-9)
+    run = _Run(sim, start, cell.threads)
+    memory = peak_growth(lambda: run.begin(plan.steps, plan.seconds / plan.rounds), plan.device)
+    return run, Ready(cell, compiling, run.first, memory, state_bytes, run.steps, run.calls)

@@ -40,6 +40,11 @@ class Cell:
         """Cells of one world."""
         return self.size[0] * self.size[1]
 
+    @property
+    def cells(self) -> int:
+        """Cells of all worlds of the batch."""
+        return self.batch * self.world_cells
+
 
 @dataclass(frozen=True)
 class Plan:

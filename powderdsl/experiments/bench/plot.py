@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.experiments.bench.figures import CellFigures, Report
+from powderdsl.experiments.bench.figures import CellFigures, Report, extra_words
 from powderdsl.system.writing import failure, replacing
 
 if TYPE_CHECKING:
@@ -81,12 +81,8 @@ def _lines(
 ) -> dict[str, list[CellFigures]]:
     """The cells by line: backend, `besides`, and whatever else differs."""
     lines: dict[str, list[CellFigures]] = {}
-    elements = len({one.cell.elements for one in cells}) > 1
-    threads = len({one.cell.threads for one in cells}) > 1
     for one in cells:
-        words = [one.cell.backend, besides(one)]
-        words += [f"{len(one.cell.elements)} elements"] if elements else []
-        words += [f"{one.cell.threads} threads"] if threads else []
+        words = [one.cell.backend, besides(one), *extra_words(one.cell, cells)]
         lines.setdefault(", ".join(words), []).append(one)
     return lines
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from powderdsl.experiments.bench.figures import CellFigures, Report, pass_shares
+from powderdsl.experiments.bench.figures import CellFigures, Report, extra_words, pass_shares
 from powderdsl.experiments.bench.plan import WORKLOADS, Cell
 
 MEGABYTE = 1 << 20
@@ -66,10 +66,7 @@ def cell_table(cells: Sequence[CellFigures]) -> str:
         ("CPUs", lambda one: f"{one.processors:.2f}"),
         ("to first step", lambda one: f"{one.to_first_step:.2f} s"),
         ("memory", _memory),
-        (
-            "state",
-            lambda one: f"{one.ready.state_bytes / (one.cell.batch * one.cell.world_cells):.3g} B/cell",
-        ),
+        ("state", lambda one: f"{one.ready.state_bytes / one.cell.cells:.3g} B/cell"),
     ]
     return aligned([[name for name, _ in columns], *([show(one) for _, show in columns] for one in cells)])
 
@@ -95,11 +92,7 @@ def label(cell: Cell, among: Sequence[CellFigures]) -> str:
     words = [cell.backend, f"{cell.batch}"]
     if len({one.cell.size for one in among}) > 1:
         words.append(f"{cell.size[0]}×{cell.size[1]}")
-    if len({one.cell.elements for one in among}) > 1:
-        words.append(f"{len(cell.elements)} elements")
-    if len({one.cell.threads for one in among}) > 1:
-        words.append(f"{cell.threads} threads")
-    return " ".join(words)
+    return " ".join([*words, *extra_words(cell, among)])
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
@@ -107,11 +100,8 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for first, *others in rows:
-        cells = [
-            first.ljust(widths[0]),
-            *(text.rjust(width) for text, width in zip(others, widths[1:], strict=True)),
-        ]
-        lines.append("  ".join(cells).rstrip())
+        to_right = [text.rjust(width) for text, width in zip(others, widths[1:], strict=True)]
+        lines.append("  ".join([first.ljust(widths[0]), *to_right]).rstrip())
     return "\n".join(lines)
 
 
@@ -128,9 +118,7 @@ def _memory(figures: CellFigures) -> str:
     growth = figures.ready.memory.growth
     if growth is None:
         return "?"
-    return (
-        f"{growth / MEGABYTE:.1f} MiB, {growth / (figures.cell.batch * figures.cell.world_cells):.0f} B/cell"
-    )
+    return f"{growth / MEGABYTE:.1f} MiB, {growth / figures.cell.cells:.0f} B/cell"
 
 
 def _footnotes(report: Report) -> list[str]:
