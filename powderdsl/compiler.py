@@ -9,7 +9,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.analysis.outgrown import with_outgrown
-from powderdsl.diagnostics import Label, Reporter, Severity, Span, suggest
+from powderdsl.diagnostics import Label, Reporter, Severity, Source, Span, suggest
 from powderdsl.model.check import check
 from powderdsl.model.composition.compose import compose
 from powderdsl.model.composition.layout import own_slots
@@ -69,9 +69,8 @@ def starting_backend(device: str) -> str:
 MAX_BASES = 8
 """Rulesets that extend each other, in a row."""
 
-
 MAX_PLUSES = 16
-"""Of one path."""
+"""`+` characters of one path."""
 
 
 def shipped(folder: str) -> Path:
@@ -88,24 +87,24 @@ def shipped_rules() -> list[str]:
 
 @cache
 def _shipped_words() -> dict[str, str]:
-    """What the shipped packs define, each word with its pack."""
+    """The words that the shipped packs define, each with its pack."""
     found: dict[str, str] = {}
-    for path in sorted(shipped("rules").glob("*.yaml")):
-        reporter = Reporter()
-        source = read_source(path, reporter)
-        for word in words_of_tree(parse_yaml(source, reporter) if source else None):
-            found.setdefault(word, path.stem)
+    for source in _shipped_sources():
+        for word in words_of_tree(parse_yaml(source, Reporter())):
+            found.setdefault(word, Path(source.name).stem)
     return found
 
 
+def _shipped_sources() -> Iterator[Source]:
+    for path in sorted(shipped("rules").glob("*.yaml")):
+        source = read_source(path, Reporter())
+        if source is not None:
+            yield source
+
+
 def shipped_tests() -> list[str]:
-    """What of that stands by itself: rulesets, and packs that need no other and belong to no ruleset."""
-    reporter = Reporter()
-    found = [
-        decl
-        for path in sorted(shipped("rules").glob("*.yaml"))
-        if (source := read_source(path, reporter)) and (decl := read_file(source, reporter))
-    ]
+    """The shipped rules that stand by themselves: rulesets, and packs that need no other and belong to no ruleset."""
+    found = [decl for source in _shipped_sources() if (decl := read_file(source, Reporter()))]
     inside = {scalar.text for decl in found if isinstance(decl, RulesetDecl) for scalar in decl.packs}
     return [
         decl.name.text
@@ -180,16 +179,11 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
         for word in plus:
             _read_one(word, packs, rulesets, reporter, from_ruleset=None)
     for word in (word for word in left_out if word not in packs):
-        reporter.error(
-            "PD304",
-            f"`{word}` is left out, but it was not there",
-            None,
-            helps=list(suggest(word, packs, "packs")),
-        )
+        helps = suggest(word, packs, "packs")
+        reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=helps)
     if not names:
-        reporter.error(
-            "PD304", "no rules were named", None, helps=["name a shipped ruleset or a file: `powderworld`"]
-        )
+        example = "name a shipped ruleset or a file: `powderworld`"
+        reporter.error("PD304", "no rules were named", None, helps=[example])
     kept = [pack for name, pack in packs.items() if name not in left_out]
     if not rulesets:
         return kept, None
@@ -286,13 +280,8 @@ def _read_one(
         if decl.name.text in packs:
             other = packs[decl.name.text]
             if other.source.name != decl.source.name:
-                reporter.error(
-                    "PD302",
-                    f"pack `{decl.name.text}` is loaded twice",
-                    decl.name.span,
-                    f"also in {other.source.name}",
-                    helps=["rename one of them"],
-                )
+                message, label = f"pack `{decl.name.text}` is loaded twice", f"also in {other.source.name}"
+                reporter.error("PD302", message, decl.name.span, label, helps=["rename one of them"])
             return
         packs[decl.name.text] = decl
     elif from_ruleset is not None:
@@ -367,10 +356,9 @@ def _with_base(decl: RulesetDecl, path: tuple[RulesetDecl, ...], reporter: Repor
         return None
     for scalar in decl.without:
         if scalar.text not in whole.members:
-            reporter.error(
-                "PD304", f"`{scalar.text}` is left out, but `{name}` does not have it", scalar.span, "not there",
-                helps=list(suggest(scalar.text, whole.members, "packs")),
-            )  # fmt: skip
+            message = f"`{scalar.text}` is left out, but `{name}` does not have it"
+            helps = suggest(scalar.text, whole.members, "packs")
+            reporter.error("PD304", message, scalar.span, "not there", helps=helps)
     return replace(decl, base=whole)
 
 
@@ -431,20 +419,15 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
     found: dict[str, Value] = {}
     for name, value in values.items():
         if name not in known:
-            helps = suggest(name, known, "parameters") or [
-                "parameters: " + (", ".join(sorted(known)) or "none")
-            ]
-            reporter.error("PD309", f"unknown parameter `{name}`", None, helps=list(helps))
+            names = ", ".join(sorted(known)) or "none"
+            helps = suggest(name, known, "parameters") or (f"parameters: {names}",)
+            reporter.error("PD309", f"unknown parameter `{name}`", None, helps=helps)
             continue
         try:
             found[name] = param_value(known[name], value)
         except ValueError as error:
-            reporter.error(
-                "PD402",
-                f"parameter `{name}`: {error}",
-                None,
-                notes=[f"it is {_kind_in_words(known[name].kind)}"],
-            )
+            notes = [f"it is {_kind_in_words(known[name].kind)}"]
+            reporter.error("PD402", f"parameter `{name}`: {error}", None, notes=notes)
     return ruleset.with_params(found)
 
 
@@ -453,37 +436,30 @@ def _kind_in_words(kind: Kind) -> str:
         return "a chance: write a percentage from 0% to 100%, or a number from 0 to 1"
     if kind.name == "flag":
         return "a flag: write yes or no"
-    return f"a {'whole' if kind.name == 'int' else 'real'} number from {kind.lo:g} to {kind.hi:g}"
+    return f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
 
 
 def param_value(param: Param, value: Any) -> Value:
     """A value for a parameter from text (``"5%"``, ``"yes"``) or a number. Raises ValueError."""
-    shown = None
-    if isinstance(value, str):
-        text = shown = value.strip()
-        words = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
-        try:
-            value = (
-                words[text]
-                if text in words
-                else float(text[:-1]) / 100
-                if text.endswith("%")
-                else float(text)
-            )
-        except ValueError:
-            raise ValueError(f"`{text}` is not a number") from None
+    text = value.strip() if isinstance(value, str) else None
+    flags = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
     try:
-        number = float(value)
+        if text is not None and text.endswith("%"):
+            number = float(text[:-1]) / 100
+        else:
+            number = float(value if text is None else flags.get(text, text))
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{value!r} is not a number") from None
-    lo, hi = (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
+        raise ValueError(f"{repr(value) if text is None else f'`{text}`'} is not a number") from None
+    kind = param.kind.name
+    lo, hi = (0.0, 1.0) if kind in ("chance", "flag") else (param.kind.lo, param.kind.hi)
     if not lo <= number <= hi:
-        if param.kind.name == "chance":
-            raise ValueError(f"{shown or format(number, 'g')} lies outside 0%..100%")
-        raise ValueError(f"{shown or format(number, 'g')} lies outside {lo:g}..{hi:g}")
-    if param.kind.name in ("int", "flag") and number != int(number):
-        raise ValueError(f"{number:g} is not whole")
-    return int(number) if param.kind.name in ("int", "flag") else number
+        bounds = "0%..100%" if kind == "chance" else f"{lo:g}..{hi:g}"
+        raise ValueError(f"{text or format(number, 'g')} lies outside {bounds}")
+    if kind not in ("int", "flag"):
+        return number
+    if number != int(number):
+        raise ValueError(f"{number:g} is not an integer")
+    return int(number)
 
 
 @collection_paused()

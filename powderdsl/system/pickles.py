@@ -41,22 +41,6 @@ class _Node:
     depth: int = 0
 
 
-_ATOMS = frozenset(
-    [
-        "BINUNICODE",
-        "BININT",
-        "BININT1",
-        "BININT2",
-        "LONG1",
-        "LONG4",
-        "BINFLOAT",
-        "NONE",
-        "NEWTRUE",
-        "NEWFALSE",
-    ]
-)
-_COUNTS = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-_EMPTY = {"EMPTY_DICT": "dict", "EMPTY_LIST": "list", "EMPTY_TUPLE": "tuple"}
 _MARK = _Node("mark")
 
 
@@ -100,35 +84,25 @@ class _Machine:
         self.memo: dict[int, _Node] = {}
 
     def run(self, text: bytes) -> None:
-        argument: Any
         for opcode, argument, _ in pickletools.genops(text):
-            name = opcode.name
-            if name in _ATOMS:
-                self.stack.append(_Node("atom", argument))
-            elif name in _EMPTY:
-                self.stack.append(_Node(_EMPTY[name], []))
-            elif name in _COUNTS:
-                self.push_tuple(self.pop(_COUNTS[name]))
-            elif name in ("BINPUT", "LONG_BINPUT"):
-                self.memo[argument] = self.stack[-1]
-            elif name in ("BINGET", "LONG_BINGET"):
-                self.stack.append(self.shared(argument))
-            elif name == "GLOBAL":
-                self.stack.append(_Node("global", argument))
-            elif name == "MARK":
-                self.stack.append(_MARK)
-            elif name in ("PROTO", "STOP"):
-                continue
-            elif name in _STEPS:
-                _STEPS[name](self)
-            else:
-                raise NotSaved(f"it uses {name}")
+            if opcode.name not in _STEPS:
+                raise NotSaved(f"it uses {opcode.name}")
+            _STEPS[opcode.name](self, argument)
 
-    def shared(self, number: int) -> _Node:
+    def push(self, kind: str, value: Any = None) -> None:
+        self.stack.append(_Node(kind, value))
+
+    def push_tuple(self, items: list[_Node]) -> None:
+        self.stack.append(self.holding(_Node("tuple", items), items))
+
+    def remember(self, number: int) -> None:
+        self.memo[number] = self.stack[-1]
+
+    def recall(self, number: int) -> None:
         found = self.memo[number]
         if found.kind in ("list", "dict", "ordered"):
             raise NotSaved("two of its values are one")
-        return found
+        self.stack.append(found)
 
     def pop(self, count: int) -> list[_Node]:
         found = self.stack[-count:]
@@ -143,9 +117,6 @@ class _Machine:
             found.append(self.stack.pop())
         self.stack.pop()
         return found[::-1]
-
-    def push_tuple(self, items: list[_Node]) -> None:
-        self.stack.append(self.holding(_Node("tuple", items), items))
 
     def holding(self, node: _Node, items: list[_Node]) -> _Node:
         """The node, as deep as with these items in it."""
@@ -174,14 +145,14 @@ class _Machine:
             raise NotSaved("it has a storage that is none")
         if self.records.get(key) != count * size:
             raise NotSaved(f"the storage {key} does not have the bytes that it says")
-        self.stack.append(_Node("storage", count))
+        self.push("storage", count)
 
     def reduce(self) -> None:
         function, arguments = self.pop(2)
         if function.kind != "global" or arguments.kind != "tuple":
             raise NotSaved("it calls what is not a function")
         if function.value == _ORDERED and not arguments.value:
-            self.stack.append(_Node("ordered", []))
+            self.push("ordered", [])
         elif function.value == _TENSOR:
             self.stack.append(_tensor(arguments.value))
         else:
@@ -208,13 +179,33 @@ def _tensor(arguments: list[_Node]) -> _Node:
     return _Node("tensor")
 
 
-_STEPS: dict[str, Callable[[_Machine], None]] = {
-    "TUPLE": lambda one: one.push_tuple(one.pop_to_mark()),
-    "APPEND": lambda one: one.fill(("list",), one.pop(1)),
-    "APPENDS": lambda one: one.fill(("list",), one.pop_to_mark()),
-    "SETITEM": lambda one: one.fill(("dict", "ordered"), one.pop(2)),
-    "SETITEMS": lambda one: one.fill(("dict", "ordered"), one.pop_to_mark()),
-    "BINPERSID": _Machine.storage,
-    "REDUCE": _Machine.reduce,
-    "BUILD": _Machine.build,
+_Step = Callable[[_Machine, Any], None]
+_ATOMS = (
+    "BINUNICODE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "NONE", "NEWTRUE", "NEWFALSE",
+)  # fmt: skip
+_STEPS: dict[str, _Step] = {
+    "PROTO": lambda machine, _: None,
+    "STOP": lambda machine, _: None,
+    **dict.fromkeys(_ATOMS, lambda machine, value: machine.push("atom", value)),
+    "GLOBAL": lambda machine, name: machine.push("global", name),
+    "EMPTY_DICT": lambda machine, _: machine.push("dict", []),
+    "EMPTY_LIST": lambda machine, _: machine.push("list", []),
+    "EMPTY_TUPLE": lambda machine, _: machine.push("tuple", []),
+    "TUPLE1": lambda machine, _: machine.push_tuple(machine.pop(1)),
+    "TUPLE2": lambda machine, _: machine.push_tuple(machine.pop(2)),
+    "TUPLE3": lambda machine, _: machine.push_tuple(machine.pop(3)),
+    "TUPLE": lambda machine, _: machine.push_tuple(machine.pop_to_mark()),
+    "MARK": lambda machine, _: machine.stack.append(_MARK),
+    "BINPUT": _Machine.remember,
+    "LONG_BINPUT": _Machine.remember,
+    "BINGET": _Machine.recall,
+    "LONG_BINGET": _Machine.recall,
+    "APPEND": lambda machine, _: machine.fill(("list",), machine.pop(1)),
+    "APPENDS": lambda machine, _: machine.fill(("list",), machine.pop_to_mark()),
+    "SETITEM": lambda machine, _: machine.fill(("dict", "ordered"), machine.pop(2)),
+    "SETITEMS": lambda machine, _: machine.fill(("dict", "ordered"), machine.pop_to_mark()),
+    "BINPERSID": lambda machine, _: machine.storage(),
+    "REDUCE": lambda machine, _: machine.reduce(),
+    "BUILD": lambda machine, _: machine.build(),
 }
+"""What each operation does, with its argument. No other operation passes."""

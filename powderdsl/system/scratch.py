@@ -13,7 +13,7 @@ import shutil
 import stat
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
@@ -35,30 +35,31 @@ _mine: dict[Path, int] = {}
 _swept: set[Path] = set()
 
 
-@contextmanager
-def scratch_file(target: Path) -> Iterator[Path]:
+def scratch_file(target: Path) -> AbstractContextManager[Path]:
     """An empty file that only its owner can read, beside `target` and with its suffix. It may be moved away.
 
     Raises:
         OSError, ValueError: it cannot be made there.
     """
-    _sweep_once(target.parent)
-    path = _made(target.parent, f".{target.stem[:40]}", target.suffix, _new_file)
-    try:
-        yield path
-    finally:
-        _dispose(path)
+    return _scratch(target.parent, f".{target.stem[:40]}", target.suffix, _new_file)
 
 
-@contextmanager
-def scratch_folder(parent: Path) -> Iterator[Path]:
+def scratch_folder(parent: Path) -> AbstractContextManager[Path]:
     """An empty folder in `parent` that only its owner can read, removed at the end with all that it holds.
 
     Raises:
         OSError: it cannot be made there.
     """
-    _sweep_once(parent)
-    path = _made(parent, "", "", _new_folder)
+    return _scratch(parent, "", "", _new_folder)
+
+
+@contextmanager
+def _scratch(parent: Path, start: str, suffix: str, make: Callable[[Path], int]) -> Iterator[Path]:
+    folder = parent.absolute()
+    if folder not in _swept:
+        _swept.add(folder)
+        sweep(folder)
+    path = _made(parent, start, suffix, make)
     try:
         yield path
     finally:
@@ -76,13 +77,6 @@ def sweep(folder: Path) -> None:
 def is_scratch(name: str) -> bool:
     """Whether a file or folder has the name of one that is made here."""
     return NAME.fullmatch(name) is not None
-
-
-def _sweep_once(folder: Path) -> None:
-    folder = folder.absolute()
-    if folder not in _swept:
-        _swept.add(folder)
-        sweep(folder)
 
 
 def _made(parent: Path, start: str, suffix: str, make: Callable[[Path], int]) -> Path:
@@ -135,30 +129,35 @@ def _dispose(path: Path) -> None:
 
 def _remove_unless_held(path: Path) -> None:
     """Remove a leftover of this user's. What is neither a file nor a folder, or a link, is left alone."""
-    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    handle = -1
     try:
         found = path.lstat()
         if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
             return
         if hasattr(os, "getuid") and found.st_uid != os.getuid():
             return
-        if fcntl is None:
-            if time.time() - found.st_mtime > OLD:
-                _remove(path)
-            return
-        handle = os.open(path, flags)
+        if fcntl is not None:
+            handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        if _nobodys(handle, found):
+            _remove(path)
     except OSError:
         return
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        _remove(path)
-    except BlockingIOError:
-        pass
-    except OSError:
-        if time.time() - found.st_mtime > OLD:
-            _remove(path)
     finally:
-        os.close(handle)
+        if handle >= 0:
+            os.close(handle)
+
+
+def _nobodys(handle: int, found: os.stat_result) -> bool:
+    """Lock a leftover; whether its process is dead, or it is old where there are no locks."""
+    if fcntl is not None:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            return False
+        except OSError:  # no locks here
+            pass
+    return time.time() - found.st_mtime > OLD
 
 
 def _remove(path: Path) -> None:

@@ -16,7 +16,7 @@ from powderdsl.cli.plain_table import Painted, table
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
-from powderdsl.model.types import ColorRamp, Element, Param, Pass, Property, Ruleset, Value
+from powderdsl.model.types import Element, Pass, Property, Ruleset, Value
 from powderdsl.tasks.names import is_task
 
 
@@ -172,47 +172,41 @@ def _data(ruleset: Ruleset) -> dict[str, Any]:
             }
             for one in reactions(ruleset)
         ],
-        "passes": [_pass_data(one) for one in ruleset.passes],
-        "params": [_param_data(param) for param in ruleset.params],
+        "passes": [
+            {
+                "name": one.name,
+                "pack": one.pack,
+                "moments": len(one.moments),
+                "rules": [{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(one)],
+                "where": place_of(one.span),
+            }
+            for one in ruleset.passes
+        ],
+        "params": [
+            {
+                "name": param.name,
+                "value": _plain(param.default),
+                "kind": str(param.kind),
+                "about": param.about,
+                "where": place_of(param.span),
+            }
+            for param in ruleset.params
+        ],
     }
 
 
 def _element_data(ruleset: Ruleset, element: Element) -> dict[str, Any]:
+    ramp = element.ramp
     return {
         "id": element.id,
         "name": element.name,
         "pack": element.pack,
         "glyph": element.glyph,
         "color": element.color,
-        "color_by": _ramp_data(element.ramp),
+        "color_by": ramp
+        and {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": [ramp.lo, ramp.hi]},
         "about": element.about,
         "tags": sorted(element.tags),
         "properties": {prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
         "where": place_of(element.span),
-    }
-
-
-def _ramp_data(ramp: ColorRamp | None) -> dict[str, Any] | None:
-    if ramp is None:
-        return None
-    return {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": [ramp.lo, ramp.hi]}
-
-
-def _pass_data(one: Pass) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "pack": one.pack,
-        "moments": len(one.moments),
-        "rules": [{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(one)],
-        "where": place_of(one.span),
-    }
-
-
-def _param_data(param: Param) -> dict[str, Any]:
-    return {
-        "name": param.name,
-        "value": _plain(param.default),
-        "kind": str(param.kind),
-        "about": param.about,
-        "where": place_of(param.span),
     }

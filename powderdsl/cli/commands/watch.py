@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -20,6 +21,11 @@ from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.cli.task_sheets import find_played
 from powderdsl.rl.config import TrainConfig
 from powderdsl.tasks.task import Task
+
+if TYPE_CHECKING:
+    from powderdsl.envs.acting import Policy
+    from powderdsl.experiments.runs import RunFolder
+    from powderdsl.tasks.episodes import TaskProgram
 
 SUFFIXES = (".gif", ".mp4")
 
@@ -86,32 +92,32 @@ def command(
     check_writable(out)
     import torch
 
-    from powderdsl.envs.acting import Policy, random_policy
-    from powderdsl.envs.tensor_env import TensorEnv
     from powderdsl.rl.films import film
-    from powderdsl.rl.policies import load_policy
     from powderdsl.simulation.media import write_gif, write_mp4
     from powderdsl.tasks.episodes import compile_task
 
     program = compile_task(task, split=split, backend=backend or config.backend)
-    acts: Policy | None = None
-    with user_values():
-        if policy == "trained" and not isinstance(played, Task):
-            env = TensorEnv(program, 1, observation=config.observation)
-            acts = load_policy(played, env, deterministic=deterministic)
-        elif policy == "random":
-            acts = random_policy(program.action_nvec)
-    episodes, pictures = film(
-        program,
-        acts,
-        torch.arange(first, first + worlds),
-        observation=config.observation if policy == "trained" else "ids",
-        seed=seed,
-        factor=scale,
-    )
+    acts, observation = _acting(policy, played, program, config, deterministic)
+    numbers = torch.arange(first, first + worlds)
+    episodes, pictures = film(program, acts, numbers, observation=observation, seed=seed, factor=scale)
     write = write_gif if out.suffix.lower() == ".gif" else write_mp4
     write(out, pictures, fps=fps)
     returns = ", ".join(f"{one:.2f}" for one in episodes.returns.tolist())
     click.echo(
         f"wrote {out}: {task.name}, {policy}, worlds {first} to {first + worlds - 1} of {split}: {returns}"
     )
+
+
+def _acting(
+    name: str, played: Task | RunFolder, program: TaskProgram, config: TrainConfig, deterministic: bool
+) -> tuple[Policy | None, str]:
+    """A policy, None if nobody acts, and the kind of observation that it is given."""
+    from powderdsl.envs.acting import random_policy
+    from powderdsl.envs.tensor_env import TensorEnv
+    from powderdsl.rl.policies import load_policy
+
+    with user_values():
+        if name == "trained" and not isinstance(played, Task):
+            env = TensorEnv(program, 1, observation=config.observation)
+            return load_policy(played, env, deterministic=deterministic), config.observation
+        return (random_policy(program.action_nvec) if name == "random" else None), "ids"
