@@ -375,9 +375,11 @@ class _PassBits:
         lo, hi = node.type.lo, node.type.hi
         inner, by = node.args[0].type, node.args[1].type
         if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
-            return gates.fit(
-                Bits(value.planes[by.lo.bit_length() - 1 :] or (gates.no,), value.signed), lo, hi
-            )
+            sign = (
+                value.planes[-1] if value.signed else gates.no
+            )  # what is left of a number that has fewer bits
+            shifted = value.planes[by.lo.bit_length() - 1 :] or (sign,)
+            return gates.fit(Bits(shifted, value.signed), lo, hi)
         if by.lo == by.hi and by.lo and len(value.planes) <= MAX_TABLE_BITS // 2:
             count, signed = width(lo, hi)
             planes = (

@@ -98,7 +98,8 @@ class _Blocks:
         """The block that the planes lie in, if they are most of it; else a new one."""
         names = [str(plane.old.attr) for plane in move.planes]
         homes = {self.members[name][0].name: self.members[name][0] for name in names if name in self.members}
-        if len(homes) == 1 and all(name in self.members for name in names):
+        once = len(set(names)) == len(names)  # a plane that becomes two needs two places
+        if len(homes) == 1 and once and all(name in self.members for name in names):
             block = next(iter(homes.values()))
             if 2 * len(names) > self.size[block.name]:
                 return [], block, [self.members[name][1] for name in names]
