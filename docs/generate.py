@@ -208,14 +208,13 @@ def stages() -> str:
 
 
 def planner() -> str:
-    from powderdsl.schedule.stages import ARRAYS, CPP, CUDA
+    from powderdsl.schedule.stages import PLANNERS
 
-    targets = {"arrays": ARRAYS, "C++": CPP, "CUDA": CUDA}
-    names = dict.fromkeys(stage.name for stages in targets.values() for stage in stages)
+    names = dict.fromkeys(stage.name for stages in PLANNERS.values() for stage in stages)
     rows = []
     for name in names:
         found = {
-            target: stage for target, stages in targets.items() for stage in stages if stage.name == name
+            target: stage for target, stages in PLANNERS.items() for stage in stages if stage.name == name
         }
         rows.append((f"`{name}`", next(iter(found.values())).about, ", ".join(found)))
     return table(("stage", "what it decides", "for"), rows)

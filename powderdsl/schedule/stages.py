@@ -39,50 +39,74 @@ class Stage:
 
 
 ARRAYS = (
-    Stage("thresholds", thresholds, "draws below a parameter, before their planes get variables"),
-    Stage("questions", cheap_questions, "guards ask without draws"),
-    Stage("share", share, "what several statements need, once; after `questions`, which copy parts of masks"),
+    Stage(
+        "thresholds",
+        thresholds,
+        "which draws are compared with a parameter; before their planes get variables",
+    ),
+    Stage("questions", cheap_questions, "guards test their masks without draws first"),
+    Stage(
+        "share",
+        share,
+        "what several statements need is computed once; after `questions`, which copies parts of masks",
+    ),
     Stage(
         "conditions",
         conditions,
-        "where each draw matters; after `share`, so that each has its own users only",
+        "where the result of each draw matters; after `share`, so that a draw has its own users only",
     ),
-    Stage("moves", moves, "planes that move together; after `share`, so that their movers are variables"),
-    Stage("blocks", blocks, "moving planes in one array"),
-    Stage("choices", choices, "choices of floats that change few cells"),
-    Stage("flatten", flatten, "one operation a statement; nothing after it makes operations"),
-    Stage("place", place, "what is released, and what is overwritten"),
+    Stage("moves", moves, "which planes move together; after `share`, so that their movers are variables"),
+    Stage("blocks", blocks, "moving planes lie in one array"),
+    Stage("choices", choices, "which choices between floats change only a few cells"),
+    Stage("flatten", flatten, "one operation per statement; no later stage creates operations"),
+    Stage("place", place, "which arrays are released and which are overwritten"),
 )
 """For targets that carry out one operation over all cells of all worlds before the next."""
 
 
 CUDA = (
-    Stage("thresholds", thresholds, "draws below a parameter"),
-    Stage("late", late, "floats where they are asked for"),
-    Stage("led", led, "comparisons under others"),
-    Stage("conditions", conditions, "where each draw matters"),
-    Stage("cut", cut(Costs(gates=24, floats=2)), "loops; a barrier costs about as much as 24 gates"),
-    Stage("unread", without_unread, "floats that were stored for neighbors who then did not ask"),
-    Stage("narrow", narrow, "loops over cells where something happens"),
-    Stage("regions", ask_regions, "not even looked for where it happens nowhere"),
+    Stage("thresholds", thresholds, "which draws are compared with a parameter"),
+    Stage("late", late, "floats are computed where they are used"),
+    Stage("led", led, "which comparisons are computed only where another one holds"),
+    Stage("conditions", conditions, "where the result of each draw matters"),
+    Stage(
+        "cut",
+        cut(Costs(gates=24, floats=2)),
+        "where loops begin and end; a barrier costs about as much as 24 gates",
+    ),
+    Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),
+    Stage("narrow", narrow, "in which cells a loop has anything to do"),
+    Stage("regions", ask_regions, "loops that have nothing to do anywhere are skipped"),
 )
 """For blocks of threads that share some worlds."""
 
 
 CPP = (
-    Stage("thresholds", thresholds, "draws below a parameter"),
-    Stage("late", late, "floats where they are asked for"),
-    Stage("led", led, "comparisons under others"),
-    Stage("conditions", conditions, "where each draw matters"),
-    Stage("presence", presence, "which elements are asked for; before `cut`, which takes masks apart"),
-    Stage("cut", cut_rows(Costs(gates=6, floats=2)), "loops over rows, and movements in place"),
-    Stage("unread", without_unread, "floats that were stored for neighbors who then did not ask"),
-    Stage("empty", empty, "loops over words that find nothing"),
-    Stage("narrow", narrow, "loops over cells where something happens"),
-    Stage("join", join, "loops over cells that follow each other; they must know what they read"),
-    Stage("release", release, "what is not needed any more, after everything that reads it has its place"),
+    Stage("thresholds", thresholds, "which draws are compared with a parameter"),
+    Stage("late", late, "floats are computed where they are used"),
+    Stage("led", led, "which comparisons are computed only where another one holds"),
+    Stage("conditions", conditions, "where the result of each draw matters"),
+    Stage(
+        "presence",
+        presence,
+        "which elements must be present for work to be done; before `cut`, which takes masks apart",
+    ),
+    Stage(
+        "cut",
+        cut_rows(Costs(gates=6, floats=2)),
+        "where loops over rows begin and end, and which movements happen in place",
+    ),
+    Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),
+    Stage("empty", empty, "which loops over words give nothing because a plane is empty"),
+    Stage("narrow", narrow, "in which cells a loop has anything to do"),
+    Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read"),
+    Stage("release", release, "when a plane is no longer needed; last, after all reads have their place"),
 )
 """For a thread that works on eight worlds side by side, plane by plane."""
+
+
+PLANNERS = {"arrays": ARRAYS, "native": CPP, "cuda": CUDA}
+"""The stages of each backend that prints schedules."""
 
 
 def plan(pass_: PassGraph, stages: tuple[Stage, ...]) -> Schedule:

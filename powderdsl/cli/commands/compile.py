@@ -102,13 +102,12 @@ def _planes(program: Program, pass_name: str | None) -> str:
 def _schedules(program: Program, backend: str, after: str | None, pass_name: str | None) -> str:
     """The schedules of a backend's passes after a stage of the planner."""
     from powderdsl.ir.segments import segments
-    from powderdsl.schedule.stages import ARRAYS, CPP, CUDA, steps
+    from powderdsl.schedule.stages import PLANNERS, steps
     from powderdsl.schedule.text import print_schedule
 
-    planners = {"cuda": CUDA, "native": CPP}
-    if backend in ("reference", "torch"):
+    stages = PLANNERS.get("arrays" if backend == "auto" else backend)
+    if stages is None:
         raise BadInput(f"the {backend} backend has no schedule: it computes pass by pass what the IR says")
-    stages = planners.get(backend, ARRAYS)
     names = ["lower", *(stage.name for stage in stages)]
     if after is not None and after not in names:
         raise BadInput("; ".join([f"no stage `{after}`", *suggest(after, names, "stages")]))

@@ -28,14 +28,14 @@ def _rewriting(*rules: Rewrite) -> Callable[[PassGraph], PassGraph]:
 
 
 PIPELINE: tuple[Stage, ...] = (
-    Stage("fold", "constants, and flags that say the same", _rewriting(*FOLD)),
+    Stage("fold", "folds constants and flags that are always equal", _rewriting(*FOLD)),
     # Before sharing: what a neighbor's property decides becomes a question about its element.
-    Stage("specialise", "properties of a cell whose element is known", specialise),
-    Stage("resolve", "questions about properties become sets of elements", _rewriting(*RESOLVE, *FOLD)),
+    Stage("specialise", "replaces the properties of a cell whose element is known", specialise),
+    Stage("resolve", "turns tests of properties into tests of the element", _rewriting(*RESOLVE, *FOLD)),
     # After resolving: only now is it clear which neighbors are read.
-    Stage("share", "one read a neighbor and value", _rewriting(*SHARE, *FOLD)),
-    # Last: moments whose rules turned out never to fire write nothing any more.
-    Stage("prune", "moments that change nothing", prune),
+    Stage("share", "reads each value of a neighbor once", _rewriting(*SHARE, *FOLD)),
+    # Last: substeps whose rules have turned out never to fire no longer write anything.
+    Stage("prune", "removes substeps that change nothing", prune),
 )
 
 
