@@ -1,26 +1,38 @@
 """IR on numbers -> IR on bit planes: every integer becomes a few flags, every rule gates, shifts and swaps.
 
-The result is ordinary IR without integers: flags and floats remain. Slots of integers become one flag slot
-a plane, ``element:0`` the lowest.
+The result is ordinary IR without integers: flags and floats remain. A slot of integers becomes one slot of flags
+for each bit plane, ``element:0`` the lowest.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.gates import Bits, Gates, width
-from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Program, SlotType, Step, nodes_of, plane_name
+from powderdsl.ir.ops import (
+    FLAG,
+    REAL,
+    Node,
+    PassGraph,
+    Program,
+    SlotType,
+    SubstepGraph,
+    Type,
+    nodes_of,
+    plane_name,
+)
 
 MAX_TABLE_BITS = 12
 
 MAX_GATES = 1 << 14
-"""Nodes of a pass on planes. So many take a C++ compiler a quarter of a minute."""
+"""Nodes of a pass on bit planes. Compiling this many takes a C++ compiler a quarter of a minute."""
 
 
 class NotBits(Exception):
-    """Something that planes cannot carry; torch tensors can. `place` is the rule's file and line."""
+    """Something that bit planes cannot carry; torch tensors can. `place` is the rule's file and line."""
 
     def __init__(self, why: str, place: str = ""):
         super().__init__(why)
@@ -28,7 +40,7 @@ class NotBits(Exception):
 
 
 def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
-    """The planes of a slot, lowest bit first; flags and reals stay one slot."""
+    """The slots of an integer's bit planes, lowest bit first; flags and floats stay one slot."""
     if slot.type.name != "int":
         return (slot,)
     count, _ = width(slot.type.lo, slot.type.hi)
@@ -39,14 +51,14 @@ def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
 
 
 def lower_bits(program: Program) -> Program:
-    """The program on planes. Raises NotBits with the pass that cannot be."""
+    """The program on bit planes. Raises NotBits for the first pass that they cannot carry."""
     slots = tuple(plane for slot in program.slots for plane in plane_slots(slot))
     passes = tuple(lower_pass(program, pass_) for pass_ in program.passes)
     return replace(program, slots=slots, passes=passes)
 
 
 def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
-    """One pass of a program on planes. Raises NotBits."""
+    """One pass of a program on bit planes. Raises NotBits."""
     return _PassBits({slot.name: slot for slot in program.slots}).lower(pass_)
 
 
@@ -59,22 +71,6 @@ class _PassBits:
         self.gates = Gates(self.build)
         self.values: dict[int, Node | Bits] = {}
         for node in nodes_of(pass_):
-            self._visit(node)
-        moments = []
-        for step in pass_.moments:
-            writes = tuple(w for name, node in step.writes for w in self._write(name, node))
-            guards = []
-            for guard in step.guards:
-                for part in _with_arguments(guard):
-                    self._visit(part)
-                guards.append(self._flag(guard))
-            moments.append(Step(step.label, step.place, writes, tuple(guards)))
-        outputs = tuple(w for name, node in pass_.outputs for w in self._write(name, node))
-        kept = tuple((name, node) for name, node in outputs if not (node.op == "input" and node.attr == name))
-        return PassGraph(pass_.name, pass_.pack, tuple(moments), kept)
-
-    def _visit(self, node: Node) -> None:
-        if id(node) not in self.values:
             self.build.place = node.places[0] if node.places else ""
             try:
                 self.values[id(node)] = self._lower(node)
@@ -83,9 +79,17 @@ class _PassBits:
             except NotBits as error:
                 error.place = error.place or self.build.place
                 raise
+        substeps = []
+        for one in pass_.substeps:
+            writes = tuple(w for name, node in one.writes for w in self._write(name, node))
+            guards = tuple(self._flag(guard) for guard in one.guards)
+            substeps.append(SubstepGraph(one.label, one.place, writes, guards))
+        outputs = tuple(w for name, node in pass_.outputs for w in self._write(name, node))
+        kept = tuple((name, node) for name, node in outputs if not (node.op == "input" and node.attr == name))
+        return PassGraph(pass_.name, pass_.pack, tuple(substeps), kept)
 
     def _write(self, name: str, node: Node) -> list[tuple[str, Node]]:
-        """The planes that a write of a slot becomes. Scratch slots have no declared range: theirs is the node's."""
+        """The writes of bit planes that a write of a slot becomes. The range of a scratch slot is that of the node."""
         value = self.values[id(node)]
         if isinstance(value, Node):
             return [(name, value)]
@@ -112,15 +116,11 @@ class _PassBits:
                 return self._input(node)
             case "const" if node.type.name == "int":
                 return gates.constant(int(node.attr))
-            case "param" if node.type.name == "int":
+            case "param" | "coordinate" if node.type.name == "int":
                 count, signed = width(node.type.lo, node.type.hi)
-                name, view = node.attr
-                planes = tuple(build.make("param", FLAG, attr=(name, view, i)) for i in range(count))
-                return Bits(planes, signed)
-            case "coordinate":
-                count, signed = width(node.type.lo, node.type.hi)
-                planes = tuple(build.make("coordinate", FLAG, attr=(*node.attr, i)) for i in range(count))
-                return Bits(planes, signed)
+                return Bits(
+                    tuple(build.make(node.op, FLAG, attr=(*node.attr, i)) for i in range(count)), signed
+                )
             case "below":
                 return self._below(node)
             case "shift":
@@ -129,12 +129,9 @@ class _PassBits:
                 return self._count(node)
             case "not":
                 return gates.not_(self._flag(args[0]))
-            case "and":
-                return gates.and_(self._flag(args[0]), self._flag(args[1]))
-            case "or":
-                return gates.or_(self._flag(args[0]), self._flag(args[1]))
-            case "xor":
-                return gates.xor(self._flag(args[0]), self._flag(args[1]))
+            case "and" | "or" | "xor":
+                gate = {"and": gates.and_, "or": gates.or_, "xor": gates.xor}[node.op]
+                return gate(*(self._flag(arg) for arg in args))
             case "in_set":
                 return self._in_set(node)
             case "table":
@@ -142,12 +139,10 @@ class _PassBits:
             case "eq" | "lt" | "le" if args[0].type.name == "int":
                 return self._compare(node)
             case "select" if node.type.name == "int":
-                condition = self._flag(args[0])
-                return gates.select(
-                    condition, self._bits(args[1]), self._bits(args[2]), node.type.lo, node.type.hi
-                )
+                yes, no = self._bits(args[1]), self._bits(args[2])
+                return gates.select(self._flag(args[0]), yes, no, node.type.lo, node.type.hi)
             case "select" if node.type == FLAG:
-                return gates.mux(self._flag(args[0]), self._flag(args[1]), self._flag(args[2]))
+                return gates.mux(*(self._flag(arg) for arg in args))
             case "swap" | "arrive":
                 return self._movement(node)
             case "to_real":
@@ -175,10 +170,9 @@ class _PassBits:
         return self.build.shift(value, (dy, dx), wraps)
 
     def _movement(self, node: Node) -> Node | Bits:
-        """Swaps stay swaps, a plane each: backends exchange planes in place."""
+        """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""
         movers = self._flag(node.args[1])
         content, rest = self.values[id(node.args[0])], self.values[id(node.args[2])]
-        make = self.build.swap if node.op == "swap" else self.build.arrive
         offset = node.attr
         if isinstance(content, Node):
             assert isinstance(rest, Node)
@@ -189,14 +183,15 @@ class _PassBits:
                 if node.op == "swap":
                     moved = self.build.select(movers, self.build.shift(content, (dy, dx)), moved)
                 return moved
-            return make(content, movers, rest, offset)
+            return self.build.move(node.op, content, movers, rest, offset)
         assert isinstance(rest, Bits)
         content = self.gates.fit(content, node.type.lo, node.type.hi)
         rest = self.gates.fit(rest, node.type.lo, node.type.hi)
-        planes = []
-        for a, b in zip(content.planes, rest.planes, strict=True):
-            planes.append(a if a is b and a.op == "const" else make(a, movers, b, offset))
-        return Bits(tuple(planes), content.signed)
+        planes = tuple(
+            a if a is b and a.op == "const" else self.build.move(node.op, a, movers, b, offset)
+            for a, b in zip(content.planes, rest.planes, strict=True)
+        )
+        return Bits(planes, content.signed)
 
     def _below(self, node: Node) -> Node:
         """A draw below a limit. A constant limit is an attribute; another is given plane by plane, highest first."""
@@ -204,7 +199,7 @@ class _PassBits:
         stream, bits = node.attr
         if limit.op == "select":
             condition, yes, no = limit.args
-            parts = [self._below(replace_argument(node, arg)) for arg in (yes, no)]
+            parts = [self._below(replace(node, args=(arg,))) for arg in (yes, no)]  # outside any graph
             return self.gates.mux(self._flag(condition), *parts)
         if limit.op == "const":
             count = int(limit.attr)
@@ -217,54 +212,44 @@ class _PassBits:
         return self.build.make("below_planes", FLAG, *reversed(planes), attr=(stream, bits))
 
     def _in_set(self, node: Node) -> Node:
-        value = self._bits(node.args[0])
-        lo, hi = node.args[0].type.lo, node.args[0].type.hi
-        members = node.attr
-        assert isinstance(members, frozenset)
-        return self._function(value, lo, hi, lambda v: v in members)
+        return self._function(node.args[0], lambda v: v in node.attr)
 
-    def _function(self, value: Bits, lo: int, hi: int, function: Callable[..., int]) -> Node:
-        """A flag that depends on a small integer only."""
-        count = len(value.planes)
+    def _function(self, argument: Node, function: Callable[..., int], below: int | None = None) -> Node:
+        """A flag that depends on a small integer only; what it is from `below` on does not matter."""
+        planes, type = self._bits(argument).planes, argument.type
+        count = len(planes)
         if count > MAX_TABLE_BITS:
             raise NotBits(f"a table over {count} planes")
         table: list[bool | None] = [None] * (1 << count)
-        for number in range(lo, hi + 1):
+        for number in range(type.lo, type.hi + 1 if below is None else min(type.hi + 1, below)):
             table[number & ((1 << count) - 1)] = bool(function(number))
-        return self.gates.truth_table(value.planes, table)
+        return self.gates.truth_table(planes, table)
+
+    def _numbers(
+        self, argument: Node, type: Type, function: Callable[[int], int], below: int | None = None
+    ) -> Bits:
+        """An integer of a type that depends on a small integer only, bit by bit."""
+        count, signed = width(type.lo, type.hi)
+        planes = (self._function(argument, lambda v, i=i: function(v) >> i & 1, below) for i in range(count))
+        return Bits(tuple(planes), signed)
 
     def _table(self, node: Node) -> Bits:
-        value = self._bits(node.args[0])
-        lo, hi = node.args[0].type.lo, node.args[0].type.hi
-        count, signed = width(node.type.lo, node.type.hi)
-        entries = node.attr
-        assert isinstance(entries, tuple)
-        hi = min(hi, len(entries) - 1)
-        planes = tuple(
-            self._function(value, lo, hi, lambda v, i=i: entries[v] >> i & 1) for i in range(count)
-        )
-        return Bits(planes, signed)
+        return self._numbers(node.args[0], node.type, node.attr.__getitem__, len(node.attr))
 
     def _compare(self, node: Node) -> Node:
-        gates = self.gates
-        left, right = node.args
         near = self._any_neighbor(node)
         if near is not None:
             return near
+        left, right = node.args
         a, b = self._bits(left), self._bits(right)
-        for value, other, flipped in ((left, right, False), (right, left, True)):
-            planes = self._bits(value).planes
-            if other.op == "const" and len(planes) <= 5:
-                bound = int(other.attr)
-                holds = {
-                    "eq": lambda v, c=bound: v == c,
-                    "lt": (lambda v, c=bound: c < v) if flipped else (lambda v, c=bound: v < c),
-                    "le": (lambda v, c=bound: c <= v) if flipped else (lambda v, c=bound: v <= c),
-                }[node.op]
-                return self._function(self._bits(value), value.type.lo, value.type.hi, holds)
+        holds = getattr(operator, node.op)
+        if right.op == "const" and len(a.planes) <= 5:
+            return self._function(left, lambda v: holds(v, right.attr))
+        if left.op == "const" and len(b.planes) <= 5:
+            return self._function(right, lambda v: holds(left.attr, v))
         if node.op == "eq":
-            return gates.eq(a, b)
-        return gates.lt(a, b) if node.op == "lt" else gates.not_(gates.lt(b, a))
+            return self.gates.eq(a, b)
+        return self.gates.lt(a, b) if node.op == "lt" else self.gates.not_(self.gates.lt(b, a))
 
     def _any_neighbor(self, node: Node) -> Node | None:
         """0 < count(x), 1 <= count(x), count(x) == 0: neighbors are joined, not counted."""
@@ -275,13 +260,10 @@ class _PassBits:
         bound = left if counted is right else right
         if bound.op != "const":
             return None
-        limit = int(bound.attr)
-        some = (node.op == "lt" and counted is right and limit == 0) or (
-            node.op == "le" and counted is right and limit == 1
-        )
-        none = (node.op == "eq" and limit == 0) or (node.op == "lt" and counted is left and limit == 1)
-        none = none or (node.op == "le" and counted is left and limit == 0)
-        if not (some or none):
+        side = "both" if node.op == "eq" else "right" if counted is right else "left"
+        asked = (node.op, side, bound.attr)
+        some = asked in (("lt", "right", 0), ("le", "right", 1))
+        if not some and asked not in (("eq", "both", 0), ("lt", "left", 1), ("le", "left", 0)):
             return None
         weights, wraps = counted.attr
         flag = self._flag(counted.args[0])
@@ -381,12 +363,7 @@ class _PassBits:
             shifted = value.planes[by.lo.bit_length() - 1 :] or (sign,)
             return gates.fit(Bits(shifted, value.signed), lo, hi)
         if by.lo == by.hi and by.lo and len(value.planes) <= MAX_TABLE_BITS // 2:
-            count, signed = width(lo, hi)
-            planes = (
-                self._function(value, inner.lo, inner.hi, lambda v, i=i: v // by.lo >> i & 1)
-                for i in range(count)
-            )
-            return Bits(tuple(planes), signed)
+            return self._numbers(node.args[0], node.type, lambda v: v // by.lo)
         most = max(abs(by.lo), abs(by.hi))
         if divisor.signed:  # a div -b = -a div b
             negative = divisor.planes[-1]
@@ -401,25 +378,13 @@ class _PassBits:
 
     def _mod(self, node: Node, value: Bits) -> Bits:
         modulus = node.attr
-        assert isinstance(modulus, int)
-        count, signed = width(0, modulus - 1)
-        if modulus & (modulus - 1) == 0:
-            return Bits(
-                tuple(
-                    self.gates.bit(value, i) if i < modulus.bit_length() - 1 else self.gates.no
-                    for i in range(count)
-                ),
-                signed,
-            )
-        inner = node.args[0].type
+        if modulus & (modulus - 1) == 0:  # its lowest bits; of a modulus of 1 none
+            bits = tuple(self.gates.bit(value, i) for i in range(modulus.bit_length() - 1))
+            return Bits(bits or (self.gates.no,))
         if len(value.planes) > MAX_TABLE_BITS // 2:
             _, rest = self.gates.divide(value, self.gates.constant(modulus), modulus)
             return self.gates.fit(rest, 0, modulus - 1)
-        planes = tuple(
-            self._function(value, inner.lo, inner.hi, lambda v, i=i: v % modulus >> i & 1)
-            for i in range(count)
-        )
-        return Bits(planes, signed)
+        return self._numbers(node.args[0], node.type, lambda v: v % modulus)
 
     def _to_real(self, argument: Node) -> Node:
         """A number from its planes: exact, since integers stay below 2^24."""
@@ -448,11 +413,6 @@ class _PassBits:
         return total
 
 
-def replace_argument(node: Node, argument: Node) -> Node:
-    """The node on another argument, outside any graph: only to be lowered."""
-    return Node(node.op, node.type, (argument,), node.attr, -1, node.places)
-
-
 def _put(columns: list[list[Node]], plane: Node, weight: int) -> None:
     """Add a plane of some weight to columns of bits."""
     if plane.op == "const" and not plane.attr:
@@ -462,16 +422,3 @@ def _put(columns: list[list[Node]], plane: Node, weight: int) -> None:
             while len(columns) <= i:
                 columns.append([])
             columns[i].append(plane)
-
-
-def _with_arguments(node: Node) -> list[Node]:
-    ordered: dict[int, Node] = {}
-    stack = [(node, False)]
-    while stack:
-        top, ready = stack.pop()
-        if ready:
-            ordered.setdefault(id(top), top)
-        elif id(top) not in ordered:
-            stack.append((top, True))
-            stack.extend((arg, False) for arg in top.args)
-    return list(ordered.values())

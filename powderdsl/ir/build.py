@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Offset, Type, whole
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Offset, Type, integer
 
 
 class Builder:
@@ -25,8 +25,8 @@ class Builder:
     def flag(self, value: bool) -> Node:
         return self.make("const", FLAG, attr=bool(value))
 
-    def whole(self, value: int) -> Node:
-        return self.make("const", whole(value, value), attr=int(value))
+    def integer(self, value: int) -> Node:
+        return self.make("const", integer(value, value), attr=int(value))
 
     def real(self, value: float) -> Node:
         return self.make("const", REAL, attr=float(value))
@@ -34,7 +34,7 @@ class Builder:
     def const(self, value: int | float, type: Type) -> Node:
         if type == FLAG:
             return self.flag(bool(value))
-        return self.real(value) if type == REAL else self.whole(int(value))
+        return self.real(value) if type == REAL else self.integer(int(value))
 
     # Flags
 
@@ -67,50 +67,50 @@ class Builder:
         (al, ah), (bl, bh) = (a.type.lo, a.type.hi), (b.type.lo, b.type.hi)
         match op:
             case "add":
-                type = whole(al + bl, ah + bh)
+                type = integer(al + bl, ah + bh)
             case "sub":
-                type = whole(al - bh, ah - bl)
+                type = integer(al - bh, ah - bl)
             case "mul":
                 corners = [x * y for x in (al, ah) for y in (bl, bh)]
-                type = whole(min(corners), max(corners))
+                type = integer(min(corners), max(corners))
             case "min":
-                type = whole(min(al, bl), min(ah, bh))
+                type = integer(min(al, bl), min(ah, bh))
             case _:
-                type = whole(max(al, bl), max(ah, bh))
+                type = integer(max(al, bl), max(ah, bh))
         return self.make(op, type, a, b)
 
     def neg(self, a: Node) -> Node:
-        return self.make("neg", REAL if a.type == REAL else whole(-a.type.hi, -a.type.lo), a)
+        return self.make("neg", REAL if a.type == REAL else integer(-a.type.hi, -a.type.lo), a)
 
     def abs(self, a: Node) -> Node:
         if a.type == REAL:
             return self.make("abs", REAL, a)
         low = 0 if a.type.lo <= 0 <= a.type.hi else min(abs(a.type.lo), abs(a.type.hi))
-        return self.make("abs", whole(low, max(abs(a.type.lo), abs(a.type.hi))), a)
+        return self.make("abs", integer(low, max(abs(a.type.lo), abs(a.type.hi))), a)
 
     def quotient(self, a: Node, b: Node) -> Node:
-        """Whole division, rounded down; 0 where b is 0."""
+        """Integer division, rounded down; 0 where b is 0."""
         (al, ah), (bl, bh) = (a.type.lo, a.type.hi), (b.type.lo, b.type.hi)
         divisors = [d for d in (bl, min(bh, -1), max(bl, 1), bh) if d and bl <= d <= bh]
         corners = [x // d for x in (al, ah) for d in divisors] + [0] * (bl <= 0 <= bh)
-        return self.make("quotient", whole(min(corners), max(corners)), a, b)
+        return self.make("quotient", integer(min(corners), max(corners)), a, b)
 
     def mod(self, a: Node, modulus: int) -> Node:
-        return self.make("mod", whole(0, modulus - 1), a, attr=modulus)
+        return self.make("mod", integer(0, modulus - 1), a, attr=modulus)
 
     def table(self, index: Node, values: tuple[int, ...]) -> Node:
         reachable = values[max(index.type.lo, 0) : index.type.hi + 1] or values
-        return self.make("table", whole(min(reachable), max(reachable)), index, attr=values)
+        return self.make("table", integer(min(reachable), max(reachable)), index, attr=values)
 
     def to_real(self, a: Node) -> Node:
         return a if a.type == REAL else self.make("to_real", REAL, a)
 
     def clamp(self, a: Node, lo: int, hi: int) -> Node:
-        """Whole numbers cut off at bounds, where their range asks for it."""
+        """Integers clamped to bounds, where their range asks for it."""
         if a.type.lo < lo:
-            a = self.arithmetic("max", a, self.whole(lo))
+            a = self.arithmetic("max", a, self.integer(lo))
         if a.type.hi > hi:
-            a = self.arithmetic("min", a, self.whole(hi))
+            a = self.arithmetic("min", a, self.integer(hi))
         return a
 
     # Neighbors, choices, movements
@@ -120,17 +120,15 @@ class Builder:
             return a
         type = a.type
         if type.name == "int" and not wraps:
-            type = whole(min(type.lo, 0), max(type.hi, 0))
+            type = integer(min(type.lo, 0), max(type.hi, 0))
         return self.make("shift", type, a, attr=(*offset, wraps))
 
     def joined(self, a: Type, b: Type) -> Type:
-        return whole(min(a.lo, b.lo), max(a.hi, b.hi)) if a.name == "int" else a
+        return integer(min(a.lo, b.lo), max(a.hi, b.hi)) if a.name == "int" else a
 
     def select(self, condition: Node, yes: Node, no: Node) -> Node:
         return self.make("select", self.joined(yes.type, no.type), condition, yes, no)
 
-    def swap(self, content: Node, movers: Node, rest: Node, offset: Offset) -> Node:
-        return self.make("swap", self.joined(content.type, rest.type), content, movers, rest, attr=offset)
-
-    def arrive(self, content: Node, movers: Node, rest: Node, offset: Offset) -> Node:
-        return self.make("arrive", self.joined(content.type, rest.type), content, movers, rest, attr=offset)
+    def move(self, op: str, content: Node, movers: Node, rest: Node, offset: Offset) -> Node:
+        """`swap` or `arrive`."""
+        return self.make(op, self.joined(content.type, rest.type), content, movers, rest, attr=offset)

@@ -10,10 +10,10 @@ from powderdsl.ir.ops import REAL, Node, Offset, PassGraph, Program, nodes_of
 from powderdsl.ir.segments import Carried, carry
 
 GATES = {"not": 1, "and": 1, "or": 1, "xor": 1, "select": 3}
-"""Gates that an operation on planes takes: a choice is (a and c) or (b and not c)."""
+"""Gates that an operation on bit planes takes: a choice is (a and c) or (b and not c)."""
 
 WEIGHTS = {"gate": 1.0, "shift": 4.0, "move": 8.0, "random": 8.0, "real": 32.0, "dense": 200.0}
-"""About what one of each takes, in vector operations on 512 cells: sixteen reals fill the vector that holds 512 flags,
+"""About what one of each takes, in vector operations on 512 cells: sixteen floats fill the vector that holds 512 flags,
 a random bit is a hash, what runs on cells goes through memory. Chosen so that the shares of the shipped rulesets come
 out as native code needs them on worlds full of everything: most do to a factor of two."""
 
@@ -22,7 +22,7 @@ out as native code needs them on worlds full of everything: most do to a factor 
 class PassCost:
     """One pass. Counts are for every cell and step.
 
-    `gates` are those of flags and integers on planes, `shifts` the planes read at a neighbor, `moves` those
+    `gates` are those of flags and integers on bit planes, `shifts` the planes read at a neighbor, `moves` those
     exchanged with one, `random_bits` what its draws take at most, `reals` operations on float32. A pass on cells has
     `dense` operations instead, with the reason and the rule (``file:line``) that is why. `share` is an estimate.
     """
@@ -30,6 +30,7 @@ class PassCost:
     name: str
     pack: str
     moments: int
+    """Substeps, by the name that the output of `check --json` has for them."""
     gates: int
     shifts: int
     moves: int
@@ -55,7 +56,7 @@ def costs(program: Program) -> tuple[PassCost, ...]:
             PassCost(
                 name=pass_.name,
                 pack=pass_.pack,
-                moments=len(pass_.moments),
+                moments=len(pass_.substeps),
                 gates=count["gate"],
                 shifts=count["shift"],
                 moves=count["move"],
@@ -73,8 +74,8 @@ def costs(program: Program) -> tuple[PassCost, ...]:
 
 
 def _counted(carried: Carried) -> tuple[Carried, Counter[str]]:
-    """How much there is of each kind of work."""
-    nodes = nodes_of(carried.planes or carried.cells, moments=False)
+    """The amount of each kind of work."""
+    nodes = nodes_of(carried.planes or carried.cells, substeps=False)
     count = Counter({"random": _random_bits(nodes)})
     if carried.planes is None:
         count["dense"] = sum(1 for node in nodes if node.args)
@@ -105,7 +106,7 @@ def _random_bits(nodes: Iterable[Node]) -> int:
 def _neighbors(pass_: PassGraph) -> set[Offset]:
     """Offsets at which other cells are read or written."""
     found: set[Offset] = set()
-    for node in nodes_of(pass_, moments=False):
+    for node in nodes_of(pass_, substeps=False):
         if node.op == "shift":
             found.add(node.attr[:2])
         elif node.op == "count":

@@ -1,4 +1,4 @@
-"""Boolean circuits on flag planes: gates that fold as they are built, adders, comparators, truth tables.
+"""Boolean circuits on bit planes: gates that fold as they are built, adders, comparators, truth tables.
 
 An integer is a `Bits`: planes from the lowest bit, and whether the highest one is a sign (two's complement).
 """
@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import permutations
-from typing import Any
+from typing import Any, NamedTuple
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, Node, Offset
@@ -24,7 +24,7 @@ class Bits:
 
 
 def width(lo: int, hi: int) -> tuple[int, bool]:
-    """How many planes a range takes, and whether the last is a sign."""
+    """The number of bit planes that a range takes, and whether the last is a sign."""
     if lo >= 0:
         return max(hi.bit_length(), 1), False
     return max((-lo - 1).bit_length(), max(hi, 0).bit_length()) + 1, True
@@ -97,16 +97,10 @@ class Gates:
         return self.build.select(condition, yes, no)
 
     def all(self, flags: Sequence[Node]) -> Node:
-        result = self.yes
-        for flag in flags:
-            result = self.and_(result, flag)
-        return result
+        return reduce(self.and_, flags, self.yes)
 
     def any(self, flags: Sequence[Node]) -> Node:
-        result = self.no
-        for flag in flags:
-            result = self.or_(result, flag)
-        return result
+        return reduce(self.or_, flags, self.no)
 
     def shift(self, a: Node, offset: Offset, wraps: bool) -> Node:
         if a is self.no or (a is self.yes and wraps) or offset == (0, 0):
@@ -116,7 +110,7 @@ class Gates:
             return self.shift(a.args[0], (dy + offset[0], dx + offset[1]), True)
         return self.build.shift(a, offset, wraps)
 
-    # Whole numbers
+    # Integers
 
     def constant(self, value: int) -> Bits:
         count, signed = width(value, value)
@@ -218,57 +212,51 @@ class Gates:
         for index in range(1 << len(used)):
             number = fixed | sum(1 << used[k] for k in range(len(used)) if index >> k & 1)
             table.append(values[number] if number < len(values) else None)
+        planes = [inputs[i] for i in used]
         order = _best_order(tuple(table), len(used))
-        return self._expand([inputs[i] for i in used], tuple(table), order)
-
-    def _expand(self, inputs: list[Node], table: tuple[bool | None, ...], order: tuple[int, ...]) -> Node:
-        gates: dict[str, Callable[..., Any]] = {
-            "no": lambda: self.no,
-            "yes": lambda: self.yes,
-            "and": lambda i, f: self.and_(inputs[i], f),
-            "andnot": lambda i, f: self.and_(self.not_(inputs[i]), f),
-            "or": lambda i, f: self.or_(inputs[i], f),
-            "ornot": lambda i, f: self.or_(self.not_(inputs[i]), f),
-            "xor": lambda i, f: self.xor(inputs[i], f),
-            "mux": lambda i, f, g: self.mux(inputs[i], f, g),
-        }
-        return _shannon(table, order, gates)
+        gates = _Split(
+            self.no, self.yes, lambda i, f: self.xor(planes[i], f), lambda i, f, g: self.mux(planes[i], f, g)
+        )
+        return _shannon(tuple(table), order, gates)
 
 
 def _opposite(a: Node, b: Node) -> bool:
     return (a.op == "not" and a.args[0] is b) or (b.op == "not" and b.args[0] is a)
 
 
-def _shannon(
-    table: tuple[bool | None, ...], order: tuple[int, ...], gates: dict[str, Callable[..., Any]]
-) -> Any:
+class _Split(NamedTuple):
+    """What truth tables become, split on one input (by number) after the other: gates, or a number of gates."""
+
+    no: Any
+    yes: Any
+    xor: Callable[[int, Any], Any]
+    mux: Callable[[int, Any, Any], Any]
+    """Of the input, the half where it holds, and the other."""
+
+
+_COST = _Split(0, 0, lambda i, f: f + 1, lambda i, f, g: f + g + (2 if f and g else 1))
+"""Gates; a half that is constant saves one."""
+
+
+def _shannon(table: tuple[bool | None, ...], order: tuple[int, ...], made: _Split) -> Any:
     """Split a truth table on its inputs in order; halves that agree where both matter are joined."""
     cares = {value for value in table if value is not None}
     if True not in cares:
-        return gates["no"]()
+        return made.no
     if False not in cares:
-        return gates["yes"]()
+        return made.yes
     split, rest = order[0], order[1:]
-    low = tuple(v if not i >> split & 1 else None for i, v in enumerate(table))
-    high = tuple(v if i >> split & 1 else None for i, v in enumerate(table))
     bit = 1 << split
     pairs = [(table[i & ~bit], table[i | bit]) for i in range(len(table))]
     if all(a is None or b is None or a == b for a, b in pairs):
         joined = tuple(a if a is not None else b for a, b in pairs)
-        return _shannon(joined, rest, gates)
+        return _shannon(joined, rest, made)
     if all(a is None or b is None or a != b for a, b in pairs):
         flipped = tuple(a if a is not None else (None if b is None else not b) for a, b in pairs)
-        return gates["xor"](split, _shannon(flipped, rest, gates))
-    sets = ({v for v in low if v is not None}, {v for v in high if v is not None})
-    if sets[0] == {False}:
-        return gates["and"](split, _shannon(high, rest, gates))
-    if sets[1] == {False}:
-        return gates["andnot"](split, _shannon(low, rest, gates))
-    if sets[0] == {True}:
-        return gates["ornot"](split, _shannon(high, rest, gates))
-    if sets[1] == {True}:
-        return gates["or"](split, _shannon(low, rest, gates))
-    return gates["mux"](split, _shannon(high, rest, gates), _shannon(low, rest, gates))
+        return made.xor(split, _shannon(flipped, rest, made))
+    high = tuple(value if i & bit else None for i, value in enumerate(table))
+    low = tuple(value if not i & bit else None for i, value in enumerate(table))
+    return made.mux(split, _shannon(high, rest, made), _shannon(low, rest, made))
 
 
 @lru_cache(maxsize=4096)
@@ -276,8 +264,4 @@ def _best_order(table: tuple[bool | None, ...], inputs: int) -> tuple[int, ...]:
     """The order of inputs that takes the fewest gates; highest first where there are too many to try."""
     if inputs > 5:
         return tuple(reversed(range(inputs)))
-    cost: dict[str, Callable[..., Any]] = {
-        "no": lambda: 0, "yes": lambda: 0, "and": lambda i, f: f + 1, "andnot": lambda i, f: f + 1, "or": lambda i, f: f + 1,
-        "ornot": lambda i, f: f + 1, "xor": lambda i, f: f + 1, "mux": lambda i, f, g: f + g + 2,
-    }  # fmt: skip
-    return min(permutations(range(inputs)), key=lambda order: _shannon(table, order, cost))
+    return min(permutations(range(inputs)), key=lambda order: _shannon(table, order, _COST))

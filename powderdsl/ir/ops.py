@@ -1,13 +1,13 @@
-"""The IR: one immutable, interned node; one table of operations; programs made of moments.
+"""The IR: one immutable, interned node; one table of operations; programs made of substeps.
 
-Values are planes over the grid, one a world: flags, integers with a declared range, or float32. There is no
-control flow inside a step. Equal nodes of one graph are the same object, so common sub-expressions are free.
+A node has a value in each cell of each world: a flag, an integer with a declared range, or a float32. There is no
+control flow inside a substep. Equal nodes of one graph are the same object, so common sub-expressions are free.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,13 +34,13 @@ class Type:
 FLAG, REAL = Type("flag", 0, 1), Type("real")
 
 
-def whole(lo: int, hi: int) -> Type:
+def integer(lo: int, hi: int) -> Type:
     return Type("int", lo, hi)
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """A chance as a number of draws of so many bits: those below it, or up to it if not `strict`."""
+    """A chance as a number of draws of `bits` bits: those below it, or up to it if not `strict`."""
 
     bits: int
     strict: bool = True
@@ -75,9 +75,7 @@ def _quotient(attr: None, a: Any, b: Any) -> Any:
 
 def _settle(attr: tuple[float, float], a: Any) -> Any:
     kept = np.clip(a, np.float32(attr[0]), np.float32(attr[1]))
-    return np.where(np.abs(kept) >= np.float32(SNAP), kept, np.float32(0))[
-        ()
-    ]  # what is not a number is not ≥ SNAP
+    return np.where(np.abs(kept) >= np.float32(SNAP), kept, np.float32(0))[()]  # NaN is not ≥ SNAP
 
 
 def _plain(evaluate: Callable[..., Any]) -> Callable[..., Any]:
@@ -85,108 +83,54 @@ def _plain(evaluate: Callable[..., Any]) -> Callable[..., Any]:
     return lambda attr, *args: evaluate(*args)
 
 
-OPS: dict[str, Op] = {
-    op.name: op
-    for op in (
-        # where values come from
-        Op("input", (), "?", "slot", "what the pass finds in a slot"),
-        Op("const", (), "?", "value", "the same everywhere"),
-        Op(
-            "param",
-            (),
-            "?",
-            "(name, threshold or None[, bit])",
-            "one number a world: its value, or a chance as a threshold for draws",
-        ),
-        Op("coordinate", (), "?", "(row | column | step, modulus[, bit])"),
-        Op("inside", (), "flag", "offset", "whether that neighbor lies inside the grid"),
-        Op(
-            "below",
-            ("int",),
-            "flag",
-            "(stream, bits)",
-            "whether the stream's draw k is less than the argument",
-        ),
-        Op("draw", (), "real", "(stream, bits)", "(k + ½) / 2^bits, rounded to float32"),
-        # the same on bit planes
-        Op(
-            "chance",
-            (),
-            "flag",
-            "(stream, bits, limit)",
-            "whether the stream's draw k is less than a constant",
-        ),
-        Op(
-            "below_planes",
-            ("*flag",),
-            "flag",
-            "(stream, bits)",
-            "`below`, the limit's planes given highest first",
-        ),
-        # neighbors
-        Op(
-            "shift",
-            ("?",),
-            "=",
-            "(rows, columns, wraps)",
-            "the value at a neighbor; zero outside unless it wraps",
-        ),
-        Op(
-            "count",
-            ("flag",),
-            "int",
-            "((rows, columns, weight)…, wraps)",
-            "weighted number of neighbors that hold",
-        ),
-        # flags
-        Op("not", ("flag",), "flag"),
-        Op("and", ("flag", "flag"), "flag"),
-        Op("or", ("flag", "flag"), "flag"),
-        Op("xor", ("flag", "flag"), "flag"),
-        # integers and floats
-        Op("in_set", ("int",), "flag", "frozen set", "whether the value is one of these"),
-        Op("table", ("int",), "int", "values by index, from 0"),
-        Op("eq", ("=", "="), "flag", evaluate=_plain(operator.eq)),
-        Op("lt", ("=", "="), "flag", evaluate=_plain(operator.lt)),
-        Op("le", ("=", "="), "flag", evaluate=_plain(operator.le)),
-        Op("add", ("=", "="), "=", evaluate=_plain(operator.add)),
-        Op("sub", ("=", "="), "=", evaluate=_plain(operator.sub)),
-        Op("mul", ("=", "="), "=", evaluate=_plain(operator.mul)),
-        Op("div", ("real", "real"), "real", about="x / 0 is 0", evaluate=_divide),
-        Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0", evaluate=_quotient),
-        Op("neg", ("?",), "=", evaluate=_plain(operator.neg)),
-        Op("abs", ("?",), "=", evaluate=_plain(abs)),
-        Op("min", ("=", "="), "=", evaluate=_plain(np.minimum)),
-        Op("max", ("=", "="), "=", evaluate=_plain(np.maximum)),
-        Op("mod", ("int",), "int", "modulus", evaluate=lambda modulus, a: a % modulus),
-        Op("sqrt", ("real",), "real", evaluate=_plain(np.sqrt)),
-        Op("to_real", ("?",), "real"),
-        Op(
-            "settle",
-            ("real",),
-            "real",
-            "(low, high)",
-            "not a number → 0, cut off at the bounds, smaller than SNAP → 0",
-            _settle,
-        ),
-        # choices and movements
-        Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),
-        Op(
-            "swap",
-            ("=", "flag", "="),
-            "=",
-            "offset",
-            "(content, movers, rest): movers and their targets exchanged",
-        ),
-        Op(
-            "arrive",
-            ("=", "flag", "="),
-            "=",
-            "offset",
-            "(content, movers, rest): targets get the movers' content",
-        ),
-    )
-}
+# fmt: off
+_TABLE = (
+    # where values come from
+    Op("input", (), "?", "slot", "what the pass finds in a slot"),
+    Op("const", (), "?", "value", "the same everywhere"),
+    Op("param", (), "?", "(name, threshold or None[, bit])", "one number a world: its value, or a chance as a threshold"),
+    Op("coordinate", (), "?", "(row | column | step, modulus[, bit])"),
+    Op("inside", (), "flag", "offset", "whether that neighbor lies inside the grid"),
+    Op("below", ("int",), "flag", "(stream, bits)", "whether the stream's draw k is less than the argument"),
+    Op("draw", (), "real", "(stream, bits)", "(k + ½) / 2^bits, rounded to float32"),
+    # the same on bit planes
+    Op("chance", (), "flag", "(stream, bits, limit)", "whether the stream's draw k is less than a constant"),
+    Op("below_planes", ("*flag",), "flag", "(stream, bits)", "`below`, the limit's bit planes given highest first"),
+    # neighbors
+    Op("shift", ("?",), "=", "(rows, columns, wraps)", "the value at a neighbor; zero outside unless it wraps"),
+    Op("count", ("flag",), "int", "((rows, columns, weight)…, wraps)", "weighted number of neighbors that hold"),
+    # flags
+    Op("not", ("flag",), "flag"),
+    Op("and", ("flag", "flag"), "flag"),
+    Op("or", ("flag", "flag"), "flag"),
+    Op("xor", ("flag", "flag"), "flag"),
+    # integers and floats
+    Op("in_set", ("int",), "flag", "frozen set", "whether the value is one of these"),
+    Op("table", ("int",), "int", "values by index, from 0"),
+    Op("eq", ("=", "="), "flag", evaluate=_plain(operator.eq)),
+    Op("lt", ("=", "="), "flag", evaluate=_plain(operator.lt)),
+    Op("le", ("=", "="), "flag", evaluate=_plain(operator.le)),
+    Op("add", ("=", "="), "=", evaluate=_plain(operator.add)),
+    Op("sub", ("=", "="), "=", evaluate=_plain(operator.sub)),
+    Op("mul", ("=", "="), "=", evaluate=_plain(operator.mul)),
+    Op("div", ("real", "real"), "real", about="x / 0 is 0", evaluate=_divide),
+    Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0", evaluate=_quotient),
+    Op("neg", ("?",), "=", evaluate=_plain(operator.neg)),
+    Op("abs", ("?",), "=", evaluate=_plain(abs)),
+    Op("min", ("=", "="), "=", evaluate=_plain(np.minimum)),
+    Op("max", ("=", "="), "=", evaluate=_plain(np.maximum)),
+    Op("mod", ("int",), "int", "modulus", evaluate=lambda modulus, a: a % modulus),
+    Op("sqrt", ("real",), "real", evaluate=_plain(np.sqrt)),
+    Op("to_real", ("?",), "real"),
+    Op("settle", ("real",), "real", "(low, high)", "NaN → 0, clamped to the bounds, smaller than SNAP → 0", _settle),
+    # choices and movements
+    Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),
+    Op("swap", ("=", "flag", "="), "=", "offset", "(content, movers, rest): movers and their targets exchanged"),
+    Op("arrive", ("=", "flag", "="), "=", "offset", "(content, movers, rest): targets get the movers' content"),
+)
+# fmt: on
+
+OPS: dict[str, Op] = {op.name: op for op in _TABLE}
 """Every operation of the IR."""
 
 COMMUTATIVE = frozenset({"and", "or", "xor", "eq", "add", "mul", "min", "max"})
@@ -207,14 +151,14 @@ class Node:
 
 
 class Graph:
-    """Makes and interns nodes. Reals commute only where rounding allows: their order is kept."""
+    """Makes and interns nodes. Arguments of commutative operations are sorted, except floats: their order is kept."""
 
     def __init__(self) -> None:
         self._nodes: dict[Hashable, Node] = {}
 
     @property
     def size(self) -> int:
-        """How many nodes there are."""
+        """The number of nodes."""
         return len(self._nodes)
 
     def node(
@@ -237,8 +181,8 @@ class Graph:
 
 
 @dataclass(frozen=True)
-class Step:
-    """What one moment writes: the new node of each slot, and the flags without which nothing changes."""
+class SubstepGraph:
+    """What one substep writes: the new node of each slot, and the flags without which nothing changes."""
 
     label: str
     place: str
@@ -248,20 +192,20 @@ class Step:
 
 @dataclass(frozen=True)
 class PassGraph:
-    """A pass: moments in order. Nodes read slots through `input`, or the nodes that earlier moments wrote."""
+    """A pass: substeps in order. Nodes read slots through `input`, or the nodes that earlier substeps wrote."""
 
     name: str
     pack: str
-    moments: tuple[Step, ...]
+    substeps: tuple[SubstepGraph, ...]
     outputs: tuple[tuple[str, Node], ...]
     """The last node of every slot that the pass changes."""
 
 
 @dataclass(frozen=True)
 class SlotType:
-    """A slot of the state: vectors are two slots, ``name.row`` and ``name.column``.
+    """A slot holds one scalar of each cell: vectors are two slots, ``name.row`` and ``name.column``.
 
-    `state` names the state's tensor, if that is not the slot's name, and `component` the part of a vector in it.
+    `state` names the state's array, if that is not the slot's name, and `component` the part of a vector in it.
     """
 
     name: str
@@ -303,22 +247,28 @@ class Program:
     passes: tuple[PassGraph, ...]
 
 
-def nodes_of(pass_: PassGraph, *, moments: bool = True) -> list[Node]:
-    """All nodes that a pass needs, arguments before their users, in a stable order."""
+def ordered(roots: Iterable[Node], known: Container[int] = ()) -> list[Node]:
+    """All nodes that some nodes need, arguments before their users, in a stable order; those `known` by id left out."""
     seen: dict[int, Node] = {}
-    roots = [node for _, node in pass_.outputs]
-    if moments:
-        roots = [node for step in pass_.moments for _, node in step.writes] + roots
     for root in roots:
         stack = [(root, False)]
         while stack:
             node, ready = stack.pop()
             if ready:
                 seen.setdefault(id(node), node)
-            elif id(node) not in seen:
+            elif id(node) not in seen and id(node) not in known:
                 stack.append((node, True))
                 stack.extend((arg, False) for arg in reversed(node.args))
     return list(seen.values())
+
+
+def nodes_of(pass_: PassGraph, *, substeps: bool = True) -> list[Node]:
+    """All nodes that a pass needs, as `ordered`: for its outputs and, unless told otherwise, for its substeps."""
+    roots = [node for _, node in pass_.outputs]
+    if substeps:
+        writes = [node for one in pass_.substeps for _, node in one.writes]
+        roots = [*writes, *roots, *(guard for one in pass_.substeps for guard in one.guards)]
+    return ordered(roots)
 
 
 def walk(node: Node) -> Iterator[Node]:

@@ -1,42 +1,59 @@
-"""The one driver of rewrites: rules are functions from a node to its replacement, or None for no change."""
+"""The one driver of rewrites: rules by operation, applied bottom-up until none applies."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import Node, PassGraph, Step, nodes_of
+from powderdsl.ir.ops import Node, PassGraph, SubstepGraph, nodes_of
 
 Rewrite = Callable[[Node, Builder], Node | None]
-
-MAX_ROUNDS = 200
+"""From a node to its replacement, or None for no change."""
 
 
 class RewriteLoop(AssertionError):
     """Rules that undo each other: a bug of ours."""
 
 
-def rewrite_pass(pass_: PassGraph, rules: Sequence[Rewrite]) -> PassGraph:
+class Rules:
+    """Rewrite rules by the operation that they apply to, in the order in which they are tried."""
+
+    def __init__(self, *parts: Rules):
+        self._by_op: dict[str, list[Rewrite]] = {}
+        for part in parts:
+            for op, rules in part._by_op.items():
+                self._by_op.setdefault(op, []).extend(rules)
+
+    def on(self, *ops: str) -> Callable[[Rewrite], Rewrite]:
+        """Adds the decorated rule for some operations."""
+
+        def add(rule: Rewrite) -> Rewrite:
+            for op in ops:
+                self._by_op.setdefault(op, []).append(rule)
+            return rule
+
+        return add
+
+    def apply(self, node: Node, build: Builder) -> Node | None:
+        """What the first rule that changes the node makes of it."""
+        for rule in self._by_op.get(node.op, ()):
+            found = rule(node, build)
+            if found is not None and found is not node:
+                return found
+        return None
+
+
+def rewrite_pass(pass_: PassGraph, rules: Rules) -> PassGraph:
     """The pass rebuilt bottom-up in a fresh graph, every node rewritten until no rule applies."""
     build = Builder()
     done: dict[int, Node] = {}
-
-    def rewritten(node: Node) -> Node:
-        """A node whose arguments are final; what a rule makes again is finished the same way."""
-        for _ in range(MAX_ROUNDS):
-            for rule in rules:
-                found = rule(node, build)
-                if found is not None and found is not node:
-                    node = finish(found)
-                    break
-            else:
-                return node
-        raise RewriteLoop(f"rules keep changing {node.op}")
-
+    """Nodes of the new graph by those of the old one."""
     final: dict[int, Node] = {}
+    """What nodes of the new graph were rewritten to."""
+    busy: set[int] = set()
 
     def finish(node: Node) -> Node:
-        """Nodes of the new graph that a rule returned: their new arguments have not been looked at yet."""
+        """A node of the new graph, rewritten. Arguments that a rule has made are finished first."""
         stack = [(node, False)]
         while stack:
             top, ready = stack.pop()
@@ -49,51 +66,32 @@ def rewrite_pass(pass_: PassGraph, rules: Sequence[Rewrite]) -> PassGraph:
             args = tuple(final[id(arg)] for arg in top.args)
             same = all(a is b for a, b in zip(args, top.args, strict=True))
             rebuilt = top if same else rebuild(top, args, build)
-            if rebuilt is not top and id(rebuilt) in final:
-                final[id(top)] = final[id(rebuilt)]
-                continue
-            final[id(top)] = rebuilt
-            result = rebuilt
-            for rule in rules:
-                found = rule(rebuilt, build)
-                if found is not None and found is not rebuilt:
-                    result = rewritten(finish(found))
-                    break
-            final[id(top)] = final[id(rebuilt)] = result
+            if id(rebuilt) not in final:
+                final[id(rebuilt)] = rebuilt  # the replacement may contain the node itself
+                found = rules.apply(rebuilt, build)
+                if found is not None:
+                    if id(found) in busy:
+                        raise RewriteLoop(f"rules keep changing {found.op}")
+                    busy.add(id(rebuilt))
+                    final[id(rebuilt)] = finish(found)
+                    busy.remove(id(rebuilt))
+            final[id(top)] = final[id(rebuilt)]
         return final[id(node)]
 
     for node in nodes_of(pass_):
         build.place = node.places[0] if node.places else ""
-        copy = rebuild(node, tuple(done[id(arg)] for arg in node.args), build)
-        done[id(node)] = finish(copy)
-    build.place = ""
-    guards = {id(guard): _copy(guard, done, build, finish) for step in pass_.moments for guard in step.guards}
-    moments = tuple(
-        Step(
-            step.label,
-            step.place,
-            tuple((slot, done[id(node)]) for slot, node in step.writes),
-            tuple(guards[id(guard)] for guard in step.guards),
+        done[id(node)] = finish(rebuild(node, tuple(done[id(arg)] for arg in node.args), build))
+    substeps = tuple(
+        SubstepGraph(
+            one.label,
+            one.place,
+            tuple((slot, done[id(node)]) for slot, node in one.writes),
+            tuple(done[id(guard)] for guard in one.guards),
         )
-        for step in pass_.moments
+        for one in pass_.substeps
     )
     outputs = tuple((slot, done[id(node)]) for slot, node in pass_.outputs)
-    return PassGraph(pass_.name, pass_.pack, moments, outputs)
-
-
-def _copy(node: Node, done: dict[int, Node], build: Builder, finish: Callable[[Node], Node]) -> Node:
-    """A guard may be a node that no write needs (its rule does nothing): it is copied too."""
-    stack = [(node, False)]
-    while stack:
-        top, ready = stack.pop()
-        if id(top) in done:
-            continue
-        if not ready:
-            stack.append((top, True))
-            stack.extend((arg, False) for arg in top.args)
-        else:
-            done[id(top)] = finish(rebuild(top, tuple(done[id(arg)] for arg in top.args), build))
-    return done[id(node)]
+    return PassGraph(pass_.name, pass_.pack, substeps, outputs)
 
 
 def rebuild(node: Node, args: tuple[Node, ...], build: Builder) -> Node:
@@ -105,8 +103,7 @@ def rebuild(node: Node, args: tuple[Node, ...], build: Builder) -> Node:
             return build.select(*args)
         case "swap" | "arrive":
             content, movers, rest = args
-            move = build.swap if node.op == "swap" else build.arrive
-            return move(content, movers, rest, node.attr)
+            return build.move(node.op, content, movers, rest, node.attr)
         case "neg":
             return build.neg(*args)
         case "abs":

@@ -1,6 +1,6 @@
-"""A program in consecutive parts, each in one form: bit planes, or one value a cell where planes cannot carry a pass.
+"""A program in consecutive segments, each in one form: bit planes, or one value a cell where planes cannot carry a pass.
 
-Random numbers depend on streams, cells and steps, never on the pass that reads them: parts draw what the whole drew.
+Random numbers depend on streams, cells and steps, never on the pass: segments draw the same numbers as the program.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from powderdsl.ir.ops import PassGraph, Program
 
 @dataclass(frozen=True)
 class Segment:
-    """Passes in a row. `planes` is `program` on planes, None if they run on cells."""
+    """Passes in a row. `planes` is `program` on bit planes, None if they run on cells."""
 
     program: Program
     planes: Program | None
@@ -23,7 +23,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Carried:
-    """A pass, the same on planes, or why there is none, and the rule that this is due to."""
+    """A pass and the same on bit planes, or why these cannot carry it and the rule that this is due to."""
 
     cells: PassGraph
     planes: PassGraph | None
@@ -32,7 +32,7 @@ class Carried:
 
 
 def carry(program: Program, pass_: PassGraph) -> Carried:
-    """In which form a pass of a program runs."""
+    """The form in which a pass of a program runs."""
     try:
         return Carried(pass_, lower_pass(program, pass_))
     except NotBits as error:
@@ -40,7 +40,7 @@ def carry(program: Program, pass_: PassGraph) -> Carried:
 
 
 def segments(program: Program, carry: Callable[[Program, PassGraph], Carried] = carry) -> tuple[Segment, ...]:
-    """A program as parts of as many passes as possible. Slots that reset do so in the first part only."""
+    """The longest segments of a program. Slots that reset do so in the first one only."""
     found = []
     slots = program.slots
     carried = [carry(program, pass_) for pass_ in program.passes]

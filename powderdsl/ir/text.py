@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of
+from powderdsl.ir.ops import Node, PassGraph, Program, ordered
 
 
 def print_program(program: Program, only: str | None = None) -> str:
-    """All passes (or one) as text: a line a node, what each moment writes, what the pass leaves."""
+    """All passes (or one) as text: a line a node, what each substep writes, what the pass leaves."""
     lines = [f"program {program.name}"]
     for slot in program.slots:
         note = " resets each step" if slot.resets else ""
@@ -25,20 +25,12 @@ def print_pass(pass_: PassGraph) -> str:
     lines = [f"pass {pass_.name}"]
 
     def show(root: Node) -> str:
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in names:
-                continue
-            if not ready:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-                continue
+        for node in ordered([root], names):
             names[id(node)] = f"%{len(names)}"
             lines.append(f"    {names[id(node)]} = {_node_text(node, names)}")
         return names[id(root)]
 
-    for number, step in enumerate(pass_.moments):
+    for number, step in enumerate(pass_.substeps):
         label = f" ({step.label})" if step.label else ""
         lines.append(f"  substep {number}{label}" + (f"  # {step.place}" if step.place else ""))
         for slot, node in step.writes:
@@ -46,7 +38,6 @@ def print_pass(pass_: PassGraph) -> str:
             lines.append(f"    write {slot} = {reference}")
     for slot, node in pass_.outputs:
         lines.append(f"  leave {slot} = {show(node)}")
-    assert len(names) >= len(nodes_of(pass_))
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""What a legal IR is. Checked after lowering and after every pass."""
+"""What a legal IR is. Checked after lowering and after every stage."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _verify_pass(pass_: PassGraph, slots: dict, params: set[str], streams: set[t
         if node.type.name == "int":
             inside = slots[name].lo <= node.type.lo and node.type.hi <= slots[name].hi
             _demand(inside, f"{name} of {slots[name]} gets {node.type}")
-    for step in pass_.moments:
+    for step in pass_.substeps:
         for guard in step.guards:
             _demand(guard.type == FLAG, "a guard is not a flag")
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.gates import Gates
-from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Step, nodes_of, walk
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, SubstepGraph, nodes_of
 
 WORTH = 0.75
 """A quiet form must have this share of the pass's nodes at most."""
@@ -14,7 +14,7 @@ WORTH = 0.75
 
 def real_inputs(pass_: PassGraph) -> tuple[str, ...]:
     """The slots of reals that a pass reads."""
-    nodes = nodes_of(pass_, moments=False)
+    nodes = nodes_of(pass_, substeps=False)
     return tuple(dict.fromkeys(str(n.attr) for n in nodes if n.op == "input" and n.type == REAL))
 
 
@@ -26,33 +26,24 @@ def calm_pass(pass_: PassGraph) -> PassGraph | None:
     build = Builder()
     gates = Gates(build)
     new: dict[int, Node] = {}
-    roots = [
-        *nodes_of(pass_),
-        *(n for step in pass_.moments for guard in step.guards for n in _ordered(guard)),
-    ]
-    for node in roots:
-        if id(node) not in new:
-            build.place = node.places[0] if node.places else ""
-            new[id(node)] = _quiet(node, [new[id(arg)] for arg in node.args], gates)
-    moments = []
-    for step in pass_.moments:
+    for node in nodes_of(pass_):
+        build.place = node.places[0] if node.places else ""
+        new[id(node)] = _quiet(node, [new[id(arg)] for arg in node.args], gates)
+    substeps = []
+    for step in pass_.substeps:
         guards = tuple(guard for guard in (new[id(g)] for g in step.guards) if guard is not gates.no)
         writes = tuple((slot, new[id(node)]) for slot, node in step.writes)
         if guards or not step.guards:
-            moments.append(Step(step.label, step.place, writes, guards))
+            substeps.append(SubstepGraph(step.label, step.place, writes, guards))
     outputs = []
     for slot, old in pass_.outputs:
         node = new[id(old)]
         unchanged = node.op == "input" and node.attr == slot
         if not unchanged and not (slot in slots and node.op == "const" and not node.attr):
             outputs.append((slot, node))
-    quiet = PassGraph(pass_.name, pass_.pack, tuple(moments), tuple(outputs))
-    size, before = (len(nodes_of(graph, moments=False)) for graph in (quiet, pass_))
+    quiet = PassGraph(pass_.name, pass_.pack, tuple(substeps), tuple(outputs))
+    size, before = (len(nodes_of(graph, substeps=False)) for graph in (quiet, pass_))
     return quiet if size <= WORTH * before else None
-
-
-def _ordered(root: Node) -> list[Node]:
-    return sorted(walk(root), key=lambda node: node.index)
 
 
 def _quiet(node: Node, args: list[Node], gates: Gates) -> Node:

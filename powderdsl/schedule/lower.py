@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from powderdsl.ir.ops import Graph, Node, PassGraph, Step, Type, nodes_of
+from powderdsl.ir.ops import Graph, Node, PassGraph, SubstepGraph, Type, nodes_of
 from powderdsl.schedule.types import (
     Compute,
     Guard,
@@ -23,7 +23,7 @@ def lower(pass_: PassGraph) -> Schedule:
     What has no such value (the first write of a scratch field) is computed in any case.
     """
     lowering = _Lowering(pass_)
-    for step in pass_.moments:
+    for step in pass_.substeps:
         lowering.substep(step)
     lowering.compute([node for _, node in pass_.outputs])
     leaves = tuple((slot, lowering.value(node)) for slot, node in pass_.outputs)
@@ -40,11 +40,11 @@ class _Lowering:
         """Variables of the pass's nodes, by id."""
         self.current: dict[str, Node | None] = {}
         """What each slot holds now: a node of the pass, None for one that nobody computes."""
-        self.alive = {id(node) for node in nodes_of(pass_, moments=False)}
+        self.alive = {id(node) for node in nodes_of(pass_, substeps=False)}
         self.kept = {slot: node.type for slot, node in pass_.outputs}
         """Slots of the state that the pass changes: others that it writes are scratch."""
 
-    def substep(self, step: Step) -> None:
+    def substep(self, step: SubstepGraph) -> None:
         new = [(slot, node) for slot, node in step.writes if id(node) in self.alive and self.missing(node)]
         guards = [node for node in dict.fromkeys(step.guards) if node.op != "const"]
         always = not guards or any(node.op == "const" and node.attr for node in step.guards)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from powderdsl.diagnostics import suggest
 from powderdsl.ir.gates import width as width_of
-from powderdsl.ir.lower.rules import plane_names, plane_type
+from powderdsl.ir.lower.rules import ir_type, slot_names
 from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, slot_name, slots, storage
 from powderdsl.model.types import MatrixChannel, Property, Ruleset
@@ -173,7 +173,7 @@ class Observer:
     def _coded(self) -> tuple[tuple[str, Slot], ...]:
         """The channels of `compact`: names, and the slots that they are codes of, which a step does not restart."""
         lasting = [slot for slot in self.slots.values() if not slot.resets]
-        return tuple((name, slot) for slot in lasting for name in plane_names(slot))
+        return tuple((name, slot) for slot in lasting for name in slot_names(slot))
 
     @cached_property
     def _bits(self) -> tuple[tuple[str, int], ...]:
@@ -181,7 +181,7 @@ class Observer:
         found = []
         for slot in self.slots.values():
             if not slot.is_real:
-                type = plane_type(slot.kind, self.ruleset.slots)
+                type = ir_type(slot.kind, self.ruleset.slots)
                 count = 1 if type.name == "flag" else width_of(type.lo, type.hi)[0]
                 found += [(slot.name, bit) for bit in range(count)]
         return tuple(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from powderdsl.ir.ops import Node, Program, Threshold, nodes_of, walk
+from powderdsl.ir.ops import Node, Program, Threshold, nodes_of
 
 
 @dataclass
@@ -43,8 +43,7 @@ def layout_of(program: Program) -> Layout:
     for i, (name, _, _) in enumerate(program.streams):
         layout.streams[name] = i
     for pass_ in program.passes:
-        guards = (inner for step in pass_.moments for guard in step.guards for inner in walk(guard))
-        for node in (*nodes_of(pass_), *guards):
+        for node in nodes_of(pass_):
             _place(node, layout)
     return layout
 

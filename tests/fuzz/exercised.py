@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from powderdsl.compiler import lower
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.ir.ops import OPS as IR_OPS
-from powderdsl.ir.ops import Node, Program, nodes_of, walk
+from powderdsl.ir.ops import Node, Program, nodes_of
 from powderdsl.ir.segments import segments
 from powderdsl.model.builtins import COORDINATES, DIRECTION_SETS, DIRECTIONS, FUNCTIONS, KERNELS, KIND_WORDS
 from powderdsl.model.operations import OPS
@@ -146,9 +146,6 @@ def program_nodes(program: Program) -> Iterator[Node]:
     """Every node of a program, guards of moments included."""
     for pass_ in program.passes:
         yield from nodes_of(pass_)
-        for step in pass_.moments:
-            for guard in step.guards:
-                yield from walk(guard)
 
 
 def missing(used: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

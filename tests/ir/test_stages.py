@@ -11,8 +11,8 @@ from powderdsl.compiler import load
 from powderdsl.ir.bits import lower_bits
 from powderdsl.ir.build import Builder
 from powderdsl.ir.lower.rules import lower_ruleset
-from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Program, Step, nodes_of, whole
-from powderdsl.ir.rewrite import RewriteLoop, rewrite_pass
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Program, SubstepGraph, integer, nodes_of
+from powderdsl.ir.rewrite import RewriteLoop, Rules, rewrite_pass
 from powderdsl.ir.stages import PIPELINE, run_passes
 from powderdsl.ir.text import print_program
 from powderdsl.ir.verify import InvalidIR, verify
@@ -67,7 +67,9 @@ def program_of(name: str, folder: Path) -> Program:
     for pass_ in program.passes:
         for node in nodes_of(pass_):
             here(node)
-    passes = tuple(replace(p, moments=tuple(replace(m, place="") for m in p.moments)) for p in program.passes)
+    passes = tuple(
+        replace(p, substeps=tuple(replace(m, place="") for m in p.substeps)) for p in program.passes
+    )
     return replace(program, passes=passes)
 
 
@@ -90,8 +92,8 @@ def test_densities_become_sets_of_elements(tmp_path: Path) -> None:
     after = run_passes(before)
     assert "table" in print_program(before)
     assert "table" not in print_program(after)
-    assert len(before.passes[0].moments) == 4
-    assert len(after.passes[0].moments) == 2  # grains sink through air and smoke, air through smoke
+    assert len(before.passes[0].substeps) == 4
+    assert len(after.passes[0].substeps) == 2  # grains sink through air and smoke, air through smoke
 
 
 def test_planes_hold_no_whole_numbers(tmp_path: Path) -> None:
@@ -101,7 +103,7 @@ def test_planes_hold_no_whole_numbers(tmp_path: Path) -> None:
 
 
 def a_pass(*outputs: tuple[str, Node]) -> PassGraph:
-    return PassGraph("p", "pack", (Step("", "", outputs, ()),), outputs)
+    return PassGraph("p", "pack", (SubstepGraph("", "", outputs, ()),), outputs)
 
 
 def a_program(*outputs: tuple[str, Node]) -> Program:
@@ -109,14 +111,14 @@ def a_program(*outputs: tuple[str, Node]) -> Program:
 
     slots = (
         SlotType("f", FLAG, 0, False),
-        SlotType("n", whole(0, 3), 0, False),
+        SlotType("n", integer(0, 3), 0, False),
         SlotType("r", REAL, 0.0, False),
     )
     return Program("broken", slots, (("q", "chance"),), (("s", 7, 16),), (a_pass(*outputs),))
 
 
 BUILD = Builder()
-F, N, R = BUILD.input("f", FLAG), BUILD.input("n", whole(0, 3)), BUILD.input("r", REAL)
+F, N, R = BUILD.input("f", FLAG), BUILD.input("n", integer(0, 3)), BUILD.input("r", REAL)
 
 
 @pytest.mark.parametrize(
@@ -147,16 +149,13 @@ def test_the_verifier_accepts() -> None:
 
 
 def test_rules_that_undo_each_other_are_found() -> None:
-    def there(node: Node, build: Builder) -> Node | None:
-        return build.or_(*node.args) if node.op == "and" else None
-
-    def back(node: Node, build: Builder) -> Node | None:
-        return build.and_(*node.args) if node.op == "or" else None
-
+    rules = Rules()
+    rules.on("and")(lambda node, build: build.or_(*node.args))
+    rules.on("or")(lambda node, build: build.and_(*node.args))
     build = Builder()
     a, b = build.input("f", FLAG), build.input("g", FLAG)
     with pytest.raises((RewriteLoop, RecursionError)):
-        rewrite_pass(a_pass(("f", build.and_(a, b))), (there, back))
+        rewrite_pass(a_pass(("f", build.and_(a, b))), rules)
 
 
 def test_every_operation_has_a_row_and_a_reason() -> None:

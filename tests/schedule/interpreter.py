@@ -49,8 +49,8 @@ class World:
 def run_graph(pass_: PassGraph, world: World) -> dict[int, Array]:
     """The value of every node of a pass, by id."""
     roots = [node for _, node in pass_.outputs]
-    roots += [node for step in pass_.moments for _, node in step.writes]
-    roots += [guard for step in pass_.moments for guard in step.guards]
+    roots += [node for step in pass_.substeps for _, node in step.writes]
+    roots += [guard for step in pass_.substeps for guard in step.guards]
     return _evaluate(roots, world, {})
 
 

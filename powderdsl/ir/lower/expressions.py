@@ -6,21 +6,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from math import ceil, floor
+from typing import Any
+
+import numpy as np
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import FLAG, REAL, Node, Threshold, component_names, whole
+from powderdsl.ir.ops import FLAG, REAL, Node, Threshold, component_names, integer
 from powderdsl.model.state import Slot
 from powderdsl.model.types import Expr, Kernel, Property, Ruleset
 
 Pair = tuple[Node, Node]
-"""A vector: its row and column planes."""
+"""A vector: its row and column components."""
 
 NEAR, FAR = 0.92387953251128674, 0.38268343236508977
 """cos(π/8) and cos(3π/8), where octants end."""
 
 
 @dataclass
-class Planes:
+class Context:
     """What expressions read: the current node of each slot, and lets."""
 
     ruleset: Ruleset
@@ -32,92 +35,85 @@ class Planes:
     def property_of(self, prop: Property, element: Node) -> Node:
         """A property of given elements; values that are parameters are chosen one at a time."""
         build = self.build
-        if any(isinstance(v, str) for v in prop.values):
-            numbers: list[Node] = []
-            for value in prop.values:
-                if isinstance(value, str):
-                    numbers.append(param_node(self, value))
-                elif prop.kind.name == "flag":
-                    numbers.append(build.flag(bool(value)))
-                else:
-                    assert not isinstance(value, tuple)
-                    numbers.append(build.whole(int(value)))
-            return self.by_element(element, numbers)
+        values = prop.values
+        if any(isinstance(value, str) for value in values):
+            type = FLAG if prop.kind.name == "flag" else integer(0, 0)
+            return self.by_element(
+                element,
+                [param_node(self, v) if isinstance(v, str) else build.const(v, type) for v in values],  # type: ignore[arg-type]
+            )
         if prop.kind.name == "flag":
-            return build.in_set(element, frozenset(i for i, v in enumerate(prop.values) if v))
-        return build.table(element, tuple(int(v) for v in prop.values))  # type: ignore[arg-type]
+            return build.in_set(element, frozenset(i for i, value in enumerate(values) if value))
+        return build.table(element, tuple(int(value) for value in values))  # type: ignore[arg-type]
 
     def by_element(self, element: Node, values: list[Node]) -> Node:
         """The value that belongs to the element: one select a distinct value."""
-        groups: dict[int, tuple[Node, set[int]]] = {}
+        groups: dict[Node, set[int]] = {}
         for identity, value in enumerate(values):
-            groups.setdefault(value.index, (value, set()))[1].add(identity)
-        ordered = sorted(groups.values(), key=lambda group: -len(group[1]))
-        result = ordered[0][0]
-        for value, ids in ordered[1:]:
+            groups.setdefault(value, set()).add(identity)
+        (result, _), *others = sorted(groups.items(), key=lambda group: -len(group[1]))
+        for value, ids in others:
             result = self.build.select(self.build.in_set(element, frozenset(ids)), value, result)
         return result
 
 
-def lower_expression(expr: Expr, at: Planes) -> Node | Pair:
+def lower_expression(expr: Expr, at: Context) -> Node | Pair:
     """The node of a checked expression; a pair for vectors."""
     return _LOWER[expr.op](expr, at)
 
 
-def node(expr: Expr, at: Planes) -> Node:
+def node(expr: Expr, at: Context) -> Node:
+    """The node of an expression that is not a vector."""
     lowered = lower_expression(expr, at)
     assert isinstance(lowered, Node)
     return lowered
 
 
-def pair(expr: Expr, at: Planes) -> Pair:
+def pair(expr: Expr, at: Context) -> Pair:
     lowered = lower_expression(expr, at)
     assert not isinstance(lowered, Node)
     return lowered
 
 
-def param_node(at: Planes, name: str, threshold: Threshold | None = None) -> Node:
+def param_node(at: Context, name: str, threshold: Threshold | None = None) -> Node:
     """A parameter's value, or as a chance the number of draws that lie below it."""
     param = next(p for p in at.ruleset.params if p.name == name)
     if threshold is not None:
-        return at.build.make("param", whole(0, 1 << threshold.bits), attr=(name, threshold))
-    type = {"flag": FLAG, "int": whole(int(param.kind.lo), int(param.kind.hi))}.get(param.kind.name, REAL)
+        return at.build.make("param", integer(0, 1 << threshold.bits), attr=(name, threshold))
+    type = {"flag": FLAG, "int": integer(int(param.kind.lo), int(param.kind.hi))}.get(param.kind.name, REAL)
     return at.build.make("param", type, attr=(name, None))
 
 
-def _const(expr: Expr, at: Planes) -> Node:
+def _const(expr: Expr, at: Context) -> Node:
     build = at.build
     match expr.kind.name:
         case "flag":
             return build.flag(bool(expr.value))
         case "real" | "chance" | "number":
             return build.real(_float32(expr.value))
-    return build.whole(int(expr.value))
+    return build.integer(int(expr.value))
 
 
 def _float32(value: object) -> float:
     """A constant as the float32 it is rounded to, going through float64 as the reference does."""
-    from struct import pack, unpack
-
-    rounded: float = unpack("f", pack("f", float(value)))[0]  # type: ignore[arg-type]
-    return rounded
+    return float(np.float32(float(value)))  # type: ignore[arg-type]
 
 
-def _property(expr: Expr, at: Planes) -> Node:
+def _property(expr: Expr, at: Context) -> Node:
     prop = at.ruleset.property(str(expr.value))
     assert prop is not None
     if prop.stored:
         return at.state[prop.name]
     if prop.kind.name == "chance":
-        return _chance_real(expr, at)
+        return _chance(expr, at)
     return at.property_of(prop, at.state["element"])
 
 
-def _slot(name: str, at: Planes) -> Node | Pair:
-    if at.slots[name].planes == 2:
-        row, column = component_names(name)
-        return at.state[row], at.state[column]
-    return at.state[name]
+def _slot(name: str, at: Context) -> Node | Pair:
+    if name in at.state:
+        return at.state[name]
+    row, column = component_names(name)
+    return at.state[row], at.state[column]
 
 
 def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
@@ -129,39 +125,34 @@ def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
     return function(*rows), function(*columns)
 
 
-def _look(expr: Expr, at: Planes) -> Node | Pair:
+def _look(expr: Expr, at: Context) -> Node | Pair:
     offset = expr.value
     return _each(lambda a: at.build.shift(a, offset), lower_expression(expr.args[0], at))
 
 
-def _arithmetic(expr: Expr, at: Planes) -> Node | Pair:
+def _arithmetic(expr: Expr, at: Context) -> Node | Pair:
     args = [lower_expression(arg, at) for arg in expr.args]
     return _each(lambda a, b: at.build.arithmetic(expr.op, a, b), *args)
 
 
-def _divide(expr: Expr, at: Planes) -> Node | Pair:
-    args = [lower_expression(arg, at) for arg in expr.args]
-    return _each(lambda a, b: at.build.make("div", REAL, a, b), *args)
-
-
-def _member(expr: Expr, at: Planes) -> Node:
+def _member(expr: Expr, at: Context) -> Node:
     return at.build.in_set(node(expr.args[0], at), expr.value)
 
 
-def _logic(expr: Expr, at: Planes) -> Node:
+def _logic(expr: Expr, at: Context) -> Node:
     return at.build.make(expr.op, FLAG, *(node(arg, at) for arg in expr.args))
 
 
-def _to_real(expr: Expr, at: Planes) -> Node:
+def _to_real(expr: Expr, at: Context) -> Node:
     argument = expr.args[0]
     if argument.kind.name == "draw":
         return _draw_real(argument, at)
     if argument.kind.name == "chance":
-        return _chance_real(argument, at)
+        return _chance(argument, at)
     return at.build.to_real(node(argument, at))
 
 
-def _draw_real(expr: Expr, at: Planes) -> Node:
+def _draw_real(expr: Expr, at: Context) -> Node:
     """A draw as float32. Sums with integers are rounded after each addition."""
     if expr.op == "draw":
         return at.build.make("draw", REAL, attr=_stream(expr, at))
@@ -171,39 +162,43 @@ def _draw_real(expr: Expr, at: Planes) -> Node:
     return at.build.arithmetic(expr.op, parts[0], parts[1])
 
 
-def _chance_real(expr: Expr, at: Planes) -> Node:
-    """A chance as float32."""
+def _chance(expr: Expr, at: Context, threshold: Threshold | None = None) -> Node:
+    """A chance as float32, or as the number of draws below it."""
     build = at.build
+
+    def number(value: Any) -> Node:
+        if isinstance(value, str):
+            return param_node(at, value, threshold)
+        return (
+            build.real(_float32(value)) if threshold is None else build.integer(draws_below(value, threshold))
+        )
+
     match expr.op:
-        case "const":
-            return build.real(_float32(expr.value))
-        case "param":
-            return param_node(at, str(expr.value))
+        case "const" | "param":
+            return number(expr.value)
         case "look":
-            return build.shift(_chance_real(expr.args[0], at), expr.value)
+            return build.shift(_chance(expr.args[0], at, threshold), expr.value)
         case "choose":
-            return build.select(
-                node(expr.args[0], at), _chance_real(expr.args[1], at), _chance_real(expr.args[2], at)
-            )
+            condition, yes, no = expr.args
+            return build.select(node(condition, at), _chance(yes, at, threshold), _chance(no, at, threshold))
         case "let":
             value = at.lets[str(expr.value)]
             assert isinstance(value, Node)
             return value
     prop = at.ruleset.property(str(expr.value))
     assert prop is not None
-    values = [param_node(at, v) if isinstance(v, str) else build.real(_float32(v)) for v in prop.values]
-    return at.by_element(at.state["element"], values)
+    return at.by_element(at.state["element"], [number(value) for value in prop.values])
 
 
 # Draws
 
 
-def _stream(expr: Expr, at: Planes) -> tuple[str, int]:
+def _stream(expr: Expr, at: Context) -> tuple[str, int]:
     stream = next(s for s in at.ruleset.streams if s.name == expr.value)
     return stream.name, stream.bits
 
 
-def _split_draw(expr: Expr, at: Planes) -> tuple[Expr, tuple[int, int], Node | None]:
+def _split_draw(expr: Expr, at: Context) -> tuple[Expr, tuple[int, int], Node | None]:
     """A draw expression as (draw, where it is read, integer added to it)."""
     if expr.op == "draw":
         return expr, (0, 0), None
@@ -229,29 +224,7 @@ def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
     return min(max(count, 0), 1 << threshold.bits)
 
 
-def _threshold_node(chance: Expr, threshold: Threshold, at: Planes) -> Node:
-    build = at.build
-    match chance.op:
-        case "const":
-            return build.whole(draws_below(chance.value, threshold))
-        case "param":
-            return param_node(at, str(chance.value), threshold)
-        case "look":
-            return build.shift(_threshold_node(chance.args[0], threshold, at), chance.value)
-        case "choose":
-            yes, no = (_threshold_node(arg, threshold, at) for arg in chance.args[1:])
-            return build.select(node(chance.args[0], at), yes, no)
-    prop = at.ruleset.property(str(chance.value))
-    assert prop is not None
-    assert chance.op == "property"
-    values = [
-        param_node(at, v, threshold) if isinstance(v, str) else build.whole(draws_below(v, threshold))  # type: ignore[arg-type]
-        for v in prop.values
-    ]
-    return at.by_element(at.state["element"], values)
-
-
-def _lt(expr: Expr, at: Planes) -> Node:
+def _lt(expr: Expr, at: Context) -> Node:
     left, right = expr.args
     if "draw" not in (left.kind.name, right.kind.name):
         return _compare(expr, at)
@@ -269,30 +242,25 @@ def _lt(expr: Expr, at: Planes) -> Node:
 
     threshold = Threshold(_stream(draw, at)[1], strict=not flipped)
     if other.kind.name == "int":
-        whole_part = node(other, at)
-        extra = extra or build.whole(0)
-        result = build.compare("lt", extra, whole_part)
-    elif isinstance(other.value, (int, Fraction)) and other.op == "const":
+        limit = node(other, at)
+        result = build.compare("lt", extra or build.integer(0), limit)
+        return build.not_(result) if flipped else result
+    base = 0
+    if isinstance(other.value, (int, Fraction)) and other.op == "const":
         base = floor(other.value)
-        part = below(build.whole(draws_below(Fraction(other.value) - base, threshold)))
-        if extra is None:
-            result = part if base == 0 else build.flag(base > 0)
-        else:
-            at_base = build.compare("eq", extra, build.whole(base))
-            result = build.or_(build.compare("lt", extra, build.whole(base)), build.and_(at_base, part))
+        part = below(build.integer(draws_below(Fraction(other.value) - base, threshold)))
     else:
-        part = below(_threshold_node(other, threshold, at))
-        if extra is None:
-            result = part
-        else:
-            zero = build.whole(0)
-            result = build.or_(
-                build.compare("lt", extra, zero), build.and_(build.compare("eq", extra, zero), part)
-            )
+        part = below(_chance(other, at, threshold))
+    if extra is None:
+        result = part if base == 0 else build.flag(base > 0)
+    else:
+        bound = build.integer(base)
+        less = build.compare("lt", extra, bound)
+        result = build.or_(less, build.and_(build.compare("eq", extra, bound), part))
     return build.not_(result) if flipped else result
 
 
-def _compare(expr: Expr, at: Planes) -> Node:
+def _compare(expr: Expr, at: Context) -> Node:
     a, b = (node(arg, at) for arg in expr.args)
     if a.type == FLAG:
         return at.build.not_(at.build.make("xor", FLAG, a, b))
@@ -302,16 +270,14 @@ def _compare(expr: Expr, at: Planes) -> Node:
 # Neighborhoods and vectors
 
 
-def _count(expr: Expr, at: Planes) -> Node:
+def _count(expr: Expr, at: Context) -> Node:
     kernel = expr.value
-    assert isinstance(kernel, Kernel)
-    type = whole(int(expr.kind.lo), int(expr.kind.hi))
+    type = integer(int(expr.kind.lo), int(expr.kind.hi))
     return at.build.make("count", type, node(expr.args[0], at), attr=(kernel.weights, kernel.wrap))
 
 
-def _sum(expr: Expr, at: Planes) -> Node | Pair:
+def _sum(expr: Expr, at: Context) -> Node | Pair:
     kernel = expr.value
-    assert isinstance(kernel, Kernel)
     return _each(lambda a: _neighborhood(a, kernel, at.build), lower_expression(expr.args[0], at))
 
 
@@ -326,7 +292,7 @@ def _neighborhood(value: Node, kernel: Kernel, build: Builder) -> Node:
         for dx, weight in cells:
             term = build.shift(value, (0, dx), kernel.wrap)
             if weight != 1:
-                factor = build.real(float(weight)) if value.type == REAL else build.whole(weight)
+                factor = build.real(float(weight)) if value.type == REAL else build.integer(weight)
                 term = build.arithmetic("mul", term, factor)
             row = term if row is None else build.arithmetic("add", row, term)
         assert row is not None
@@ -341,7 +307,7 @@ def _length(vector: Pair, build: Builder) -> Node:
     return build.make("sqrt", REAL, squares)
 
 
-def _octant(expr: Expr, at: Planes) -> Node:
+def _octant(expr: Expr, at: Context) -> Node:
     """The octant, by comparing x with the borders of the octants at this length."""
     build = at.build
     y, x = pair(expr.args[0], at)
@@ -349,31 +315,31 @@ def _octant(expr: Expr, at: Planes) -> Node:
     near = build.arithmetic("mul", build.real(_float32(NEAR)), reach)
     far = build.arithmetic("mul", build.real(_float32(FAR)), reach)
     up = build.compare("lt", y, build.real(0.0))
-    result: Node = build.whole(4)
+    result: Node = build.integer(4)
     borders = (near, far, build.neg(far), build.neg(near))
     for octant in (3, 2, 1, 0):
-        mirrored = build.select(up, build.whole((8 - octant) % 8), build.whole(octant))
+        mirrored = build.select(up, build.integer((8 - octant) % 8), build.integer(octant))
         result = build.select(build.compare("lt", borders[octant], x), mirrored, result)
     return result
 
 
-def _opposite(expr: Expr, at: Planes) -> Node:
-    return at.build.mod(at.build.arithmetic("add", node(expr.args[0], at), at.build.whole(4)), 8)
+def _opposite(expr: Expr, at: Context) -> Node:
+    return at.build.mod(at.build.arithmetic("add", node(expr.args[0], at), at.build.integer(4)), 8)
 
 
-def _vector(expr: Expr, at: Planes) -> Pair:
+def _vector(expr: Expr, at: Context) -> Pair:
     return node(expr.args[0], at), node(expr.args[1], at)
 
 
-def _choose(expr: Expr, at: Planes) -> Node | Pair:
+def _choose(expr: Expr, at: Context) -> Node | Pair:
     if expr.kind.name == "chance":
-        return _chance_real(expr, at)
+        return _chance(expr, at)
     condition = node(expr.args[0], at)
     values = [lower_expression(arg, at) for arg in expr.args[1:]]
     return _each(lambda a, b: at.build.select(condition, a, b), *values)
 
 
-_LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
+_LOWER: dict[str, Callable[[Expr, Context], Node | Pair]] = {
     "const": _const,
     "param": lambda e, at: param_node(at, str(e.value)),
     "element": lambda e, at: at.state["element"],
@@ -382,23 +348,15 @@ _LOWER: dict[str, Callable[[Expr, Planes], Node | Pair]] = {
     "let": lambda e, at: at.lets[str(e.value)],
     "draw": _draw_real,
     "coordinate": lambda e, at: at.build.make(
-        "coordinate", whole(int(e.kind.lo), int(e.kind.hi)), attr=e.value
+        "coordinate", integer(int(e.kind.lo), int(e.kind.hi)), attr=e.value
     ),
     "inside": lambda e, at: at.build.make("inside", FLAG, attr=e.value),
     "look": _look,
     "member": _member,
-    "not": _logic,
-    "and": _logic,
-    "or": _logic,
-    "eq": _compare,
+    **dict.fromkeys(("not", "and", "or"), _logic),
+    **dict.fromkeys(("eq", "le"), _compare),
     "lt": _lt,
-    "le": _compare,
-    "add": _arithmetic,
-    "sub": _arithmetic,
-    "mul": _arithmetic,
-    "min": _arithmetic,
-    "max": _arithmetic,
-    "div": _divide,
+    **dict.fromkeys(("add", "sub", "mul", "min", "max", "div"), _arithmetic),
     "quotient": lambda e, at: at.build.quotient(node(e.args[0], at), node(e.args[1], at)),
     "neg": lambda e, at: _each(at.build.neg, lower_expression(e.args[0], at)),
     "abs": lambda e, at: at.build.abs(node(e.args[0], at)),

@@ -1,12 +1,13 @@
-"""The checked model -> IR. Vectors become two planes, fresh cells their parts, conflict policies masks."""
+"""The checked model -> IR. Vectors become two slots, fresh cells their parts, conflict policies masks."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import replace
 
+from powderdsl.analysis.reactions import facts_of
 from powderdsl.ir.build import Builder
-from powderdsl.ir.lower.expressions import Pair, Planes, lower_expression
-from powderdsl.ir.lower.live import live_passes
+from powderdsl.ir.lower.expressions import Context, Pair, lower_expression, node
 from powderdsl.ir.ops import (
     FLAG,
     REAL,
@@ -15,56 +16,67 @@ from powderdsl.ir.ops import (
     PassGraph,
     Program,
     SlotType,
-    Step,
+    SubstepGraph,
     Type,
     component_names,
-    whole,
+    component_of,
+    integer,
 )
+from powderdsl.model.logic.budget import Budget
+from powderdsl.model.logic.satisfy import Facts, satisfiable
 from powderdsl.model.state import Slot, slots
-from powderdsl.model.types import Assign, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
+from powderdsl.model.types import Assign, Field, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
 
 Mover = Transform | Swap | Move
 
-
-def plane_names(slot: Slot) -> tuple[str, ...]:
-    """The IR slots of a state slot."""
-    return component_names(slot.name) if slot.planes == 2 else (slot.name,)
+LIVE_BUDGET = 100_000
+"""Nodes evaluated to find rules that no world lets happen, a tenth of a second. After that every rule stays."""
 
 
-def plane_type(kind: Kind, ids: int) -> Type:
-    """The IR type in which values of a kind are held."""
+def slot_names(slot: Slot) -> tuple[str, ...]:
+    """The IR slots of a state array: one, or one for each component of a vector."""
+    return _parts_of(slot.name, slot.kind)
+
+
+def _parts_of(name: str, kind: Kind) -> tuple[str, ...]:
+    return component_names(name) if kind.name == "vec2" else (name,)
+
+
+def ir_type(kind: Kind, ids: int) -> Type:
+    """The IR type in which values of a kind are held; `ids` is the number of element ids."""
     match kind.name:
         case "flag":
             return FLAG
         case "real" | "vec2":
             return REAL
         case "element":
-            return whole(0, ids - 1)
+            return integer(0, ids - 1)
         case "direction":
-            return whole(0, 7)
-    return whole(int(kind.lo), int(kind.hi))
+            return integer(0, 7)
+    return integer(int(kind.lo), int(kind.hi))
 
 
 def lower_ruleset(ruleset: Ruleset) -> Program:
     """All passes of a ruleset, one graph each."""
-    table = {slot.name: slot for slot in slots(ruleset)}
     slot_types = []
-    for slot in table.values():
-        defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
-        type, names = plane_type(slot.kind, ruleset.slots), plane_names(slot)
-        for i, (name, default) in enumerate(zip(names, defaults, strict=True)):
-            component = i if len(names) > 1 else None
+    for slot in slots(ruleset):
+        names = slot_names(slot)
+        for i, name in enumerate(names):
+            default = slot.default[i] if isinstance(slot.default, tuple) else slot.default
+            type, component = ir_type(slot.kind, ruleset.slots), i if len(names) > 1 else None
             slot_types.append(SlotType(name, type, default, slot.resets, slot.name, component))
-    # What a slot that starts each step at its default can have become by the time a pass reads it.
+    # The range of a slot that starts each step at its default grows from pass to pass.
     ranges = {
-        s.name: whole(int(s.default), int(s.default)) for s in slot_types if s.resets and s.type.name == "int"
+        s.name: integer(int(s.default), int(s.default))
+        for s in slot_types
+        if s.resets and s.type.name == "int"
     }
     passes = []
     for pass_ in live_passes(ruleset):
-        graph = _PassLowering(ruleset, table, {s.name: s.type for s in slot_types} | ranges).lower(pass_)
-        for name, node in graph.outputs:
+        graph = _PassLowering(ruleset, Graph(), ranges).lower(pass_)
+        for name, last in graph.outputs:
             if name in ranges:
-                ranges[name] = whole(min(ranges[name].lo, node.type.lo), max(ranges[name].hi, node.type.hi))
+                ranges[name] = integer(min(ranges[name].lo, last.type.lo), max(ranges[name].hi, last.type.hi))
         passes.append(graph)
     return Program(
         ruleset.name,
@@ -75,113 +87,109 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
     )
 
 
+def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
+    """The passes without rules whose conditions cannot hold: a loop writes many copies, of which few suit the elements."""
+    facts = replace(facts_of(ruleset), budget=Budget(LIVE_BUDGET))
+    return tuple(
+        replace(one, moments=tuple(_live_substep(moment, facts) for moment in one.moments))
+        for one in ruleset.passes
+    )
+
+
+def _live_substep(moment: Moment, facts: Facts) -> Moment:
+    lets = {let.name: let.value for let in moment.lets}
+    rules = (
+        rule for rule in moment.rules if rule.mask is None or satisfiable(facts, [(rule.mask, (0, 0))], lets)
+    )
+    return replace(moment, rules=tuple(rules))
+
+
 def lower_pass(ruleset: Ruleset, pass_: Pass, graph: Graph) -> dict[str, Node]:
-    """What a pass leaves in the slots that it writes, as nodes of a graph that several passes may share."""
-    return dict(_pass_lowering(ruleset, graph).lower(pass_).outputs)
+    """The nodes of the slots that a pass writes, in a graph that several passes may share."""
+    return dict(_PassLowering(ruleset, graph).lower(pass_).outputs)
 
 
-def lower_moment(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> dict[str, Node]:
-    """What one moment of a pass leaves, as nodes that read the world as the moment finds it.
+def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> dict[str, Node]:
+    """The nodes of what one substep of a pass writes, as functions of the world that the substep finds.
 
-    Scratch fields and values that `let` fixed in earlier moments are inputs too, the latter as ``let NAME``; values
-    that this moment fixes are among the results.
+    Scratch fields and values that `let` fixed in earlier substeps are inputs too, the latter as ``let NAME``; values
+    that this substep fixes are among the results.
     """
-    lowering = _pass_lowering(ruleset, graph)
+    lowering = _PassLowering(ruleset, graph)
     build = lowering.build
-    lowering.slots = dict(lowering.table)
     for item in pass_.scratch:
-        planes = 2 if item.kind.name == "vec2" else 1
-        slot = Slot(item.name, item.kind, item.default, False, True, None, "", planes)
-        lowering.slots[item.name] = slot
-        lowering.types |= dict.fromkeys(plane_names(slot), plane_type(item.kind, ruleset.slots))
-    lowering.state = {name: build.input(name, type) for name, type in lowering.types.items()}
-    lowering.lets = {}
+        for name in lowering.add_scratch(item):
+            lowering.state[name] = build.input(name, ir_type(item.kind, ruleset.slots))
     for moment in pass_.moments[:number]:
         for let in moment.lets:
-            type = REAL if let.value.kind.name == "chance" else plane_type(let.value.kind, ruleset.slots)
-            parts = tuple(build.input(f"let {name}", type) for name in _part_names(let.name, let.value.kind))
+            type = REAL if let.value.kind.name == "chance" else ir_type(let.value.kind, ruleset.slots)
+            parts = tuple(build.input(f"let {name}", type) for name in _parts_of(let.name, let.value.kind))
             lowering.lets[let.name] = parts[0] if len(parts) == 1 else (parts[0], parts[1])
     before = dict(lowering.state)
     moment = pass_.moments[number]
-    lowering._moment(moment, pass_)
+    lowering.substep(moment)
     found = {name: node for name, node in lowering.state.items() if before[name] is not node}
     for let in moment.lets:
-        names = _part_names(let.name, let.value.kind)
-        found |= {
-            f"let {name}": part for name, part in zip(names, _parts(lowering.lets[let.name]), strict=True)
-        }
+        names = _parts_of(let.name, let.value.kind)
+        parts = _parts(lowering.lets[let.name])
+        found |= {f"let {name}": part for name, part in zip(names, parts, strict=True)}
     return found
 
 
-def _part_names(name: str, kind: Kind) -> tuple[str, ...]:
-    return component_names(name) if kind.name == "vec2" else (name,)
-
-
-def _pass_lowering(ruleset: Ruleset, graph: Graph) -> _PassLowering:
-    table = {slot.name: slot for slot in slots(ruleset)}
-    types = {
-        name: plane_type(slot.kind, ruleset.slots) for slot in table.values() for name in plane_names(slot)
-    }
-    return _PassLowering(ruleset, table, types, Builder(graph))
-
-
-@dataclass
 class _PassLowering:
     """Lowers one pass: keeps the current node of every slot, and the values of lets."""
 
-    ruleset: Ruleset
-    table: dict[str, Slot]
-    types: dict[str, Type]
-    build: Builder = field(default_factory=Builder)
+    def __init__(self, ruleset: Ruleset, graph: Graph, ranges: Mapping[str, Type] | None = None):
+        self.ruleset = ruleset
+        self.build = Builder(graph)
+        self.slots = {slot.name: slot for slot in slots(ruleset)}
+        """The state's arrays, and scratch fields."""
+        types = {
+            name: ir_type(slot.kind, ruleset.slots)
+            for slot in self.slots.values()
+            for name in slot_names(slot)
+        } | dict(ranges or {})
+        self.state = {name: self.build.input(name, type) for name, type in types.items()}
+        self.lets: dict[str, Node | Pair] = {}
+
+    def add_scratch(self, item: Field) -> tuple[str, ...]:
+        """Makes a slot of a scratch field; its names in the IR."""
+        components = 2 if item.kind.name == "vec2" else 1
+        slot = Slot(item.name, item.kind, item.default, False, True, None, "", components)
+        self.slots[item.name] = slot
+        return slot_names(slot)
 
     def lower(self, pass_: Pass) -> PassGraph:
         build = self.build
-        self.state: dict[str, Node] = {name: build.input(name, type) for name, type in self.types.items()}
-        self.lets: dict[str, Node | Pair] = {}
-        self.slots = dict(self.table)
+        found = dict(self.state)
         for item in pass_.scratch:
-            slot = Slot(
-                item.name,
-                item.kind,
-                item.default,
-                False,
-                True,
-                None,
-                "",
-                2 if item.kind.name == "vec2" else 1,
-            )
-            self.slots[item.name] = slot
-            type = plane_type(item.kind, self.ruleset.slots)
-            for name in plane_names(slot):
-                # The nearest number to zero: the same in both parts of a vector.
-                default = item.default[0] if isinstance(item.default, tuple) else item.default
-                self.state[name] = build.const(default, type)
-        steps = tuple(self._moment(moment, pass_) for moment in pass_.moments)
+            # The number nearest to zero: the same in both components of a vector.
+            default = item.default[0] if isinstance(item.default, tuple) else item.default
+            for name in self.add_scratch(item):
+                self.state[name] = build.const(default, ir_type(item.kind, self.ruleset.slots))
+        substeps = tuple(self.substep(moment) for moment in pass_.moments)
         outputs = []
-        for name, type in self.types.items():
-            if self.state[name].op == "input" and self.state[name].attr == name:
+        for name, before in found.items():
+            last = self.state[name]
+            if last is before:
                 continue
-            if type == REAL:
-                kind = self.table[name.removesuffix(".row").removesuffix(".column")].kind
-                self.state[name] = build.make(
-                    "settle", REAL, self.state[name], attr=(float(kind.lo), float(kind.hi))
-                )
-            outputs.append((name, self.state[name]))
-        return PassGraph(pass_.name, pass_.pack, steps, tuple(outputs))
+            if before.type == REAL:
+                kind = self.slots[component_of(name)[0]].kind
+                last = build.make("settle", REAL, last, attr=(float(kind.lo), float(kind.hi)))
+            outputs.append((name, last))
+        return PassGraph(pass_.name, pass_.pack, substeps, tuple(outputs))
 
-    def planes(self) -> Planes:
-        return Planes(self.ruleset, self.build, dict(self.state), self.lets, self.slots)
+    def context(self) -> Context:
+        return Context(self.ruleset, self.build, dict(self.state), self.lets, self.slots)
 
-    def _moment(self, moment: Moment, pass_: Pass) -> Step:
+    def substep(self, moment: Moment) -> SubstepGraph:
         build = self.build
         place = next((f"{r.span.source.name}:{r.span.line}" for r in moment.rules), "")
         build.place = place
         for let in moment.lets:
-            self.lets[let.name] = lower_expression(let.value, self.planes())
-        at = self.planes()
-        masks = {
-            id(rule): _flag(lower_expression(rule.mask, at)) for rule in moment.rules if rule.mask is not None
-        }
+            self.lets[let.name] = lower_expression(let.value, self.context())
+        at = self.context()
+        masks = {id(rule): node(rule.mask, at) for rule in moment.rules if rule.mask is not None}
         movers: list[Mover] = [rule for rule in moment.rules if not isinstance(rule, Assign)]
         if moment.policy != "prove":
             self._apply_policy(moment.policy, movers, masks)
@@ -194,8 +202,8 @@ class _PassLowering:
         self._move(movers, masks, at)
         for write, mask in effects:
             self._assign(write, values[id(write)], mask)
-        changed = tuple((name, node) for name, node in self.state.items() if before.get(name) is not node)
-        return Step(moment.label, place, changed, tuple(masks.values()))
+        changed = tuple((name, new) for name, new in self.state.items() if before[name] is not new)
+        return SubstepGraph(moment.label, place, changed, tuple(masks.values()))
 
     def _assign(self, write: Assign, value: Node | Pair, mask: Node) -> None:
         """`field op value` at an offset from each cell of the mask, read from the target's side."""
@@ -205,7 +213,7 @@ class _PassLowering:
         mask = build.shift(mask, back)
         if slot.of is not None:  # cells of other elements keep reading the default
             mask = build.and_(mask, build.in_set(self.state["element"], slot.of))
-        for name, part in zip(plane_names(slot), _parts(value), strict=True):
+        for name, part in zip(slot_names(slot), _parts(value), strict=True):
             old = self.state[name]
             new = build.shift(part, back)
             if write.op != ":=":
@@ -214,36 +222,28 @@ class _PassLowering:
                 new = build.clamp(new, int(slot.kind.lo), int(slot.kind.hi))
             self.state[name] = build.select(mask, new, old)
 
-    def _move(self, movers: list[Mover], masks: dict[int, Node], at: Planes) -> None:
+    def _move(self, movers: list[Mover], masks: dict[int, Node], at: Context) -> None:
         """Transforms and what moves leave behind first, then arrivals, all from the world before."""
         build = self.build
         before = dict(self.state)
         for rule in movers:
-            target = (
-                rule.target
-                if isinstance(rule, Transform)
-                else rule.leaving
-                if isinstance(rule, Move)
-                else None
-            )
-            if target is not None:
-                fresh = lower_expression(target, at)
-                assert isinstance(fresh, Node)
-                for name, node in self._fresh(fresh).items():
-                    self.state[name] = build.select(masks[id(rule)], node, self.state[name])
+            if isinstance(rule, Swap):
+                continue
+            fresh = node(rule.target if isinstance(rule, Transform) else rule.leaving, at)
+            for name, value in self._fresh(fresh).items():
+                self.state[name] = build.select(masks[id(rule)], value, self.state[name])
         for rule in movers:
             if isinstance(rule, Transform):
                 continue
-            move = build.swap if isinstance(rule, Swap) else build.arrive
-            for slot in self.slots.values():
-                if slot.travels:
-                    for name in plane_names(slot):
-                        self.state[name] = move(before[name], masks[id(rule)], self.state[name], rule.offset)
+            op = "swap" if isinstance(rule, Swap) else "arrive"
+            for name in (name for slot in self.slots.values() if slot.travels for name in slot_names(slot)):
+                mask, rest = masks[id(rule)], self.state[name]
+                self.state[name] = build.move(op, before[name], mask, rest, rule.offset)
 
     def _fresh(self, element: Node) -> dict[str, Node]:
         """What a new cell of an element holds."""
         build = self.build
-        at = self.planes()
+        at = self.context()
         found = {"element": element}
         for slot in self.slots.values():
             if not slot.travels or slot.name == "element":
@@ -253,8 +253,8 @@ class _PassLowering:
                 found[slot.name] = at.property_of(prop, element)
                 continue
             defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
-            type = plane_type(slot.kind, self.ruleset.slots)
-            for part, (name, default) in enumerate(zip(plane_names(slot), defaults, strict=True)):
+            type = ir_type(slot.kind, self.ruleset.slots)
+            for part, (name, default) in enumerate(zip(slot_names(slot), defaults, strict=True)):
                 values = [build.const(default, type)] * self.ruleset.slots
                 for identity, own in slot.own:
                     values[identity] = build.const(own[part] if isinstance(own, tuple) else own, type)
@@ -289,11 +289,6 @@ class _PassLowering:
                 mask = build.and_(mask, build.not_(touches(rule, taken)))
                 taken = build.or_(taken, claimed(rule, mask))
             masks[id(rule)] = mask
-
-
-def _flag(value: Node | Pair) -> Node:
-    assert isinstance(value, Node)
-    return value
 
 
 def _parts(value: Node | Pair) -> tuple[Node, ...]:

@@ -1,4 +1,4 @@
-"""The pipeline between lowering and backends: an ordered list, a reason for each place, the verifier in between."""
+"""The stages between lowering and targets: an ordered list, a reason for each place, the verifier in between."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from powderdsl.ir.ops import PassGraph, Program
-from powderdsl.ir.rewrite import Rewrite, rewrite_pass
+from powderdsl.ir.rewrite import Rules, rewrite_pass
 from powderdsl.ir.stages.fold import FOLD
 from powderdsl.ir.stages.prune import prune
 from powderdsl.ir.stages.resolve import RESOLVE, specialise
@@ -16,24 +16,25 @@ from powderdsl.ir.verify import verify
 
 @dataclass(frozen=True)
 class Stage:
-    """A pass of the compiler: its name, one line of help, and what it does to one pass of a program."""
+    """A stage of the compiler: its name, one line of help, and what it does to one pass of a program."""
 
     name: str
     about: str
     run: Callable[[PassGraph], PassGraph]
 
 
-def _rewriting(*rules: Rewrite) -> Callable[[PassGraph], PassGraph]:
+def _rewriting(*parts: Rules) -> Callable[[PassGraph], PassGraph]:
+    rules = Rules(*parts)
     return lambda graph: rewrite_pass(graph, rules)
 
 
 PIPELINE: tuple[Stage, ...] = (
-    Stage("fold", "folds constants and flags that are always equal", _rewriting(*FOLD)),
+    Stage("fold", "folds constants and flags that are always equal", _rewriting(FOLD)),
     # Before sharing: what a neighbor's property decides becomes a question about its element.
     Stage("specialise", "replaces the properties of a cell whose element is known", specialise),
-    Stage("resolve", "turns tests of properties into tests of the element", _rewriting(*RESOLVE, *FOLD)),
+    Stage("resolve", "turns tests of properties into tests of the element", _rewriting(RESOLVE, FOLD)),
     # After resolving: only now is it clear which neighbors are read.
-    Stage("share", "reads each value of a neighbor once", _rewriting(*SHARE, *FOLD)),
+    Stage("share", "reads each value of a neighbor once", _rewriting(SHARE, FOLD)),
     # Last: substeps whose rules have turned out never to fire no longer write anything.
     Stage("prune", "removes substeps that change nothing", prune),
 )

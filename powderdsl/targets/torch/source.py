@@ -175,7 +175,7 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
     """Source, function name and constants of a pass. `number` makes the name unique."""
     writer = _Writer(_significant_bits(pass_))
     place = ""
-    nodes = nodes_of(pass_, moments=False)
+    nodes = nodes_of(pass_, substeps=False)
     for node in nodes:
         if node.places and node.places[0] != place:
             place = node.places[0]

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.lower.expressions import Planes, lower_expression
-from powderdsl.ir.lower.rules import plane_names, plane_type
+from powderdsl.ir.lower.expressions import Context, lower_expression
+from powderdsl.ir.lower.rules import ir_type, slot_names
 from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, component_of
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
@@ -140,9 +140,7 @@ class _Part:
         build = Builder()
         table = {slot.name: slot for slot in slots(ruleset)}
         types = {
-            name: plane_type(slot.kind, ruleset.slots)
-            for slot in table.values()
-            for name in plane_names(slot)
+            name: ir_type(slot.kind, ruleset.slots) for slot in table.values() for name in slot_names(slot)
         }
         exprs = [measure.value for _, measure in measures if measure.value is not None]
         regions = sorted({name for expr in exprs for name in _regions_of(expr)})
@@ -150,7 +148,7 @@ class _Part:
         lets: dict[str, Node | tuple[Node, Node]] = {name: build.input(name, FLAG) for name in regions}
         outputs = []
         for number, expr in zip(self.numbers, exprs, strict=True):
-            node = lower_expression(expr, Planes(ruleset, build, state, lets, table))
+            node = lower_expression(expr, Context(ruleset, build, state, lets, table))
             assert isinstance(node, Node)
             outputs.append((f"measure {number}", node))
         rows = [SlotType(name, type, 0, False) for name, type in types.items()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from powderdsl.ir.lower.rules import lower_moment, lower_pass, plane_names
+from powderdsl.ir.lower.rules import lower_pass, lower_substep, slot_names
 from powderdsl.ir.ops import Graph, Node
 from powderdsl.model.state import slots
 from powderdsl.model.types import Pass, Ruleset
@@ -46,7 +46,7 @@ def _cells(ruleset: Ruleset) -> Cells:
     for slot in slots(ruleset):
         if slot.is_real:
             continue
-        (name,) = plane_names(slot)
+        (name,) = slot_names(slot)
         prop = ruleset.property(slot.name)
         if slot.kind.name == "element":
             domains[name] = ids
@@ -60,22 +60,22 @@ def _cells(ruleset: Ruleset) -> Cells:
 
 
 def _same_pass(first: Ruleset, one: Pass, second: Ruleset, other: Pass, cells: Cells) -> bool:
-    """Moment by substep, each from whatever the one before may have left; if that does not do, as a whole."""
+    """Substep by substep, each from whatever the one before may have left; if that does not do, as a whole."""
     if one.scratch != other.scratch:
         return False
     numbers = range(len(one.moments))
     if len(one.moments) == len(other.moments) and all(
-        _same_moment(first, one, second, other, number, cells) for number in numbers
+        _same_substep(first, one, second, other, number, cells) for number in numbers
     ):
         return True
     graph = Graph()
     return _same_writes(lower_pass(first, one, graph), lower_pass(second, other, graph), graph, cells)
 
 
-def _same_moment(first: Ruleset, one: Pass, second: Ruleset, other: Pass, number: int, cells: Cells) -> bool:
+def _same_substep(first: Ruleset, one: Pass, second: Ruleset, other: Pass, number: int, cells: Cells) -> bool:
     graph = Graph()
     return _same_writes(
-        lower_moment(first, one, number, graph), lower_moment(second, other, number, graph), graph, cells
+        lower_substep(first, one, number, graph), lower_substep(second, other, number, graph), graph, cells
     )
 
 
