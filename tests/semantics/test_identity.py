@@ -156,6 +156,16 @@ def test_ids_of_packs_that_a_ruleset_leaves_out_stay_reserved() -> None:
     assert [channel.name for channel in less.matrix[:4]] == ["empty", "wall", "", "crab"]
 
 
+def test_an_id_that_a_left_out_pack_reserves_is_not_given_again() -> None:
+    pack("aa", '  moss: {id: 5, color: "#306030"}')
+    pack("bb", '  crab: {id: 5, color: "#306030"}')
+    Path("shore.yaml").write_text("ruleset: shore\npacks: [core, aa]\n")
+    rules, notes = load_with_diagnostics("shore.yaml-aa+bb.yaml")
+    assert rules.element("crab").id != 5
+    (note,) = [note for note in notes if note.code == "PD313"]
+    assert note.primary.text == "`aa.moss` has id 5"
+
+
 def test_a_full_palette_is_refused() -> None:
     name = pack("many", "\n".join(f'  e{n}: {{color: "#306030"}}' for n in range(255)))
     with pytest.raises(CompileError) as error:

@@ -110,8 +110,7 @@ def compose(
     claims = _claims(groups, ruleset is not None, chosen)
     natural = composed_ids(claims)
     ids = natural if palette is None else recorded_ids(claims, palette)
-    loaded = [claim for claim in claims if claim.name in chosen]
-    report_ids(loaded, ids, reporter, recorded=palette is not None)
+    report_ids(claims, ids, reporter, recorded=palette is not None)
     elements = _elements(chosen, ids, reporter)
     placing = ruleset.placing if ruleset else None
     wanted = (placing.slots if placing else None) or 0
@@ -337,7 +336,7 @@ def _claims_of(pack: PackDecl, chosen: dict[str, _Chosen], own: bool) -> Iterato
         if one is None:
             if not decl.override:  # of a pack that is left out: its id stays reserved
                 qualified = f"{name}.{decl.name.text}"
-                yield Claim(f"-{qualified}", qualified, name, decl, own)
+                yield Claim(f"-{qualified}", qualified, name, decl, own, is_loaded=False)
             continue
         final = one.named
         wished = next((old for old in (final, *one.replaced) if old.decl.id is not None), final).decl

@@ -30,6 +30,8 @@ class Claim:
     own: bool
     replaces: tuple[str, ...] = ()
     """Qualified names of the elements that it overrides, the latest first: it takes over their id."""
+    is_loaded: bool = True
+    """False for elements of packs that a ruleset leaves out: their ids stay reserved."""
 
 
 def composed_ids(claims: Iterable[Claim]) -> dict[str, int]:
@@ -86,41 +88,33 @@ def report_ids(
     claims: Sequence[Claim], ids: Mapping[str, int], reporter: Reporter, *, recorded: bool
 ) -> None:
     """Report elements without an id, two of one pack with the same one, and those that could not have theirs."""
-    lacking = [claim for claim in claims if claim.name not in ids]
+    loaded = [claim for claim in claims if claim.is_loaded]
+    lacking = [claim for claim in loaded if claim.name not in ids]
     if lacking:
         reporter.error(
-            "PD508",
-            f"{len(claims)} elements",
-            lacking[0].decl.name.span,
-            f"the limit is {MAX_ELEMENTS}",
+            "PD508", f"{len(loaded)} elements", lacking[0].decl.name.span, f"the limit is {MAX_ELEMENTS}",
             helps=["load fewer packs"],
-        )
+        )  # fmt: skip
+    holders = {ids[claim.name]: claim for claim in claims if claim.name in ids}
     by_number: dict[tuple[str, int], Claim] = {}
-    for claim in claims:
+    for claim in loaded:
         wanted, scalar = claim.decl.id, claim.decl.id_scalar
         if wanted is None or scalar is None:
             continue
         first = by_number.setdefault((claim.pack, wanted), claim)
         if first is not claim:
-            used = {other.decl.id for other in claims}
-            used |= {ids[other.name] for other in claims if other is not claim and other.name in ids}
+            used = {other.decl.id for other in loaded} | {
+                number for number, holder in holders.items() if holder.is_loaded and holder is not claim
+            }
             free = next((n for n in range(MAX_ELEMENTS) if n not in used), None)
             reporter.error(
-                "PD303",
-                f"elements `{first.decl.name.text}` and `{claim.decl.name.text}` have the same id {wanted}",
-                scalar.span,
-                "already taken",
-                secondary=[Label(first.decl.name.span, "by this one")],
-                helps=[]
-                if free is None
-                else [f"id {free} is free; an element without `id:` gets a free one"],
-            )
+                "PD303", f"elements `{first.decl.name.text}` and `{claim.decl.name.text}` have the same id {wanted}",
+                scalar.span, "already taken", secondary=[Label(first.decl.name.span, "by this one")],
+                helps=[] if free is None else [f"id {free} is free; an element without `id:` gets a free one"],
+            )  # fmt: skip
         elif not recorded and ids.get(claim.name, wanted) != wanted:
-            owner = next(other for other in claims if ids.get(other.name) == wanted)
             reporter.report(
-                "PD313",
-                f"`{claim.qualified}` has id {ids[claim.name]} here, not {wanted}",
-                scalar.span,
-                f"`{owner.qualified}` has id {wanted}",
+                "PD313", f"`{claim.qualified}` has id {ids[claim.name]} here, not {wanted}",
+                scalar.span, f"`{holders[wanted].qualified}` has id {wanted}",
                 notes=["saved worlds, datasets and checkpoints know elements by name, not by id"],
-            )
+            )  # fmt: skip
