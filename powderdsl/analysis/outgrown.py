@@ -8,7 +8,7 @@ from dataclasses import replace
 from powderdsl.diagnostics import Diagnostic, Reporter, Severity
 from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.compose import compose
-from powderdsl.model.declarations import Block, PackDecl
+from powderdsl.model.declarations import PackDecl
 from powderdsl.model.restrict import Difference, remarks_alone
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Ruleset
@@ -50,24 +50,12 @@ def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Di
 
 def _words(pack: PackDecl) -> Iterator[str]:
     """The words of a pack's own rules and elements, by which it shows what it knows."""
-    for pass_ in pack.passes:
-        yield from _block_words(pass_.block)
-    for element in pack.elements:
-        yield from (key.text.removesuffix("?") for key, _ in element.values)
-        yield from (tag.text.removesuffix("?") for tag in element.tags)
-    for also in pack.also:
-        yield also.element.text.removesuffix("?")
-        yield from (key.text.removesuffix("?") for key, _ in also.values)
-        yield from (tag.text.removesuffix("?") for tag in also.tags)
-    yield from _of(syntax for _, syntax in pack.sets)
-
-
-def _block_words(block: Block) -> Iterator[str]:
-    yield from _of(block.rules)
-    yield from _of(value for _, value in block.lets)
-    yield from _of([block.header] if block.header else [])
-    for inner in (*block.blocks, *block.then):
-        yield from _block_words(inner)
+    yield from _of(pack.lines)
+    yield from _of(one.members for one in pack.sets)
+    yield from (also.name.word for also in pack.also)
+    for entry in pack.entries:
+        yield from (key.word for key, _ in entry.values)
+        yield from (tag.word for tag in entry.tags)
 
 
 def _of(lines: Iterable[Syntax]) -> Iterator[str]:

@@ -81,24 +81,16 @@ class AddedPacks:
         """What packs outside a scope give an element: tags that stand in some words, else such values, else itself."""
         composition = self.composition
         named = composition.element_decls[element]
-        entries = [(named.pack, named.decl.tags, named.decl.values)]
-        for pack in composition.packs:
-            own = pack.name.text
-            entries += [
-                (own, also.tags, also.values)
-                for also in pack.also
-                if composition.element(also.element.text.removesuffix("?"), own) == element
-            ]
-        tags = [("tag", pack, tag) for pack, given, _ in entries for tag in given]
-        values = [("value", pack, key) for pack, _, given in entries for key, _ in given]
+        entries = [(pack, entry) for pack, name, entry in composition.entries() if name == element]
+        tags = [("tag", pack, tag) for pack, entry in entries for tag in entry.tags]
+        values = [("value", pack, key) for pack, entry in entries for key, _ in entry.values]
         found: list[Given] = []
         for several in (tags, values):
             found = found or [
                 Given(pack, element, noun, name, scalar.span)
                 for noun, pack, scalar in several
                 if pack not in scope
-                and (name := composition.names.of(pack, scalar.text.removesuffix("?"))).rpartition(".")[2]
-                in words
+                and (name := composition.names.of(pack, scalar.word)).rpartition(".")[2] in words
             ]
         if not found and named.pack not in scope:
             found = [Given(named.pack, element, "", "", named.decl.name.span)]

@@ -73,7 +73,9 @@ def resolve_names(
     reporter.raise_if_errors()  # with names that clash or packs that lack, rules would only be misread
     symbols = base_symbols(composition)
     typer = Typer(symbols, reporter)
-    typer.set_definitions = {name: (named.pack, named.decl[1]) for name, named in composition.sets.items()}
+    typer.set_definitions = {
+        name: (named.pack, named.decl.members) for name, named in composition.sets.items()
+    }
     check_param_names(symbols, reporter)
     _shaped_kernels(symbols, typer)
     _params(symbols, typer)

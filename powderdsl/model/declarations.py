@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
 
 from powderdsl.diagnostics import Source
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
+
+Pair = tuple[Scalar, Syntax]
+"""A name and what stands behind it."""
 
 
 @dataclass(frozen=True)
@@ -14,12 +19,13 @@ class TypedDecl:
     """A property, field or parameter as written: its kind and default are still syntax."""
 
     name: Scalar
-    type: Syntax | None
-    default: Syntax | None
+    type: Syntax | None = None
+    default: Syntax | None = None
     at: str = "place"
     of: Syntax | None = None
-    resets: bool = False
-    values: tuple[tuple[Scalar, Syntax], ...] = ()
+    resets: str | None = None
+    values: tuple[Pair, ...] = ()
+    """The values of single elements."""
     about: str = ""
 
 
@@ -37,22 +43,24 @@ class RampDecl:
 @dataclass(frozen=True)
 class ElementDecl:
     name: Scalar
-    id: int | None
-    id_scalar: Scalar | None
-    color: str
-    glyph: str
-    about: str
-    tags: tuple[Scalar, ...]
-    values: tuple[tuple[Scalar, Syntax], ...]
-    override: bool
+    id: int | None = None
+    id_scalar: Scalar | None = None
+    color: str = "#000000"
+    glyph: str = ""
+    about: str = ""
+    tags: tuple[Scalar, ...] = ()
+    values: tuple[Pair, ...] = ()
+    override: bool = False
     ramp: RampDecl | None = None
 
 
 @dataclass(frozen=True)
 class AlsoDecl:
-    element: Scalar
-    tags: tuple[Scalar, ...]
-    values: tuple[tuple[Scalar, Syntax], ...]
+    """What a pack adds to an element of another pack."""
+
+    name: Scalar
+    tags: tuple[Scalar, ...] = ()
+    values: tuple[Pair, ...] = ()
     ramp: RampDecl | None = None
 
 
@@ -68,46 +76,71 @@ class KernelDecl:
 @dataclass(frozen=True)
 class StreamDecl:
     name: Scalar
-    bits: int
+    bits: int = 16
+
+
+@dataclass(frozen=True)
+class TagDecl:
+    name: Scalar
+    about: str
+
+
+@dataclass(frozen=True)
+class SetDecl:
+    name: Scalar
+    members: Syntax
 
 
 @dataclass(frozen=True)
 class Block:
     """A block of a pass: lets, then one action (a substep of rules, or further blocks, maybe in a loop), then the rest."""
 
-    lets: tuple[tuple[Scalar, Syntax], ...]
-    header: Syntax | None
-    rules: tuple[Syntax, ...]
-    blocks: tuple[Block, ...]
-    symmetry: str | None
-    policy: str | None
-    then: tuple[Block, ...]
+    lets: tuple[Pair, ...] = ()
+    header: Syntax | None = None
+    rules: tuple[Syntax, ...] = ()
+    blocks: tuple[Block, ...] = ()
+    symmetry: str | None = None
+    conflicts: str | None = None
+    then: tuple[Block, ...] = ()
+
+    def walk(self) -> Iterator[Block]:
+        """This block and all blocks in it, as they are written."""
+        yield self
+        for block in (*self.blocks, *self.then):
+            yield from block.walk()
+
+    @property
+    def lines(self) -> tuple[Syntax, ...]:
+        """The lines of this block alone: its values, its loop, its rules."""
+        return (*(value for _, value in self.lets), *([self.header] if self.header else []), *self.rules)
 
 
 @dataclass(frozen=True)
 class PassDecl:
     name: Scalar
-    about: str
-    after: tuple[Scalar, ...]
-    before: tuple[Scalar, ...]
-    scratch: tuple[TypedDecl, ...]
     block: Block
+    about: str = ""
+    after: tuple[Scalar, ...] = ()
+    before: tuple[Scalar, ...] = ()
+    scratch: tuple[TypedDecl, ...] = ()
 
 
 @dataclass(frozen=True)
 class TestDecl:
-    name: str
-    scalar: Scalar
+    name: Scalar
     given: Scalar | None
     legend: tuple[tuple[Scalar, Scalar], ...]
     steps: int
     expect: Scalar | None
     always: tuple[Syntax, ...]
     seed: int | None
-    fields: tuple[tuple[Scalar, Scalar], ...] = ()
-    expect_fields: tuple[tuple[Scalar, Scalar], ...] = ()
-    often: tuple[tuple[Syntax, Syntax], ...] = ()
+    fields: tuple[tuple[Scalar, Scalar], ...]
+    expect_fields: tuple[tuple[Scalar, Scalar], ...]
+    often: tuple[tuple[Syntax, Syntax], ...]
     """What becomes of cells, as `before -> after`, and how likely."""
+
+
+Definition = TagDecl | TypedDecl | StreamDecl | KernelDecl | SetDecl | ElementDecl | PassDecl
 
 
 @dataclass(frozen=True)
@@ -116,22 +149,39 @@ class PackDecl:
 
     name: Scalar
     source: Source
-    about: str
-    needs: tuple[Scalar, ...]
-    conflicts: tuple[Scalar, ...]
-    tags: tuple[tuple[Scalar, str], ...]
-    properties: tuple[TypedDecl, ...]
-    fields: tuple[TypedDecl, ...]
-    streams: tuple[StreamDecl, ...]
-    params: tuple[TypedDecl, ...]
-    kernels: tuple[KernelDecl, ...]
-    sets: tuple[tuple[Scalar, Syntax], ...]
-    elements: tuple[ElementDecl, ...]
-    also: tuple[AlsoDecl, ...]
-    passes: tuple[PassDecl, ...]
-    tests: tuple[TestDecl, ...]
+    about: str = ""
+    needs: tuple[Scalar, ...] = ()
+    conflicts: tuple[Scalar, ...] = ()
+    tags: tuple[TagDecl, ...] = ()
+    properties: tuple[TypedDecl, ...] = ()
+    fields: tuple[TypedDecl, ...] = ()
+    streams: tuple[StreamDecl, ...] = ()
+    params: tuple[TypedDecl, ...] = ()
+    kernels: tuple[KernelDecl, ...] = ()
+    sets: tuple[SetDecl, ...] = ()
+    elements: tuple[ElementDecl, ...] = ()
+    also: tuple[AlsoDecl, ...] = ()
+    passes: tuple[PassDecl, ...] = ()
+    tests: tuple[TestDecl, ...] = ()
     invariants: tuple[Syntax, ...] = ()
     side_multiple: int = 1
+
+    @property
+    def definitions(self) -> tuple[Definition, ...]:
+        """What it defines for all packs, but for passes: a pass and an element may have one name."""
+        tables: tuple[Sequence[Definition], ...]
+        tables = self.tags, self.properties, self.fields, self.streams, self.kernels, self.sets, self.elements
+        return tuple(chain.from_iterable(tables))
+
+    @property
+    def entries(self) -> tuple[ElementDecl | AlsoDecl, ...]:
+        """What it says of single elements."""
+        return (*self.elements, *self.also)
+
+    @property
+    def lines(self) -> Iterator[Syntax]:
+        """The lines of its passes."""
+        return (line for one in self.passes for block in one.block.walk() for line in block.lines)
 
 
 @dataclass(frozen=True)
@@ -143,11 +193,11 @@ class RulesetDecl:
 
     name: Scalar
     source: Source
-    about: str
-    packs: tuple[Scalar, ...]
-    slots: int | None
-    matrix: tuple[Scalar, ...]
-    params: tuple[tuple[Scalar, Syntax], ...] = field(default=())
+    about: str = ""
+    packs: tuple[Scalar, ...] = ()
+    slots: int | None = None
+    matrix: tuple[Scalar, ...] = ()
+    params: tuple[Pair, ...] = ()
     invariants: tuple[Syntax, ...] = ()
     rename: tuple[tuple[Scalar, Scalar], ...] = ()
     """Qualified names, and the names by which these definitions are known here."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
-from powderdsl.model.composition.compose import Named
+from powderdsl.model.composition.names import Named
 from powderdsl.model.declarations import Block, PassDecl
 from powderdsl.model.expressions.operands import (
     FALSE,
@@ -112,7 +112,10 @@ class Elaborator:
     def _pass(self, named: Named[PassDecl]) -> Pass:
         decl = named.decl
         self._name, self._pack, self._word = named.name, named.pack, decl.name.text
-        self._numbers = {id(rule): number for number, rule in enumerate(_rules_of(decl.block))}
+        self._numbers = {
+            id(rule): number
+            for number, rule in enumerate(rule for block in decl.block.walk() for rule in block.rules)
+        }
         self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
         self._pending: list[Let] = []
@@ -168,7 +171,7 @@ class Elaborator:
                 "repeated too often",
                 "loop over fewer things",
             )
-        symmetry, policy = block.symmetry or symmetry, block.policy or policy
+        symmetry, policy = block.symmetry or symmetry, block.conflicts or policy
         for scalar, syntax in block.lets:
             fresh = self._fresh(scalar.text, scalar.span, scope)
             scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope) if fresh else Broken()})
@@ -466,12 +469,6 @@ class Elaborator:
             vector = Expr("vector", VEC2, parts, span=amount.span)
             rules.append(Assign(name, (dy, dx), "+=", vector, mask, syntax.span))
         return rules
-
-
-def _rules_of(block: Block) -> list[Syntax]:
-    """All rules of a block, in the order they are written."""
-    inner = [rule for child in (*block.blocks, *block.then) for rule in _rules_of(child)]
-    return [*block.rules, *inner]
 
 
 def _show(operand: Operand) -> str:

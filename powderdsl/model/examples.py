@@ -58,7 +58,7 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
         legend[key.text] = name
     if decl.given is None:
         raise typer.fail(
-            "PD109", f"the test `{decl.name}` has no start world", decl.scalar.span, "`given` is missing"
+            "PD109", f"the test `{decl.name.text}` has no start world", decl.name.span, "`given` is missing"
         )
     given = _rows(decl.given, legend, typer, wildcard=False)
     sides = (len(given), len(given[0]))
@@ -69,7 +69,7 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
             typer.reporter.report(
                 "PD506",
                 "this test is inactive: its world has sides that these rules do not allow",
-                decl.scalar.span,
+                decl.name.span,
                 "left out",
                 notes=[f"a loaded pack asks for sides that are multiples of {composition.side_multiple}"],
                 helps=["it wakes up without the pack that says `side_multiple`"],
@@ -99,8 +99,8 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
     if expect is None and not expect_fields and not decl.always and not decl.often:
         raise typer.fail(
             "PD109",
-            f"the test `{decl.name}` checks nothing",
-            decl.scalar.span,
+            f"the test `{decl.name.text}` checks nothing",
+            decl.name.span,
             "`expect`, `expect_fields`, `always` or `often` is missing",
         )
     scope = Scope(pack, {"world": _whole_world(len(given), len(given[0]))})
@@ -110,14 +110,14 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
     asked = [*decl.always, *(change for change, _ in decl.often)]
     words += [word for syntax in asked for word in words_of(syntax)]
     return Example(
-        decl.name,
+        decl.name.text,
         given,
         tuple(sorted(legend.items())),
         decl.steps,
         expect,
         tuple(always),
         pack,
-        decl.scalar.span,
+        decl.name.span,
         decl.seed,
         fields,
         expect_fields,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from typing import Any
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span
-from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
+from powderdsl.model.builtins import MAX_RADIUS
 from powderdsl.model.declarations import (
     AlsoDecl,
     Block,
@@ -13,17 +15,20 @@ from powderdsl.model.declarations import (
     KernelDecl,
     PackDecl,
     PassDecl,
+    RampDecl,
     RulesetDecl,
+    SetDecl,
     StreamDecl,
+    TagDecl,
     TestDecl,
     TypedDecl,
 )
-from powderdsl.model.kernel_rows import kernel_rows
-from powderdsl.model.ramp_keys import color_of, read_ramp
-from powderdsl.model.schema import KEYS, Reader, first_line
+from powderdsl.model.schema import KEYS, Entries, Reader, first_line
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_yaml
+
+MAX_WEIGHTS = 2 * MAX_RADIUS + 1
+"""In a row or a column of a kernel."""
 
 
 def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | None:
@@ -31,14 +36,13 @@ def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | No
     tree = parse_yaml(source, reporter)
     if tree is None:
         if not reporter.has_errors:
-            reporter.error(
-                "PD107", f"{source.name} is empty", None, helps=["a pack starts with `pack: NAME`"]
-            )
-        return None
-    if not isinstance(tree, Mapping):
-        Reader(reporter).shape(tree, "a pack: a mapping that starts with `pack: NAME`")
+            helps = ["a pack starts with `pack: NAME`"]
+            reporter.error("PD107", f"{source.name} is empty", None, helps=helps)
         return None
     reader = _PackReader(reporter, source)
+    if not isinstance(tree, Mapping):
+        reader.shape(tree, "a pack: a mapping that starts with `pack: NAME`")
+        return None
     if tree.get("ruleset") is not None:
         return reader.ruleset(tree)
     if tree.entries and not any(key.text in KEYS["pack"] for key, _ in tree.entries if key.text != "about"):
@@ -56,51 +60,42 @@ class _PackReader(Reader):
     def __init__(self, reporter: Reporter, source: Source):
         super().__init__(reporter)
         self.source = source
+        self.sections = {
+            "tags": ("a tag", self.tag),
+            "properties": ("a property", self.property),
+            "fields": ("a field", self.field),
+            "params": ("a parameter", self.param),
+            "kernels": ("a kernel", self.kernel),
+            "sets": ("a set", self.set),
+            "elements": ("an element", self.element),
+            "passes": ("a pass", self.pass_),
+        }
+        """What an entry of a section of a pack is, and how it is read: None after reporting that it makes no sense."""
 
-    def line(self, node: Node, start: str = "expression") -> Syntax | None:
-        if not isinstance(node, Scalar):
-            self.shape(node, "one line")
-            return None
-        return parse_scalar(node, start, self.reporter)
+    # Files
 
     def ruleset(self, tree: Mapping) -> RulesetDecl | None:
-        entries = self.mapping(tree, "ruleset", "a ruleset")
-        name = self.scalar(entries, "ruleset")
+        values = self.read(tree, "ruleset", "a ruleset")
+        name = values.pop("ruleset", None)
         if name is None or not self.name(name, "a ruleset"):
             return None
-        renamed = []
-        for key, value in self._pairs(entries.get("rename", (None, None))[1], "names: `pack.word: name`"):
+        if tree.get("extends") is None:
+            self.needs_no_base(tree, values.get("without", ()))
+        params = self.pairs(values.pop("params", None), "a mapping from parameters to values")
+        values["params"] = tuple((key, line) for key, node in params if (line := self.line(node)))
+        values["rename"] = tuple(self.renamed(values.pop("rename", None)))
+        return RulesetDecl(name, self.source, **values)
+
+    def renamed(self, node: Node | None) -> Iterator[tuple[Scalar, Scalar]]:
+        for key, value in self.pairs(node, "a mapping from names: `pack.word: name`"):
             if not isinstance(value, Scalar):
                 self.shape(value, "a name")
             elif self.name(value, "a name"):
-                renamed.append((key, value))
-        params = []
-        node = entries.get("params", (None, None))[1]
-        if isinstance(node, Mapping):
-            params = [(key, line) for key, value in node.entries if (line := self.line(value))]
-        extends = self.scalar(entries, "extends")
-        without = self.words(entries.get("without", (None, None))[1])
-        if extends is None and "extends" not in entries:
-            self.needs_no_base(tree, entries, without)
-        return RulesetDecl(
-            name,
-            self.source,
-            self.text(entries, "about"),
-            self.words(entries.get("packs", (None, None))[1]),
-            self.number(entries, "slots", 1, 256),
-            self.words(entries.get("matrix", (None, None))[1]),
-            tuple(params),
-            self.statements(entries.get("invariants", (None, None))[1]),
-            tuple(renamed),
-            extends=extends,
-            without=without,
-        )
+                yield key, value
 
-    def needs_no_base(
-        self, tree: Mapping, entries: dict[str, tuple[Scalar, Node]], without: tuple[Scalar, ...]
-    ) -> None:
+    def needs_no_base(self, tree: Mapping, without: tuple[Scalar, ...]) -> None:
         """Report what is missing in a ruleset that extends none, or has no sense there."""
-        if "packs" not in entries:
+        if tree.get("packs") is None:
             start = tree.span.start
             self.reporter.error(
                 "PD109", "a ruleset lacks `packs`", Span(self.source, start, start + 1), "`packs` is missing",
@@ -113,146 +108,63 @@ class _PackReader(Reader):
             )  # fmt: skip
 
     def pack(self, tree: Mapping) -> PackDecl | None:
-        entries = self.mapping(tree, "pack", "a pack")
-        name = self.scalar(entries, "pack")
+        values = self.read(tree, "pack", "a pack")
+        name = values.pop("pack", None)
         if name is None or not self.name(name, "a pack"):
             return None
+        for section, (noun, read) in self.sections.items():
+            entries = self.named(values.pop(section, None), noun)
+            values[section] = tuple(found for key, node in entries if (found := read(key, node)))
+        values["streams"] = tuple(self.streams(values.pop("streams", None)))
+        also = self.pairs(values.pop("also", None), "a mapping from elements to tags")
+        values["also"] = tuple(self.also(key, node) for key, node in also)
+        values["tests"] = tuple(self.tests(values.pop("tests", None)))
+        return PackDecl(name, self.source, **values)
 
-        def value(key: str) -> Node | None:
-            return entries.get(key, (None, None))[1]
+    # Definitions
 
-        return PackDecl(
-            name=name,
-            source=self.source,
-            about=self.text(entries, "about"),
-            needs=self.words(value("needs")),
-            conflicts=self.words(value("conflicts")),
-            tags=tuple(
-                (key, node.text if isinstance(node, Scalar) else "")
-                for key, node in self.named(value("tags"), "a tag")
-            ),
-            properties=tuple(
-                self.property(key, node) for key, node in self.named(value("properties"), "a property")
-            ),
-            fields=tuple(self.field(key, node) for key, node in self.named(value("fields"), "a field")),
-            streams=self.streams(value("streams")),
-            params=tuple(self.param(key, node) for key, node in self.named(value("params"), "a parameter")),
-            kernels=tuple(
-                k for key, node in self.named(value("kernels"), "a kernel") if (k := self.kernel(key, node))
-            ),
-            sets=tuple(
-                (key, line) for key, node in self.named(value("sets"), "a set") if (line := self.line(node))
-            ),
-            elements=tuple(
-                self.element(key, node) for key, node in self.named(value("elements"), "an element")
-            ),
-            also=tuple(self.also(key, node) for key, node in self._pairs(value("also"), "elements to tags")),
-            passes=tuple(self.pass_(key, node) for key, node in self.named(value("passes"), "a pass")),
-            tests=tuple(t for node in self._items(value("tests")) if (t := self.test(node))),
-            invariants=self.statements(value("invariants")),
-            side_multiple=self.number(entries, "side_multiple", 1, MAX_SIDE_MULTIPLE) or 1,
-        )
+    def tag(self, key: Scalar, node: Node) -> TagDecl:
+        return TagDecl(key, node.text if isinstance(node, Scalar) else "")
 
-    def statements(self, node: Node | None) -> tuple[Syntax, ...]:
-        """Invariants: a line, or a list of lines."""
-        items = () if node is None else node.items if isinstance(node, Sequence) else (node,)
-        return tuple(line for item in items if (line := self.line(item, "invariant")))
-
-    def _pairs(self, node: Node | None, what: str) -> tuple[tuple[Scalar, Node], ...]:
-        if node is None:
-            return ()
-        if not isinstance(node, Mapping):
-            self.shape(node, f"a mapping from {what}")
-            return ()
-        return node.entries
-
-    def _items(self, node: Node | None) -> tuple[Node, ...]:
-        if node is None:
-            return ()
-        if not isinstance(node, Sequence):
-            self.shape(node, "a list")
-            return ()
-        return node.items
+    def set(self, key: Scalar, node: Node) -> SetDecl | None:
+        line = self.line(node)
+        return SetDecl(key, line) if line else None
 
     def property(self, key: Scalar, node: Node) -> TypedDecl:
         if isinstance(node, Scalar):
-            return TypedDecl(key, self.line(node), None)
-        entries = self.mapping(node, "property", f"the property `{key.text}`")
-        values = self.open_values(entries, "property")
-        return TypedDecl(
-            key,
-            self.entry_line(entries, "type"),
-            self.entry_line(entries, "default"),
-            values=values,
-            about=self.text(entries, "about"),
-        )
-
-    def open_values(
-        self, entries: dict[str, tuple[Scalar, Node]], context: str
-    ) -> tuple[tuple[Scalar, Syntax], ...]:
-        """Entries beyond the table's keys: property values, or values for elements."""
-        found = []
-        for name, (key, node) in entries.items():
-            if name not in KEYS[context] and (line := self.line(node)):
-                found.append((key, line))
-        return tuple(found)
-
-    def entry_line(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> Syntax | None:
-        node = entries.get(key, (None, None))[1]
-        return self.line(node) if isinstance(node, Scalar) else None
+            return TypedDecl(key, type=self.line(node))
+        return TypedDecl(key, **self.read(node, "property", f"the property `{key.text}`"))
 
     def field(self, key: Scalar, node: Node) -> TypedDecl:
-        entries = self.mapping(node, "field", f"the field `{key.text}`")
-        at = self.choice(entries, "at", ("element", "place")) or "place"
-        resets = self.choice(entries, "resets", ("step",)) is not None
-        return TypedDecl(
-            key,
-            self.entry_line(entries, "type"),
-            self.entry_line(entries, "default"),
-            at,
-            self.entry_line(entries, "of"),
-            resets,
-            values=self.open_values(entries, "field"),
-            about=self.text(entries, "about"),
-        )
+        return TypedDecl(key, **self.read(node, "field", f"the field `{key.text}`"))
 
     def param(self, key: Scalar, node: Node) -> TypedDecl:
         if isinstance(node, Scalar):
-            return TypedDecl(key, None, self.line(node))
-        entries = self.mapping(node, "param", f"the parameter `{key.text}`")
-        return TypedDecl(
-            key,
-            self.entry_line(entries, "type"),
-            self.entry_line(entries, "default"),
-            about=self.text(entries, "about"),
-        )
+            return TypedDecl(key, default=self.line(node))
+        return TypedDecl(key, **self.read(node, "param", f"the parameter `{key.text}`"))
 
-    def streams(self, node: Node | None) -> tuple[StreamDecl, ...]:
-        if isinstance(node, Mapping):
-            found = []
-            for key, value in self.named(node, "a stream"):
-                entries = self.mapping(value, "stream", f"the stream `{key.text}`")
-                bits = self.number(entries, "bits", 16, 32) or 16
-                if bits not in (16, 32):
-                    self.reporter.error(
-                        "PD110", "`bits` must be 16 or 32", entries["bits"][1].span, "neither of them"
-                    )
-                    bits = 16
-                found.append(StreamDecl(key, bits))
-            return tuple(found)
-        return tuple(StreamDecl(word, 16) for word in self.words(node) if self.name(word, "a stream"))
+    def streams(self, node: Node | None) -> Iterator[StreamDecl]:
+        if not isinstance(node, Mapping):
+            yield from (StreamDecl(word) for word in self.words(node) if self.name(word, "a stream"))
+            return
+        for key, value in self.named(node, "a stream"):
+            entries = self.mapping(value, "stream", f"the stream `{key.text}`")
+            bits = self.values(entries, "stream").get("bits", 16)
+            if bits not in (16, 32):
+                place = entries["bits"][1].span
+                self.reporter.error("PD110", "`bits` must be 16 or 32", place, "neither of them")
+            yield StreamDecl(key, bits)
 
     def kernel(self, key: Scalar, node: Node) -> KernelDecl | None:
         """Rows of weights, a shape with its radius, or a mapping with one of them and `edges`."""
         if isinstance(node, Scalar) and not node.text[:1].isdigit():
             shape = self.line(node)
             return KernelDecl(key, (), False, shape) if shape else None
+        wrap = False
         if isinstance(node, Mapping):
             entries = self.mapping(node, "kernel", f"the kernel `{key.text}`")
-            wrap = self.choice(entries, "edges", ("nothing", "wrap")) == "wrap"
-            if "shape" in entries and "rows" not in entries:
-                shape = self.entry_line(entries, "shape")
-                return KernelDecl(key, (), wrap, shape) if shape else None
+            values = self.values(entries, "kernel")
+            wrap = values.get("edges") == "wrap"
             if len({"shape", "rows"} & entries.keys()) != 1:
                 both = "rows" in entries
                 self.reporter.error(
@@ -261,105 +173,123 @@ class _PackReader(Reader):
                     helps=["`rows`: rows of integer weights; or `shape`: a shape and its radius, such as `disc(3)`"],
                 )  # fmt: skip
                 return None
-            rows = kernel_rows(self, key, entries["rows"][1])
-        else:
-            wrap, rows = False, kernel_rows(self, key, node)
+            if "shape" in entries:
+                return KernelDecl(key, (), wrap, values["shape"]) if "shape" in values else None
+            node = entries["rows"][1]
+        rows = self.kernel_rows(key, node)
         return KernelDecl(key, rows, wrap) if rows else None
+
+    def kernel_rows(self, key: Scalar, node: Node) -> tuple[tuple[int, ...], ...] | None:
+        """Rows of weights with a cell in the middle; reports what they lack."""
+        words = self.words(node)
+        if not words:
+            self.shape(node, "rows of weights", 'write ["1 1 1", "1 0 1", "1 1 1"]')
+            return None
+        rows = [word.text.split() for word in words]
+        faults = (
+            (word.span, _row_fault(row, len(rows[0]), key.text))
+            for word, row in zip(words, rows, strict=True)
+        )
+        wrong = [(span, fault) for span, fault in faults if fault]
+        if not wrong and (len(rows) > MAX_WEIGHTS or len(rows) % 2 == 0):
+            fault = "has no middle" if len(rows) <= MAX_WEIGHTS else "is too high"
+            label = f"{len(rows)} rows" + (" are an even number" if len(rows) % 2 == 0 else "")
+            fix = f"write an odd number of rows, at most {MAX_WEIGHTS}, the cell's own in the middle"
+            wrong = [(key.span, (f"kernel `{key.text}` {fault}", label, fix))]
+        for span, (message, label, fix) in wrong[:1]:
+            self.reporter.error("PD110", message, span, label, helps=[fix])
+        return None if wrong else tuple(tuple(int(weight) for weight in row) for row in rows)
 
     def element(self, key: Scalar, node: Node) -> ElementDecl:
         entries = self.mapping(node, "element", f"the element `{key.text}`")
-        glyph = self.scalar(entries, "glyph")
-        if glyph is not None and not (
-            len(glyph.text) == 1 and "!" <= glyph.text <= "~" and glyph.text != "?"
-        ):
+        values = self.values(entries, "element")
+        glyph = values.get("glyph")
+        if glyph is not None and not (re.fullmatch(r"[!-~]", glyph.text) and glyph.text != "?"):
             self.reporter.error(
-                "PD110",
-                f"`{glyph.text}` is not a glyph",
-                glyph.span,
-                "expected one printable ASCII character, not `?`",
+                "PD110", f"`{glyph.text}` is not a glyph", glyph.span, "expected one printable ASCII character, not `?`",
                 helps=['quote it: glyph: "#"'],
-            )
+            )  # fmt: skip
             glyph = None
-        return ElementDecl(
-            key,
-            self.number(entries, "id", 0, 255),
-            self.scalar(entries, "id"),
-            color_of(self, entries, "color") or "#000000",
-            glyph.text if glyph else "",
-            self.text(entries, "about"),
-            self.words(entries.get("tags", (None, None))[1]),
-            self.open_values(entries, "element"),
-            self.choice(entries, "override", ("yes", "no", "true", "false")) in ("yes", "true"),
-            ramp=read_ramp(self, entries, f"`{key.text}`"),
-        )
+        values["color"] = self.color(values, "color") or ElementDecl.color
+        values["glyph"] = glyph.text if glyph else ""
+        return ElementDecl(key, id_scalar=self.scalar(entries, "id"), **self.with_ramp(key, entries, values))
 
     def also(self, key: Scalar, node: Node) -> AlsoDecl:
-        if isinstance(node, (Sequence, Scalar)):
-            return AlsoDecl(key, self.words(node), ())
+        if not isinstance(node, Mapping):
+            return AlsoDecl(key, self.words(node))
         entries = self.mapping(node, "also", f"`{key.text}`")
-        tags, values = self.words(entries.get("tags", (None, None))[1]), self.open_values(entries, "also")
-        return AlsoDecl(key, tags, values, read_ramp(self, entries, f"`{key.text}`"))
+        return AlsoDecl(key, **self.with_ramp(key, entries, self.values(entries, "also")))
+
+    def with_ramp(self, element: Scalar, entries: Entries, values: dict[str, Any]) -> dict[str, Any]:
+        """The values with the ramp that `color_by` describes; without one if something is wrong with it."""
+        node = values.pop("color_by", None)
+        if node is None:
+            return values
+        found = self.read(node, "color_by", f"`color_by` of `{element.text}`")
+        start, end = self.color(found, "from"), self.color(found, "to")
+        if end is None or "field" not in found:
+            return values
+        key = entries["color_by"][0]
+        return values | {"ramp": RampDecl(key, found["field"], start, end, found.get("over"))}
+
+    def color(self, values: dict[str, Any], key: str) -> str | None:
+        """The color under a key, ``#RRGGBB``; None where there is none, which is reported if it should be one."""
+        color = values.get(key)
+        if color is None or re.fullmatch(r"#[0-9A-Fa-f]{6}", color.text):
+            return color.text.upper() if color else None
+        self.reporter.error(
+            "PD110", f"`{color.text}` is not a color", color.span, 'expected "#RRGGBB"',
+            helps=[f'six hexadecimal digits in quotes: {key}: "#RRGGBB"'],
+        )  # fmt: skip
+        return None
+
+    # Passes
 
     def pass_(self, key: Scalar, node: Node) -> PassDecl:
         entries = self.mapping(node, "pass", f"the pass `{key.text}`")
-        scratch = []
-        for name, value in self.named(entries.get("scratch", (None, None))[1], "a scratch field"):
-            scratch.append(TypedDecl(name, self.line(value), None))
+        values = self.values(entries, "pass")
+        scratch = self.named(values.get("scratch"), "a scratch field")
         return PassDecl(
             key,
-            self.text(entries, "about"),
-            self.words(entries.get("after", (None, None))[1]),
-            self.words(entries.get("before", (None, None))[1]),
-            tuple(scratch),
-            self.block(entries, node),
+            self.block(entries, values, node),
+            values.get("about", ""),
+            values.get("after", ()),
+            values.get("before", ()),
+            tuple(TypedDecl(name, type=self.line(value)) for name, value in scratch),
         )
 
-    def block(self, entries: dict[str, tuple[Scalar, Node]], node: Node) -> Block:
-        lets = []
-        for name, value in self.named(entries.get("let", (None, None))[1], "a value"):
-            if line := self.line(value):
-                lets.append((name, line))
-        actions = [
-            (key, value)
-            for key, value in entries.values()
-            if key.text == "do" or key.text.startswith(("for ", "repeat "))
-        ]
+    def block(self, entries: Entries, values: dict[str, Any], node: Node) -> Block:
+        lets = self.named(values.get("let"), "a value")
+        actions = [entry for key, entry in entries.items() if key.startswith(("do", "for ", "repeat "))]
         if len(actions) > 1:
             self.reporter.error(
-                "PD107",
-                "a block with two actions",
-                actions[1][0].span,
-                "the second one",
+                "PD107", "a block with two actions", actions[1][0].span, "the second one",
                 secondary=[Label(actions[0][0].span, "the first one")],
                 helps=["put what comes next under `then:`"],
-            )
+            )  # fmt: skip
         header = None
         rules: tuple[Syntax, ...] = ()
         blocks: tuple[Block, ...] = ()
+        then: tuple[Block, ...] = ()
         if actions:
             key, body = actions[0]
-            if key.text != "do":
-                header = parse_scalar(key, "header", self.reporter)
+            header = self.line(key, "header") if key.text != "do" else None
             rules, blocks = self.body(body)
         elif "then" not in entries and isinstance(node, Mapping) and len(entries) == len(node.entries):
             self.reporter.error(
-                "PD109",
-                "a block that does nothing",
-                first_line(node),
-                "it lacks `do:`, `for …:` or `repeat …:`",
+                "PD109", "a block that does nothing", first_line(node), "it lacks `do:`, `for …:` or `repeat …:`",
                 helps=["put the rules under `do:`"],
-            )
-        then: tuple[Block, ...] = ()
+            )  # fmt: skip
         if "then" in entries:
             then_rules, then_blocks = self.body(entries["then"][1])
-            then = (Block((), None, then_rules, (), None, None, ()),) if then_rules else then_blocks
+            then = (Block(rules=then_rules),) if then_rules else then_blocks
         return Block(
-            tuple(lets),
+            tuple((name, line) for name, value in lets if (line := self.line(value))),
             header,
             rules,
             blocks,
-            self.choice(entries, "symmetry", ("mirror", "rotations", "all")),
-            self.choice(entries, "conflicts", ("drop_both", "first_wins")),
+            values.get("symmetry"),
+            values.get("conflicts"),
             then,
         )
 
@@ -367,115 +297,104 @@ class _PackReader(Reader):
         """A rule or a list of rules (one substep), or a block or a list of blocks (one after the other)."""
         items = node.items if isinstance(node, Sequence) else (node,)
         if not items or (isinstance(node, Scalar) and not node.text):
+            helps = ["write rules, or leave the key out"]
             self.reporter.error(
-                "PD109", "a place for rules without any", node.span, "nothing here", helps=["write rules, or leave the key out"]
+                "PD109", "a place for rules without any", node.span, "nothing here", helps=helps
+            )
+            return (), ()
+        other = next(
+            (one for one in items if isinstance(one, Mapping) != isinstance(items[0], Mapping)), None
+        )
+        if other is not None:
+            self.reporter.error(
+                "PD204", "rules and blocks in one list", first_line(other), "not of the kind of the first item",
+                notes=["a list of rules is one substep; a list of blocks happens one after the other"],
+                helps=["put each group of rules under a `- do:` of its own; quote a rule that has `: ` in it"],
             )  # fmt: skip
             return (), ()
-        kinds = {isinstance(item, Mapping) for item in items}
-        if len(kinds) > 1:
-            first = next(item for item in items if isinstance(item, Mapping) != isinstance(items[0], Mapping))
-            self.reporter.error(
-                "PD204",
-                "rules and blocks in one list",
-                first_line(first),
-                "not of the kind of the first item",
-                notes=["a list of rules is one substep; a list of blocks happens one after the other"],
-                helps=[
-                    "put each group of rules under a `- do:` of its own; quote a rule that has `: ` in it"
-                ],
-            )
-            return (), ()
-        if True in kinds:
-            return (), tuple(self.block(self.mapping(item, "block", "a block"), item) for item in items)
-        return tuple(rule for item in items if (rule := self.line(item, "rule"))), ()
+        if isinstance(items[0], Mapping):
+            entries = [self.mapping(item, "block", "a block") for item in items]
+            return (), tuple(map(self.block, entries, (self.values(one, "block") for one in entries), items))
+        return self.lines(node, "rule"), ()
 
-    def test(self, node: Node) -> TestDecl | None:
-        if not isinstance(node, Mapping) or len(node.entries) != 1:
-            self.shape(node, "a test: `- what it shows:` with its keys indented below")
-            return None
-        name, body = node.entries[0]
-        entries = self.mapping(body, "test", f"the test `{name.text}`")
-        legend = []
-        legend_node = entries.get("legend", (None, None))[1]
-        if isinstance(legend_node, Mapping):
-            legend = [(key, value) for key, value in legend_node.entries if isinstance(value, Scalar)]
+    # Tests
+
+    def tests(self, node: Node | None) -> Iterator[TestDecl]:
+        if isinstance(node, Sequence):
+            for item in node.items:
+                if isinstance(item, Mapping) and len(item.entries) == 1:
+                    yield self.test(*item.entries[0])
+                else:
+                    self.shape(item, "a test: `- what it shows:` with its keys indented below")
+        elif node is not None:
+            self.shape(node, "a list")
+
+    def test(self, name: Scalar, node: Node) -> TestDecl:
+        entries = self.mapping(node, "test", f"the test `{name.text}`")
+        values = self.values(entries, "test")
         after = self.scalar(entries, "after")
-        steps = 1
-        if after is not None:
-            match = re.fullmatch(r"([0-9]{1,5}) steps?", after.text.strip())
-            if match:
-                steps = int(match[1])
-            else:
-                self.reporter.error(
-                    "PD110",
-                    "`after` says how many steps",
-                    after.span,
-                    "not a number of steps",
-                    helps=["write `50 steps`"],
-                )
-        always = entries.get("always", (None, None))[1]
-        lines = (
-            ()
-            if always is None
-            else tuple(
-                line
-                for item in (always.items if isinstance(always, Sequence) else (always,))
-                if (line := self.line(item))
+        steps = re.fullmatch(r"([0-9]{1,5}) steps?", after.text.strip() if after else "1 step")
+        if after and not steps:
+            helps = ["write `50 steps`"]
+            self.reporter.error(
+                "PD110", "`after` says how many steps", after.span, "not a number of steps", helps=helps
             )
-        )
+        field = "a mapping with an entry for each field", "write `FIELD: …`, each on a line of its own"
+        drawing = "a drawing of `{}`", "write a word a cell, a row a line, below `|`"
         return TestDecl(
-            name.text,
             name,
             self.scalar(entries, "given"),
-            tuple(legend),
-            steps,
+            self.scalars(
+                self.pairs(values.get("legend"), "a mapping from characters to elements"), "an element"
+            ),
+            int(steps[1]) if steps else 1,
             self.scalar(entries, "expect"),
-            lines,
-            self.number(entries, "seed", 0, 2**31 - 1),
-            self.drawn(entries, "fields"),
-            self.drawn(entries, "expect_fields"),
-            self.often(entries.get("often", (None, None))[1]),
+            self.lines(values.get("always")),
+            values.get("seed"),
+            self.scalars(self.pairs(values.get("fields"), *field), *drawing),
+            self.scalars(self.pairs(values.get("expect_fields"), *field), *drawing),
+            tuple(self.often(values.get("often"))),
         )
 
-    def often(self, node: Node | None) -> tuple[tuple[Syntax, Syntax], ...]:
+    def scalars(
+        self, pairs: tuple[tuple[Scalar, Node], ...], wanted: str, help_text: str = ""
+    ) -> tuple[tuple[Scalar, Scalar], ...]:
+        """The pairs whose value is a scalar; reports the others. `{}` in `wanted` stands for the key."""
+        for key, value in pairs:
+            if not isinstance(value, Scalar):
+                self.shape(value, wanted.format(key.text), help_text)
+        return tuple((key, value) for key, value in pairs if isinstance(value, Scalar))
+
+    def often(self, node: Node | None) -> Iterator[tuple[Syntax, Syntax]]:
         """`before -> after: CHANCE`, in one mapping or a list of them."""
-        if node is None:
-            return ()
         parts = node.items if isinstance(node, Sequence) else (node,)
-        found = []
         for part in parts:
-            if not isinstance(part, Mapping):
-                self.shape(part, "a mapping from changes to chances", "write `egg -> hen: 2%`")
-                continue
-            for key, value in part.entries:
+            for key, value in self.pairs(part, "a mapping from changes to chances", "write `egg -> hen: 2%`"):
                 change, chance = self.line(key, "rule"), self.line(value)
                 if change is None or chance is None:
                     continue
                 if change.kind == "transform" and len(change.children) == 2:
-                    found.append((change, chance))
+                    yield change, chance
                     continue
                 self.reporter.error(
                     "PD110", "`often` says what becomes of cells", key.span, "not of the form `A -> B`",
                     helps=["write what holds in a cell before and after: `egg -> hen: 2%`"],
                 )  # fmt: skip
-        return tuple(found)
 
-    def drawn(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> tuple[tuple[Scalar, Scalar], ...]:
-        """Drawings by a field's name."""
-        node = entries.get(key, (None, None))[1]
-        if node is None:
-            return ()
-        if not isinstance(node, Mapping):
-            self.shape(
-                node, "a mapping with an entry for each field", "write `FIELD: …`, each on a line of its own"
-            )
-            return ()
-        found = []
-        for name, value in node.entries:
-            if isinstance(value, Scalar):
-                found.append((name, value))
-            else:
-                self.shape(
-                    value, f"a drawing of `{name.text}`", "write a word a cell, a row a line, below `|`"
-                )
-        return tuple(found)
+
+def _row_fault(row: list[str], width: int, kernel: str) -> tuple[str, str, str] | None:
+    """What is wrong with a row of weights: a message, a label, a fix. `width` is that of the first row."""
+    count = len(row)
+    if not row or not all(re.fullmatch(r"-?[0-9]{1,3}", weight) for weight in row):
+        fix = 'write "1 0 1", numbers up to 999 with blanks between them'
+        return "a kernel row that is not integers", "not a row of weights", fix
+    if count > MAX_WEIGHTS:
+        label = f"{count} weights: a kernel reaches {MAX_RADIUS} cells to each side"
+        return "a kernel that is too wide", label, f"write at most {MAX_WEIGHTS}"
+    if count % 2 == 0:
+        fix = "write an odd number of weights, the cell's own in the middle"
+        return f"kernel `{kernel}` has no middle", f"{count} weights are an even number", fix
+    if count != width:
+        label = f"{count} weights, the first row has {width}"
+        return "the rows of a kernel are equally long", label, f"write {width} weights here too"
+    return None

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-from powderdsl.diagnostics import Label, suggest
-from powderdsl.model.composition.compose import Composition, needed_first
+from powderdsl.diagnostics import Label, Span
+from powderdsl.model.composition.contested import report_replaced
+from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import RampDecl
 from powderdsl.model.expressions.literals import read_bounds
 from powderdsl.model.expressions.operands import Poisoned
@@ -19,38 +18,27 @@ ORDERED = ("int", "flag", "real")
 def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
     """The ramps by global names of elements. Of several for one element the last holds. Reports what is wrong."""
     composition = typer.symbols.composition
-    holding: dict[str, tuple[str, RampDecl]] = {}
+    places: dict[str, tuple[str, Span]] = {}
     found: dict[str, ColorRamp] = {}
-    for pack, name, decl in _written(composition):
-        element = composition.elements.get(name)
-        field = _field(pack, decl, typer)
-        if element is None or field is None or not _shows(field, element, decl, typer):
+    for pack, name, entry in composition.entries():
+        element, decl = composition.elements.get(name), entry.ramp
+        field = _field(pack, decl, typer) if decl else None
+        if decl is None or element is None or field is None or not _shows(field, element, decl, typer):
             continue
         ramp = _ramp(field, element, decl, typer)
         if ramp is None:
             continue
-        if name in holding and found[name] != ramp:
-            _report_contested(name, holding[name], (pack, decl), typer)
-        holding[name], found[name] = (pack, decl), ramp
+        here = pack, decl.key.span
+        if name in found and found[name] != ramp:
+            report_replaced("color_by", name, places[name], here, composition, typer.reporter)
+        places[name], found[name] = here, ramp
     return found
-
-
-def _written(composition: Composition) -> Iterator[tuple[str, str, RampDecl]]:
-    """Every ramp with its pack and its element, in rising precedence: the order of `contested.given_values`."""
-    for name, named in composition.element_decls.items():
-        if named.decl.ramp is not None:
-            yield named.pack, name, named.decl.ramp
-    for pack in needed_first(composition.packs):
-        for also in pack.also:
-            word = also.element.text.removesuffix("?")
-            if also.ramp is not None:
-                yield pack.name.text, composition.element(word, pack.name.text) or word, also.ramp
 
 
 def _field(pack: str, decl: RampDecl, typer: Typer) -> Field | None:
     """The field that a ramp follows; None where its pack is absent, or after reporting that there is none."""
     symbols, composition = typer.symbols, typer.symbols.composition
-    word = decl.field.text.removesuffix("?")
+    word = decl.field.word
     owner, _, base = word.rpartition(".")
     name = (composition.names.qualified(owner, base) if owner else None) or composition.names.of(pack, word)
     if name in composition.fields:
@@ -60,11 +48,8 @@ def _field(pack: str, decl: RampDecl, typer: Typer) -> Field | None:
             "PD401", f"`{word}` is a property", decl.field.span, "a color follows a field",
             helps=["a property is the same in all cells of an element: choose its `color` accordingly, or declare a field"],
         )  # fmt: skip
-    elif not decl.field.text.endswith("?"):
-        typer.reporter.error(
-            "PD301", f"unknown field `{word}`", decl.field.span, "no loaded pack declares it",
-            helps=[*suggest(word, symbols.fields, "fields"), f"if its pack may be absent, write `{word}?`"],
-        )  # fmt: skip
+    elif not decl.field.is_optional:
+        report_unknown("field", decl.field, symbols.fields, typer.reporter)
     return None
 
 
@@ -115,21 +100,3 @@ def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> Color
         )  # fmt: skip
         return None
     return ColorRamp(field.name, decl.start or element.color, decl.end, lo, hi, kind.name == "real")
-
-
-def _report_contested(
-    name: str, lost: tuple[str, RampDecl], held: tuple[str, RampDecl], typer: Typer
-) -> None:
-    """Report a ramp in whose place another one comes: a note where a pack means to, a warning where none can."""
-    (before, old), (after, new) = lost, held
-    if before in typer.symbols.composition.names.needs[after]:
-        typer.reporter.report(
-            "PD317", f"`{after}` replaces the `color_by` of `{name}`", new.key.span, "this one holds",
-            secondary=[Label(old.key.span, f"the one that `{before}` gives")],
-        )  # fmt: skip
-        return
-    typer.reporter.report(
-        "PD316", f"packs `{before}` and `{after}` give `{name}` a different `color_by`", new.key.span, "this one holds",
-        secondary=[Label(old.key.span, "this one is lost")],
-        helps=[f"say `needs: {before}` in `{after}` if it means to replace it", "or remove one of them"],
-    )  # fmt: skip

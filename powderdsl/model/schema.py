@@ -7,9 +7,13 @@ from collections.abc import Iterator
 from collections.abc import Mapping as Mapping_
 from dataclasses import dataclass
 from difflib import get_close_matches
+from typing import Any
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.diagnostics.printable import look_alikes, shown_character, spelled
+from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
+from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
 
 
@@ -17,20 +21,31 @@ from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
 class Key:
     """A key: one line for the docs, whether it must be there, and the shape of its value.
 
-    Shapes: ``text word words number flag mapping list line lines statements block any``.
+    Shapes: ``text word words number flag mapping list line lines statements block any``. A word may have to be one of
+    some `options`; a number lies within `bounds`.
     """
 
     shape: str
     about: str
     required: bool = False
+    options: tuple[str, ...] = ()
+    bounds: tuple[int, int] = (0, 0)
 
 
 _BLOCK = {
     "let": Key("mapping", "names for values, fixed here, in order, before the rules run"),
     "do": Key("block", "a rule, a list of rules (one substep), or blocks in sequence"),
     "then": Key("block", "what comes after: a rule, a list of rules (one substep), or blocks in sequence"),
-    "symmetry": Key("word", "`mirror`, `rotations` or `all`: the rules hold in these orientations at once"),
-    "conflicts": Key("word", "`drop_both` or `first_wins`: what happens when rules claim one cell"),
+    "symmetry": Key(
+        "word",
+        "`mirror`, `rotations` or `all`: the rules hold in these orientations at once",
+        options=("mirror", "rotations", "all"),
+    ),
+    "conflicts": Key(
+        "word",
+        "`drop_both` or `first_wins`: what happens when rules claim one cell",
+        options=("drop_both", "first_wins"),
+    ),
 }
 
 KEYS: dict[str, dict[str, Key]] = {
@@ -44,7 +59,11 @@ KEYS: dict[str, dict[str, Key]] = {
         "fields": Key("mapping", "state that cells carry"),
         "streams": Key("any", "sources of random numbers that rules share by name"),
         "params": Key("mapping", "numbers that users override without editing the file"),
-        "side_multiple": Key("number", "rows and columns of all worlds are multiples of this number"),
+        "side_multiple": Key(
+            "number",
+            "rows and columns of all worlds are multiples of this number",
+            bounds=(1, MAX_SIDE_MULTIPLE),
+        ),
         "kernels": Key("mapping", "neighborhoods for `count` and `sum`"),
         "sets": Key("mapping", "names for sets of elements"),
         "elements": Key("mapping", "the pack's elements"),
@@ -59,7 +78,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "extends": Key("word", "a ruleset that this one takes over, with all that it says"),
         "packs": Key("words", "the packs it is made of, besides those of the ruleset that it extends"),
         "without": Key("words", "packs of the ruleset that it extends, which are left out"),
-        "slots": Key("number", "how many element ids there are, vacant ones included"),
+        "slots": Key("number", "how many element ids there are, vacant ones included", bounds=(1, 256)),
         "matrix": Key("words", "the channels of `World.matrix()`"),
         "rename": Key("mapping", "other names for what packs define: `pack.word: name`"),
         "params": Key("mapping", "other values for the packs' parameters"),
@@ -72,14 +91,16 @@ KEYS: dict[str, dict[str, Key]] = {
     },
     "field": {
         "type": Key("line", "its kind", True),
-        "at": Key("word", "`element`: it travels with it; `place`: it stays", True),
+        "at": Key(
+            "word", "`element`: it travels with it; `place`: it stays", True, options=("element", "place")
+        ),
         "default": Key("line", "its value in a fresh cell; that of one element beside it, by its name"),
         "of": Key("line", "the elements that have it; others read the default"),
-        "resets": Key("word", "`step`: back to the default when a step starts"),
+        "resets": Key("word", "`step`: back to the default when a step starts", options=("step",)),
         "about": Key("text", "what it is, in a sentence"),
     },
     "stream": {
-        "bits": Key("number", "resolution of a draw: 16 or 32"),
+        "bits": Key("number", "resolution of a draw: 16 or 32", bounds=(16, 32)),
         "about": Key("text", "what it is for"),
     },
     "param": {
@@ -90,10 +111,14 @@ KEYS: dict[str, dict[str, Key]] = {
     "kernel": {
         "rows": Key("words", "rows of integer weights, an odd number of each, at most 31"),
         "shape": Key("line", "instead of rows: a shape and its radius, `disc(3)`"),
-        "edges": Key("word", "`nothing` (the default) or `wrap`: what lies outside the grid"),
+        "edges": Key(
+            "word",
+            "`nothing` (the default) or `wrap`: what lies outside the grid",
+            options=("nothing", "wrap"),
+        ),
     },
     "element": {
-        "id": Key("number", "the number it asks for, 0 to 255; a free one otherwise"),
+        "id": Key("number", "the number it asks for, 0 to 255; a free one otherwise", bounds=(0, 255)),
         "color": Key("word", 'its color, quoted: "#RRGGBB"', True),
         "color_by": Key("mapping", "how its color follows a field"),
         "glyph": Key("word", "one character for ASCII art; the first free letter of its name otherwise"),
@@ -128,7 +153,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "expect_fields": Key("mapping", "values of fields then; `?` matches anything, `LOW..HIGH` a range"),
         "always": Key("any", "conditions that hold in every cell after every step"),
         "often": Key("any", "how likely cells become something else: `egg -> hen: 2%`"),
-        "seed": Key("number", "the seed; several are tried without one"),
+        "seed": Key("number", "the seed; several are tried without one", bounds=(0, 2**31 - 1)),
     },
 }
 
@@ -172,11 +197,18 @@ def first_line(node: Node) -> Span:
     return Span(span.source, span.start, max(min(span.end, end if end >= 0 else span.end), span.start + 1))
 
 
-def before_comment(key: Scalar) -> bool:
-    """Whether nothing but a comment stands after a key on its line."""
-    text = key.span.source.text
-    end = text.find("\n", key.span.end)
-    return text[key.span.end : end if end >= 0 else len(text)].lstrip(": ").startswith("#")
+def comment_after(scalar: Scalar) -> Span | None:
+    """What YAML takes for a comment behind a key or a value on its line."""
+    text, start = scalar.span.source.text, scalar.span.end
+    end = text.find("\n", start)
+    rest = text[start : end if end >= 0 else len(text)]
+    if not rest.lstrip(": \t").startswith("#"):
+        return None
+    return Span(scalar.span.source, start + rest.index("#"), start + len(rest.rstrip()))
+
+
+Entries = dict[str, tuple[Scalar, Node]]
+"""The entries of a mapping by key: the key as it stands in the file, and what it has."""
 
 
 class Reader:
@@ -189,52 +221,82 @@ class Reader:
     def shape(self, node: Node, wanted: str, help_text: str = "") -> None:
         """Report a node of the wrong shape."""
         found = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
+        helps = [help_text] if help_text else []
         self.reporter.error(
-            "PD107",
-            f"expected {wanted}, found {found}",
-            first_line(node),
-            f"this is {found}",
-            helps=[help_text] if help_text else [],
+            "PD107", f"expected {wanted}, found {found}", first_line(node), f"this is {found}", helps=helps
         )
 
-    def mapping(self, node: Node, context: str, what: str) -> dict[str, tuple[Scalar, Node]]:
+    def read(self, node: Node, context: str, what: str) -> dict[str, Any]:
+        """The values of a mapping by key. What is absent, or wrong and reported, is left out."""
+        return self.values(self.mapping(node, context, what), context)
+
+    def values(self, entries: Entries, context: str) -> dict[str, Any]:
+        """The values of entries, each read as the table says; those of keys that the table leaves open as `values`."""
+        table = self.keys[context]
+        found = {key: self._value(entries, key, table[key]) for key in entries if key in table}
+        if context in OPEN:
+            others = [entry for key, entry in entries.items() if key not in table]
+            found["values"] = tuple((key, line) for key, node in others if (line := self.line(node)))
+        return {key: value for key, value in found.items() if value is not None}
+
+    def _value(self, entries: Entries, key: str, row: Key) -> Any:
+        node = entries[key][1]
+        match row.shape:
+            case "text":
+                return self.text(entries, key)
+            case "word":
+                return self.choice(entries, key, row.options) if row.options else self.scalar(entries, key)
+            case "words":
+                return self.words(node)
+            case "number":
+                return self.number(entries, key, *row.bounds)
+            case "flag":
+                return self.choice(entries, key, ("yes", "no", "true", "false")) in ("yes", "true")
+            case "line":
+                return self.line(node) if isinstance(node, Scalar) else None
+            case "statements":
+                return self.lines(node, "invariant")
+        return node
+
+    def line(self, node: Node, start: str = "expression") -> Syntax | None:
+        """The syntax of a single line; `start` is the grammar's rule for it."""
+        if isinstance(node, Scalar):
+            return parse_scalar(node, start, self.reporter)
+        self.shape(node, "one line")
+        return None
+
+    def lines(self, node: Node | None, start: str = "expression") -> tuple[Syntax, ...]:
+        """A line, or a list of lines."""
+        items = () if node is None else node.items if isinstance(node, Sequence) else (node,)
+        return tuple(line for item in items if (line := self.line(item, start)))
+
+    def mapping(self, node: Node, context: str, what: str) -> Entries:
         """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""
+        known = self.keys[context]
+        prefixes = PREFIXES.get(context, ())
         if not isinstance(node, Mapping):
-            fix = "known keys: " + ", ".join(self.keys[context])
-            if isinstance(node, Scalar) and node.text:
-                fix = "a key ends with `:`" if node.text.startswith(PREFIXES.get(context, ("\0",))) else fix
+            fix = "known keys: " + ", ".join(known)
+            if isinstance(node, Scalar) and node.text.startswith(prefixes):
+                fix = "a key ends with `:`"
             self.shape(node, f"a mapping with the keys of {what}", fix)
             return {}
-        known = self.keys[context]
         missing = {name for name, row in known.items() if row.required and node.get(name) is None}
-        entries: dict[str, tuple[Scalar, Node]] = {}
+        entries: Entries = {}
         for key, value in node.entries:
-            prefixed = key.text.startswith(PREFIXES.get(context, ())) and bool(PREFIXES.get(context))
-            misspelled = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
             row = known.get(key.text)
-            empty = isinstance(value, Scalar) and value.style == "plain" and not value.text
-            if row and isinstance(value, Scalar) and empty and (row.required or row.shape in VALUES):
-                self._no_value(key, value, row)
-            elif (
-                row and empty and row.shape in SECTIONS and not (row.shape == "text" and before_comment(key))
-            ):
-                self.reporter.report(
-                    "PD113", f"`{key.text}` is empty", key.span, "nothing stands after it",
-                    helps=[f"`{key.text}`: {row.about}", "remove it, or indent what belongs to it"],
-                )  # fmt: skip
-            elif row or prefixed or (context in OPEN and not misspelled):
-                entries[key.text] = (key, value)
-                if row:
+            misspelled = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
+            if row is not None:
+                if not self._is_empty(key, value, row):
+                    entries[key.text] = (key, value)
                     self._check_shape(row, key, value)
+            elif key.text.startswith(prefixes) or (context in OPEN and not misspelled):
+                entries[key.text] = (key, value)
             else:
                 missing -= set(misspelled)  # a key that is there under a wrong name is one mistake
                 self.reporter.error(
-                    "PD108",
-                    f"unknown key `{key.text}`",
-                    key.span,
-                    f"not a key of {what}",
+                    "PD108", f"unknown key `{key.text}`", key.span, f"not a key of {what}",
                     helps=self._key_help(key.text, context, what),
-                )
+                )  # fmt: skip
         for name in sorted(missing):
             start = node.span.start
             self.reporter.error(
@@ -243,34 +305,34 @@ class Reader:
             )  # fmt: skip
         return entries
 
-    def _no_value(self, key: Scalar, value: Scalar, row: Key) -> None:
-        """Report a key without a value, or one whose value YAML takes for a comment."""
-        text = value.span.source.text
-        end = text.find("\n", key.span.end)
-        line = text[key.span.end : end if end >= 0 else len(text)]
-        if line.lstrip(": ").startswith("#"):
-            start = key.span.end + line.index("#")
-            comment = Span(key.span.source, start, key.span.end + len(line.rstrip()))
-            fix = f'put quotes around it: {key.text}: "{comment.text}"'
-            self.reporter.error(
-                "PD109", f"`{key.text}` has no value", comment, "a comment, to YAML", helps=[fix]
-            )
-            return
-        fix = f"`{key.text}`: {row.about}"
-        self.reporter.error(
-            "PD109", f"`{key.text}` has no value", key.span, "nothing stands after it", helps=[fix]
-        )
+    def _is_empty(self, key: Scalar, value: Node, row: Key) -> bool:
+        """Whether a key has no value where it needs one, which is reported: YAML may take the value for a comment."""
+        if not isinstance(value, Scalar) or value.style != "plain" or value.text:
+            return False
+        comment = comment_after(key)
+        if row.required or row.shape in VALUES:
+            place, label, fix = key.span, "nothing stands after it", f"`{key.text}`: {row.about}"
+            if comment:
+                place, label = comment, "a comment, to YAML"
+                fix = f'put quotes around it: {key.text}: "{comment.text}"'
+            self.reporter.error("PD109", f"`{key.text}` has no value", place, label, helps=[fix])
+            return True
+        if row.shape not in SECTIONS or (row.shape == "text" and comment):
+            return False
+        self.reporter.report(
+            "PD113", f"`{key.text}` is empty", key.span, "nothing stands after it",
+            helps=[f"`{key.text}`: {row.about}", "remove it, or indent what belongs to it"],
+        )  # fmt: skip
+        return True
 
     def _key_help(self, word: str, context: str, what: str) -> tuple[str, ...]:
         """The fix for an unknown key: what it should be called, where it belongs, or that it is a rule."""
         if any(sign in word for sign in ("->", ":=", " swaps ", " moves ", "swap ")):
             return ("YAML takes text before `: ` for a key: quote the rule",)
-        if word in ("repeat", "for") and PREFIXES.get(context):
-            return (
-                "say how often: `repeat 3:`"
-                if word == "repeat"
-                else "say over what: `for side in (left, right):`",
-            )
+        if context in PREFIXES and word == "repeat":
+            return ("say how often: `repeat 3:`",)
+        if context in PREFIXES and word == "for":
+            return ("say over what: `for side in (left, right):`",)
         if word in _MEANT and _MEANT[word] in self.keys[context]:
             return (f"did you mean `{_MEANT[word]}`?",)
         close = suggest(word, self.keys[context], f"keys of {what}")
@@ -283,102 +345,84 @@ class Reader:
         return close or ("known keys: " + ", ".join(self.keys[context]),)
 
     def _check_shape(self, row: Key, key: Scalar, value: Node) -> None:
-        wants_scalar = row.shape in ("text", "word", "number", "flag", "line")
-        if wants_scalar and not isinstance(value, Scalar):
+        if row.shape in ("text", *VALUES) and not isinstance(value, Scalar):
             is_set = row.shape == "line" and isinstance(value, Sequence)
             fix = "a set is written `(a, b)`" if is_set else f"`{key.text}`: {row.about}"
             self.shape(value, f"a single value for `{key.text}`", fix)
 
     def named(self, node: Node | None, what: str) -> Iterator[tuple[Scalar, Node]]:
         """Entries of a mapping whose keys are new names; bad names are reported and left out."""
-        if node is None or (isinstance(node, Scalar) and node.text == ""):
+        if isinstance(node, Scalar) and node.text == "":
             return
-        if not isinstance(node, Mapping):
-            noun = what.split(" ", 1)[-1]
-            self.shape(
-                node, f"a mapping with an entry for each {noun}", "write `NAME: …`, each on a line of its own"
-            )
-            return
-        for key, value in node.entries:
+        wanted = f"a mapping with an entry for each {what.split(' ', 1)[-1]}"
+        for key, value in self.pairs(node, wanted, "write `NAME: …`, each on a line of its own"):
             if self.name(key, what):
                 yield key, value
 
+    def pairs(self, node: Node | None, wanted: str, help_text: str = "") -> tuple[tuple[Scalar, Node], ...]:
+        """Entries of a mapping, none where there is no node; reports another shape."""
+        if isinstance(node, Mapping):
+            return node.entries
+        if node is not None:
+            self.shape(node, wanted, help_text)
+        return ()
+
     def name(self, key: Scalar, what: str) -> bool:
         """Whether a scalar can be a name; reports if not."""
-        if NAME.match(key.text) and len(key.text) <= MAX_NAME:
+        word = key.text[:MAX_NAME]
+        if NAME.match(key.text) and word == key.text:
             return True
         odd = look_alikes(key.text)
         if odd:
-            listed = ", ".join(shown_character(char) for char in odd)
-            self.reporter.error(
-                "PD111", f"`{spelled(key.text[:MAX_NAME])}` cannot name {what}", key.span,
-                "not all of it is plain ASCII", helps=[f"type these again: {listed}"],
-            )  # fmt: skip
-            return False
-        clean = re.sub(r"[^A-Za-z0-9_]+", "_", key.text).strip("_")[:MAX_NAME]
-        helps = [f"write `{clean}`"] if NAME.match(clean) else []
-        self.reporter.error(
-            "PD111",
-            f"`{key.text[:MAX_NAME]}` cannot name {what}",
-            key.span,
-            "letters, digits and `_`, a letter first",
-            helps=helps,
-        )
+            word, label = spelled(word), "not all of it is plain ASCII"
+            helps = ["type these again: " + ", ".join(shown_character(char) for char in odd)]
+        else:
+            label = "letters, digits and `_`, a letter first"
+            clean = re.sub(r"[^A-Za-z0-9_]+", "_", key.text).strip("_")[:MAX_NAME]
+            helps = [f"write `{clean}`"] if NAME.match(clean) else []
+        self.reporter.error("PD111", f"`{word}` cannot name {what}", key.span, label, helps=helps)
         return False
 
     def words(self, node: Node | None) -> tuple[Scalar, ...]:
         """A word or a list of words."""
         if node is None or (isinstance(node, Scalar) and node.text == ""):
             return ()
-        if isinstance(node, Scalar):
-            return (node,)
-        if isinstance(node, Sequence):
-            for item in node.items:
-                if not isinstance(item, Scalar):
-                    self.shape(item, "a word")
-            return tuple(item for item in node.items if isinstance(item, Scalar))
-        self.shape(node, "a word or a list of words")
-        return ()
+        if isinstance(node, Mapping):
+            self.shape(node, "a word or a list of words")
+            return ()
+        items = node.items if isinstance(node, Sequence) else (node,)
+        for item in items:
+            if not isinstance(item, Scalar):
+                self.shape(item, "a word")
+        return tuple(item for item in items if isinstance(item, Scalar))
 
-    def scalar(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> Scalar | None:
+    def scalar(self, entries: Entries, key: str) -> Scalar | None:
         value = entries.get(key, (None, None))[1]
         return value if isinstance(value, Scalar) else None
 
-    def text(self, entries: dict[str, tuple[Scalar, Node]], key: str) -> str:
+    def text(self, entries: Entries, key: str) -> str:
         value = self.scalar(entries, key)
         return " ".join(value.text.split()) if value else ""
 
-    def number(self, entries: dict[str, tuple[Scalar, Node]], key: str, lo: int, hi: int) -> int | None:
-        """A whole decimal number within bounds."""
+    def number(self, entries: Entries, key: str, lo: int, hi: int) -> int | None:
+        """A decimal integer within bounds."""
         value = self.scalar(entries, key)
         if value is None:
             return None
         if not re.fullmatch(r"-?(0|[1-9][0-9]*)", value.text):
-            self.reporter.error(
-                "PD110", f"`{key}` must be an integer", value.span, "not an integer",
-                helps=[f"write a number from {lo} to {hi}"],
-            )  # fmt: skip
-            return None
-        if len(value.text) > 12 or not lo <= int(value.text) <= hi:
-            self.reporter.error(
-                "PD402", f"`{key}` must lie in {lo}..{hi}", value.span, "out of range",
-                helps=[f"write a number from {lo} to {hi}"],
-            )  # fmt: skip
-            return None
-        return int(value.text)
+            code, problem, label = "PD110", f"`{key}` must be an integer", "not an integer"
+        elif len(value.text) > 12 or not lo <= int(value.text) <= hi:
+            code, problem, label = "PD402", f"`{key}` must lie in {lo}..{hi}", "out of range"
+        else:
+            return int(value.text)
+        self.reporter.error(code, problem, value.span, label, helps=[f"write a number from {lo} to {hi}"])
+        return None
 
-    def choice(
-        self, entries: dict[str, tuple[Scalar, Node]], key: str, options: tuple[str, ...]
-    ) -> str | None:
+    def choice(self, entries: Entries, key: str, options: tuple[str, ...]) -> str | None:
         value = self.scalar(entries, key)
         if value is None or value.text in options:
             return value.text if value else None
-        listed = ", ".join(f"`{option}`" for option in options)
-        self.reporter.error(
-            "PD110",
-            f"`{key}` must be one of {listed}",
-            value.span,
-            "not one of them",
-            helps=suggest(value.text, options, "one of"),
-        )
+        message = f"`{key}` must be one of " + ", ".join(f"`{option}`" for option in options)
+        helps = suggest(value.text, options, "one of")
+        self.reporter.error("PD110", message, value.span, "not one of them", helps=helps)
         return None

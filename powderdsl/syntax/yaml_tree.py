@@ -30,6 +30,16 @@ class Scalar:
     content: Span
     style: str
 
+    @property
+    def word(self) -> str:
+        """The text as a name, without the `?` of one that may be absent."""
+        return self.text.removesuffix("?")
+
+    @property
+    def is_optional(self) -> bool:
+        """Whether it is the name of something that may be absent."""
+        return self.text.endswith("?")
+
 
 @dataclass(frozen=True)
 class Sequence:

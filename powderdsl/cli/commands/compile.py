@@ -177,8 +177,8 @@ def _pack_lines(pack: PackDecl, pass_name: str | None) -> Iterator[str]:
         return
     yield f"pack {pack.name.text}  # {place_of(pack.name.span)}"
     if pass_name is None:
-        for name, syntax in pack.sets:
-            yield from _syntax_lines(f"set {name.text}", syntax, "  ")
+        for decl in pack.sets:
+            yield from _syntax_lines(f"set {decl.name.text}", decl.members, "  ")
     for one in chosen:
         yield from _pass_lines(one)
 
@@ -198,7 +198,7 @@ def _block_lines(block: Block, indent: str) -> Iterator[str]:
     if block.header is not None:
         yield from _syntax_lines("loop", block.header, indent)
         inner += "  "
-    for key, value in (("symmetry", block.symmetry), ("conflicts", block.policy)):
+    for key, value in (("symmetry", block.symmetry), ("conflicts", block.conflicts)):
         if value:
             yield f"{inner}{key} {value}"
     for syntax in block.rules:

@@ -54,13 +54,8 @@ def title_of(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
 
 def names_left_out(ruleset: RulesetDecl | None) -> frozenset[str]:
     """What the packs define that are left out of a ruleset: its own lines may ask for it as if there were a `?`."""
-    found: set[str] = set()
-    for pack in ruleset.left_out if ruleset else ():
-        found |= {decl.name.text for decl in pack.elements}
-        found |= {decl.name.text for decl in (*pack.properties, *pack.fields)}
-        found |= {decl.name.text for decl in pack.streams} | {decl.name.text for decl in pack.kernels}
-        found |= {scalar.text for scalar, _ in pack.tags} | {scalar.text for scalar, _ in pack.sets}
-    return frozenset(found)
+    left_out = ruleset.left_out if ruleset else ()
+    return frozenset(decl.name.text for pack in left_out for decl in pack.definitions)
 
 
 def with_optional(syntax: Syntax, names: frozenset[str]) -> Syntax:

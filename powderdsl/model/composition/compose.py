@@ -2,41 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property
 from math import lcm
-from typing import Generic, TypeVar
+from typing import Any, TypeVar
 
-from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.diagnostics import Label, Reporter
+from powderdsl.model.builtins import RESERVED
 from powderdsl.model.composition.claim_scopes import ClaimScopes, title_of
-from powderdsl.model.composition.names import PASS, NameBook, Names, needs_of
+from powderdsl.model.composition.names import NameBook, Named, Names, needed_first, report_unknown
 from powderdsl.model.composition.palette import Claim, Palette, composed_ids, recorded_ids, report_ids
 from powderdsl.model.composition.pass_order import order_passes
 from powderdsl.model.declarations import (
+    AlsoDecl,
+    Definition,
     ElementDecl,
     KernelDecl,
     PackDecl,
     PassDecl,
     RulesetDecl,
+    SetDecl,
     StreamDecl,
+    TagDecl,
     TypedDecl,
 )
 from powderdsl.model.types import Element
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
 
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Named(Generic[T]):
-    """A declaration with the pack it comes from, and its global name."""
-
-    pack: str
-    decl: T
-    name: str
+T = TypeVar("T", bound=Definition)
 
 
 @dataclass(frozen=True)
@@ -51,13 +49,13 @@ class Composition:
     element_decls: dict[str, Named[ElementDecl]]
     slots: int
     tags: dict[str, frozenset[int]]
-    tag_spans: dict[str, Span]
+    tag_decls: dict[str, Named[TagDecl]]
     properties: dict[str, Named[TypedDecl]]
     fields: dict[str, Named[TypedDecl]]
     streams: dict[str, Named[StreamDecl]]
     params: dict[str, Named[TypedDecl]]
     kernels: dict[str, Named[KernelDecl]]
-    sets: dict[str, Named[tuple[Scalar, Syntax]]]
+    sets: dict[str, Named[SetDecl]]
     passes: tuple[Named[PassDecl], ...]
     names: Names
     order: dict[int, int]
@@ -73,6 +71,36 @@ class Composition:
     def scopes(self) -> ClaimScopes:
         """What invariants and tests speak of."""
         return ClaimScopes(self.packs, self.ruleset, self.names)
+
+    @cached_property
+    def definitions(self) -> Mapping[str, Named[Any]]:
+        """Everything that has a global name, parameters and passes left out."""
+        tables = (
+            self.element_decls,
+            self.tag_decls,
+            self.properties,
+            self.fields,
+            self.streams,
+            self.sets,
+            self.kernels,
+        )
+        return ChainMap(*tables)
+
+    @cached_property
+    def lineage(self) -> tuple[RulesetDecl, ...]:
+        """The rulesets that are loaded, what inherits after what it extends."""
+        return self.ruleset.lineage if self.ruleset else ()
+
+    def entries(self) -> Iterator[tuple[str, str, ElementDecl | AlsoDecl]]:
+        """What packs say of each element: the pack, the element (global; an absent one as written), what it says.
+
+        In rising precedence: the elements' own entries, then those under `also`, each pack after those that it needs.
+        """
+        for name, named in self.element_decls.items():
+            yield named.pack, name, named.decl
+        for pack in needed_first(self.packs):
+            for also in pack.also:
+                yield pack.name.text, self.element(also.name.word, pack.name.text) or also.name.word, also
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
         """The glyphs of elements, by global name, as they are where only some packs are loaded."""
@@ -104,103 +132,87 @@ def compose(
     """
     _check_needs(packs, reporter)
     reporter.raise_if_errors()  # every name of a pack that lacks would be a mistake of its own
-    book = NameBook(packs, ruleset.renames if ruleset else (), reporter)
-    chosen = _chosen_elements(packs, book, reporter)
+    renames = ruleset.renames if ruleset else ()
+    book = NameBook(packs, renames, reporter, RESERVED | reserved_words() | {"elements"})
+    passes_book = NameBook(packs, renames, reporter)
+
+    def table(
+        kind: str, decls_of: Callable[[PackDecl], Sequence[T]], book: NameBook = book
+    ) -> dict[str, Named[T]]:
+        """The declarations of a kind by global name."""
+        found = [book.define(decl, kind, pack.name.text) for pack in packs for decl in decls_of(pack)]
+        return {named.name: named for named in found if named}
+
+    versions = _versions(packs, book, reporter)
     groups = _groups(packs, ruleset)
-    claims = _claims(groups, ruleset is not None, chosen)
+    claims = _claims(groups, ruleset is not None, versions)
     natural = composed_ids(claims)
     ids = natural if palette is None else recorded_ids(claims, palette)
     report_ids(claims, ids, reporter, recorded=palette is not None)
-    elements = _elements(chosen, ids, reporter)
-    placing = ruleset.placing if ruleset else None
-    wanted = (placing.slots if placing else None) or 0
-    slots = max(
-        [
-            wanted,
-            *(number + 1 for number in ids.values()),
-            len(palette or ()),
-            1,
-        ]
-    )
-    # The packs of the ruleset that says so must fit its slots; packs loaded on top of them add slots.
-    own = ruleset.placed if ruleset and wanted else ()
-    top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
-    if top and placing and palette is None and top.id >= wanted:
-        reporter.error(
-            "PD402",
-            f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots",
-            top.span,
-            helps=[f"say `slots: {top.id + 1}` in {placing.source.name}"],
-        )
-    tag_spans: dict[str, Span] = {}
-    for pack in packs:
-        for scalar, _ in pack.tags:
-            if name := book.define(scalar, "tag", pack.name.text):
-                tag_spans[name] = scalar.span
-
-    def table(entries: Iterable[tuple[PackDecl, Scalar, T]], kind: str) -> dict[str, Named[T]]:
-        found: dict[str, Named[T]] = {}
-        for pack, scalar, decl in entries:
-            if name := book.define(scalar, kind, pack.name.text):
-                found[name] = Named(pack.name.text, decl, name)
-        return found
-
-    properties = table(((p, d.name, d) for p in packs for d in p.properties), "property")
-    fields = table(((p, d.name, d) for p in packs for d in p.fields), "field")
-    streams = table(((p, d.name, d) for p in packs for d in p.streams), "stream")
-    kernels = table(((p, d.name, d) for p in packs for d in p.kernels), "kernel")
-    sets = table(((p, d[0], d) for p in packs for d in p.sets), "set")
-    passes = table(((p, d.name, d) for p in packs for d in p.passes), PASS)
-    params: dict[str, Named[TypedDecl]] = {}
-    for pack in packs:
-        for decl in pack.params:
-            qualified = f"{pack.name.text}.{decl.name.text}"
-            params[qualified] = Named(pack.name.text, decl, qualified)
-            book.check_word(decl.name, "parameter")
+    elements = _elements([found[0] for found in versions.values()], ids, reporter)
+    tag_decls = table("tag", lambda pack: pack.tags)
+    properties = table("property", lambda pack: pack.properties)
+    fields = table("field", lambda pack: pack.fields)
+    streams = table("stream", lambda pack: pack.streams)
+    kernels = table("kernel", lambda pack: pack.kernels)
+    sets = table("set", lambda pack: pack.sets)
+    passes = table("pass", lambda pack: pack.passes, passes_book)
+    params = [Named(p.name.text, decl, f"{p.name.text}.{decl.name.text}") for p in packs for decl in p.params]
+    for param in params:
+        book.check_word(param.decl.name, "parameter")
     names = book.finish()
-    _check_renamed(ruleset, book, reporter)
-    name = title_of(packs, ruleset)
-    about = ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else "")
+    _check_renamed(ruleset, book.renamed | passes_book.renamed, reporter)
     composition = Composition(
-        name=name,
-        about=about,
+        name=title_of(packs, ruleset),
+        about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
         packs=tuple(packs),
         ruleset=ruleset,
         elements=elements,
-        element_decls={word: chosen[word].named for word in elements},
-        slots=slots,
+        element_decls={name: versions[name][0] for name in elements},
+        slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
         tags={},
-        tag_spans=tag_spans,
+        tag_decls=tag_decls,
         properties=properties,
         fields=fields,
         streams=streams,
-        params=params,
+        params={param.name: param for param in params},
         kernels=kernels,
         sets=sets,
-        passes=order_passes(passes, names, reporter),
+        passes=order_passes(passes, passes_book.finish(), reporter),
         names=names,
         order={number: natural.get(word, number) for word, number in ids.items()},
         side_multiple=lcm(*(pack.side_multiple for pack in packs)),
         groups=tuple(tuple(pack.name.text for pack in group) for group in groups),
-        reserved=tuple(ids[c.name] for c in claims if c.name in ids and c.name not in chosen),
+        reserved=tuple(ids[claim.name] for claim in claims if claim.name in ids and not claim.is_loaded),
     )
     return replace(composition, tags=_tags(composition, reporter))
 
 
-def _check_renamed(ruleset: RulesetDecl | None, book: NameBook, reporter: Reporter) -> None:
+def _slots(
+    ruleset: RulesetDecl | None, elements: Mapping[str, Element], palette: Palette | None, reporter: Reporter
+) -> int:
+    """How many ids a ruleset or a palette asks for. Reports an id of the ruleset's own packs beyond its slots."""
+    wanted = (ruleset.placing.slots if ruleset else None) or 0
+    # The packs of the ruleset that says so must fit its slots; packs loaded on top of them add slots.
+    own = ruleset.placed if ruleset and wanted else ()
+    top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
+    if top and ruleset and palette is None and top.id >= wanted:
+        reporter.error(
+            "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots", top.span,
+            helps=[f"say `slots: {top.id + 1}` in {ruleset.placing.source.name}"],
+        )  # fmt: skip
+    return max(wanted, len(palette or ()))
+
+
+def _check_renamed(ruleset: RulesetDecl | None, renamed: AbstractSet[str], reporter: Reporter) -> None:
     """Report names under `rename:` that no pack defines. Those of packs that are left out may wait."""
-    if ruleset is None:
-        return
-    waiting = {pack.name.text for pack in ruleset.left_out}
-    for old, _ in ruleset.renames:
-        if old.text not in book.renamed and old.text.partition(".")[0] not in waiting:
+    waiting = {pack.name.text for pack in ruleset.left_out} if ruleset else ()
+    for old, _ in ruleset.renames if ruleset else ():
+        if old.text not in renamed and old.text.partition(".")[0] not in waiting:
             reporter.error(
-                "PD310",
-                f"nothing is called `{old.text}`",
-                old.span,
-                "no loaded pack defines this",
+                "PD310", f"nothing is called `{old.text}`", old.span, "no loaded pack defines this",
                 helps=["write the pack's name, a point, and the name that it defines: `pack.word`"],
-            )
+            )  # fmt: skip
 
 
 def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
@@ -244,56 +256,42 @@ def _need_helps(need: str, needing: Sequence[str], loaded: Iterable[str]) -> lis
     return [f"load `{need}` too, or leave out what needs it: {', '.join(f'`{name}`' for name in needing)}"]
 
 
-@dataclass(frozen=True)
-class _Chosen:
-    """The declaration of an element that holds, and those that it overrides, the latest first."""
-
-    named: Named[ElementDecl]
-    replaced: tuple[Named[ElementDecl], ...] = ()
-
-    @property
-    def first(self) -> ElementDecl:
-        """Where the element is defined, not overridden."""
-        return (self.replaced or (self.named,))[-1].decl
-
-
-def _chosen_elements(packs: Sequence[PackDecl], book: NameBook, reporter: Reporter) -> dict[str, _Chosen]:
-    """By global name, in load order."""
-    chosen: dict[str, _Chosen] = {}
+def _versions(
+    packs: Sequence[PackDecl], book: NameBook, reporter: Reporter
+) -> dict[str, list[Named[ElementDecl]]]:
+    """By global name, in load order: the declaration of an element that holds, then those that it overrides."""
+    found: dict[str, list[Named[ElementDecl]]] = {}
     for pack in packs:
         for decl in pack.elements:
             known = book.override(decl.name.text, pack.name.text) if decl.override else None
             if known is not None:
-                before = chosen[known]
-                _check_same_id(decl, before, reporter)
-                named = Named(pack.name.text, decl, known)
-                chosen[known] = _Chosen(named, (before.named, *before.replaced))
+                _check_same_id(decl, found[known], reporter)
+                found[known].insert(0, Named(pack.name.text, decl, known))
                 continue
             if decl.override:
                 reporter.error(
-                    "PD301",
-                    f"`{decl.name.text}` overrides nothing",
-                    decl.name.span,
-                    "no pack before this one defines it",
+                    "PD301", f"`{decl.name.text}` overrides nothing", decl.name.span, "no pack before this one defines it",
                     helps=["remove `override`, or load the other pack first"],
-                )
-            if name := book.define(decl.name, "element", pack.name.text):
-                chosen[name] = _Chosen(Named(pack.name.text, decl, name))
-    if not chosen:
+                )  # fmt: skip
+            if named := book.define(decl, "element", pack.name.text):
+                found[named.name] = [named]
+    if not found:
         reporter.error(
-            "PD109",
-            "no element is defined",
-            packs[0].name.span if packs else None,
-            "a world needs elements",
+            "PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements",
             helps=["define `elements:`, or load `core` too"],
-        )
-    return chosen
+        )  # fmt: skip
+    return found
 
 
-def _check_same_id(decl: ElementDecl, before: _Chosen, reporter: Reporter) -> None:
+def _asking(versions: Sequence[Named[ElementDecl]]) -> ElementDecl | None:
+    """The latest declaration of an element that asks for an id."""
+    return next((one.decl for one in versions if one.decl.id is not None), None)
+
+
+def _check_same_id(decl: ElementDecl, before: Sequence[Named[ElementDecl]], reporter: Reporter) -> None:
     """Warn if an element that overrides asks for another id than the one it replaces."""
-    old = next((one.decl for one in (before.named, *before.replaced) if one.decl.id is not None), decl)
-    if old.id_scalar and decl.id_scalar and decl.id != old.id:
+    old = _asking(before)
+    if old and old.id_scalar and decl.id_scalar and decl.id != old.id:
         reporter.report(
             "PD318", f"`{decl.name.text}` gets the id {decl.id} instead of {old.id}", decl.id_scalar.span,
             "its channel moves too", secondary=[Label(old.id_scalar.span, "the id of the element that it replaces")],
@@ -315,83 +313,65 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     return [*([first] if first else []), *([pack] for pack in others)]
 
 
-def _claims(groups: Sequence[Sequence[PackDecl]], own: bool, chosen: dict[str, _Chosen]) -> list[Claim]:
+def _claims(
+    groups: Sequence[Sequence[PackDecl]], own: bool, versions: Mapping[str, list[Named[ElementDecl]]]
+) -> list[Claim]:
     """All elements in the order in which ids are decided. In each group those that ask for an id come first.
 
     `own` says that the first group is a ruleset's.
     """
+    by_decl = {id(found[-1].decl): found for found in versions.values()}
     claims: list[Claim] = []
     for number, group in enumerate(groups):
-        found = [claim for pack in group for claim in _claims_of(pack, chosen, not own or number == 0)]
-        claims += sorted(found, key=lambda claim: claim.decl.id is None)
+        listed = not own or number == 0
+        decls = [(pack.name.text, decl) for pack in group for decl in pack.elements]
+        found = [_claim(pack, decl, by_decl.get(id(decl)), listed) for pack, decl in decls]
+        claims += sorted(filter(None, found), key=lambda claim: claim.decl.id is None)
     return claims
 
 
-def _claims_of(pack: PackDecl, chosen: dict[str, _Chosen], own: bool) -> Iterator[Claim]:
-    """The claims of the elements that a pack defines first. What overrides them speaks for them."""
-    name = pack.name.text
-    by_decl = {id(one.first): one for one in chosen.values()}
-    for decl in pack.elements:
-        one = by_decl.get(id(decl))
-        if one is None:
-            if not decl.override:  # of a pack that is left out: its id stays reserved
-                qualified = f"{name}.{decl.name.text}"
-                yield Claim(f"-{qualified}", qualified, name, decl, own, is_loaded=False)
-            continue
-        final = one.named
-        wished = next((old for old in (final, *one.replaced) if old.decl.id is not None), final).decl
-        yield Claim(
-            final.name,
-            f"{final.pack}.{final.decl.name.text}",
-            final.pack,
-            replace(final.decl, id=wished.id, id_scalar=wished.id_scalar),
-            own,
-            tuple(f"{old.pack}.{old.decl.name.text}" for old in one.replaced),
-        )
+def _claim(
+    pack: str, decl: ElementDecl, versions: Sequence[Named[ElementDecl]] | None, own: bool
+) -> Claim | None:
+    """The claim of an element that a pack defines first. What overrides it speaks for it."""
+    if versions is None:
+        qualified = f"{pack}.{decl.name.text}"  # of a pack that is left out: its id stays reserved
+        return None if decl.override else Claim(f"-{qualified}", qualified, pack, decl, own, is_loaded=False)
+    names = [f"{one.pack}.{one.decl.name.text}" for one in versions]
+    final, asking = versions[0], _asking(versions) or versions[0].decl
+    asked = replace(final.decl, id=asking.id, id_scalar=asking.id_scalar)
+    return Claim(final.name, names[0], final.pack, asked, own, tuple(names[1:]))
 
 
-def needed_first(packs: Sequence[PackDecl]) -> list[PackDecl]:
-    """The packs in load order, but each after those that it needs. Packs that need each other stay as they are."""
-    needs = needs_of(packs)
-    ordered: list[PackDecl] = []
-    waiting = list(packs)
-    while waiting:
-        names = {pack.name.text for pack in waiting}
-        ready = next((p for p in waiting if not (needs[p.name.text] - {p.name.text}) & names), waiting[0])
-        waiting.remove(ready)
-        ordered.append(ready)
-    return ordered
-
-
-def _elements(chosen: dict[str, _Chosen], ids: dict[str, int], reporter: Reporter) -> dict[str, Element]:
+def _elements(
+    declared: Sequence[Named[ElementDecl]], ids: Mapping[str, int], reporter: Reporter
+) -> dict[str, Element]:
     """The elements by ascending id. A glyph that another element has already is replaced by a free one."""
     owners: dict[str, Named[ElementDecl]] = {}
-    for one in chosen.values():
-        glyph = one.named.decl.glyph
-        first = owners.setdefault(glyph, one.named) if glyph else one.named
-        if first is not one.named and first.pack == one.named.pack:
+    for named in declared:
+        glyph = named.decl.glyph
+        first = owners.setdefault(glyph, named) if glyph else named
+        if first is not named and first.pack == named.pack:
             reporter.error(
-                "PD302", f"elements `{first.decl.name.text}` and `{one.named.decl.name.text}` have the same glyph `{glyph}`",
-                one.named.decl.name.span, "this one", secondary=[Label(first.decl.name.span, "and this one")], helps=["give one of them another glyph"],
+                "PD302", f"elements `{first.decl.name.text}` and `{named.decl.name.text}` have the same glyph `{glyph}`",
+                named.span, "this one", secondary=[Label(first.span, "and this one")], helps=["give one of them another glyph"],
             )  # fmt: skip
-    glyphs = _glyphs([one.named for name, one in chosen.items() if name in ids])
-    elements: dict[str, Element] = {}
-    for name, one in chosen.items():
-        decl = one.named.decl
-        if name not in ids:
-            continue
-        elements[name] = Element(
-            name,
-            one.named.pack,
-            ids[name],
-            decl.color,
-            glyphs[name],
-            decl.about,
+    declared = [named for named in declared if named.name in ids]
+    glyphs = _glyphs(declared)
+    return {
+        named.name: Element(
+            named.name,
+            named.pack,
+            ids[named.name],
+            named.decl.color,
+            glyphs[named.name],
+            named.decl.about,
             frozenset(),
-            decl.name.span,
-            "" if name == decl.name.text else decl.name.text,
+            named.span,
+            named.word,
         )
-    return dict(sorted(elements.items(), key=lambda item: item[1].id))
+        for named in sorted(declared, key=lambda named: ids[named.name])
+    }
 
 
 def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
@@ -414,45 +394,17 @@ def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
 
 
 def _tags(composition: Composition, reporter: Reporter) -> dict[str, frozenset[int]]:
-    elements, names = composition.elements, composition.names
-    members: dict[str, set[int]] = {tag: set() for tag in composition.tag_spans}
-
-    def give(pack: str, element: str, tags: Iterable[Scalar]) -> None:
-        for scalar in tags:
-            word = scalar.text.removesuffix("?")
-            tag = names.of(pack, word)
+    """The ids of the elements that carry each tag. Reports tags and elements that no pack defines."""
+    elements = composition.elements
+    members: dict[str, set[int]] = {tag: set() for tag in composition.tag_decls}
+    for pack, element, entry in composition.entries():
+        if isinstance(entry, AlsoDecl) and element not in elements and not entry.name.is_optional:
+            report_unknown("element", entry.name, elements, reporter)
+        for scalar in entry.tags:
+            tag = composition.names.of(pack, scalar.word)
             if tag in members:
-                if element in elements:
-                    members[tag].add(elements[element].id)
-            elif not scalar.text.endswith("?"):
-                reporter.error(
-                    "PD301",
-                    f"unknown tag `{word}`",
-                    scalar.span,
-                    "no loaded pack declares it",
-                    helps=[
-                        *suggest(word, members, "tags"),
-                        f"if its pack may be absent, write `{word}?`; to make a tag, declare it under `tags:`",
-                    ],
-                )
-
-    for element, named in composition.element_decls.items():
-        give(named.pack, element, named.decl.tags)
-    for pack in composition.packs:
-        own = pack.name.text
-        for also in pack.also:
-            word = also.element.text.removesuffix("?")
-            name = composition.element(word, own)
-            if name is None and not also.element.text.endswith("?"):
-                reporter.error(
-                    "PD301",
-                    f"unknown element `{word}`",
-                    also.element.span,
-                    "no loaded pack defines it",
-                    helps=[
-                        *suggest(word, elements, "elements"),
-                        f"if its pack may be absent, write `{word}?`",
-                    ],
-                )
-            give(own, name or word, also.tags)
+                members[tag] |= {elements[element].id} if element in elements else set()
+            elif not scalar.is_optional:
+                more = "; to make a tag, declare it under `tags:`"
+                report_unknown("tag", scalar, members, reporter, more=more)
     return {tag: frozenset(ids) for tag, ids in members.items()}

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from fractions import Fraction
 
-from powderdsl.diagnostics import Label, Reporter
-from powderdsl.model.composition.compose import Composition, needed_first
-from powderdsl.model.composition.names import needs_of
+from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.composition.compose import Composition
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
@@ -18,54 +17,53 @@ Given = tuple[str, str, str, Scalar, Syntax]
 def given_values(composition: Composition) -> Iterator[Given]:
     """Every value of a single element, in rising precedence.
 
-    First come the elements' own, then those under `also`: each pack after those that it needs, in load order
-    otherwise. Those beside the property or field come last.
+    First come those that stand with the elements, as `Composition.entries` has them, then those beside the property or
+    field.
     """
-
-    def name_of(pack: str, key: Scalar) -> str:
-        return composition.names.of(pack, key.text.removesuffix("?"))
-
-    for element, named in composition.element_decls.items():
-        for key, syntax in named.decl.values:
-            yield named.pack, name_of(named.pack, key), element, key, syntax
-    for decl in needed_first(composition.packs):
-        pack = decl.name.text
-        for also in decl.also:
-            word = also.element.text.removesuffix("?")
-            for key, syntax in also.values:
-                yield pack, name_of(pack, key), composition.element(word, pack) or word, key, syntax
+    for pack, element, entry in composition.entries():
+        for key, syntax in entry.values:
+            yield pack, composition.names.of(pack, key.word), element, key, syntax
     for table in (composition.properties, composition.fields):
         for name, typed in table.items():
             for key, syntax in typed.decl.values:
-                word = key.text.removesuffix("?")
-                yield typed.pack, name, composition.element(word, typed.pack) or word, key, syntax
+                yield typed.pack, name, composition.element(key.word, typed.pack) or key.word, key, syntax
 
 
 def report_contested(composition: Composition, reporter: Reporter) -> None:
-    """Report values that another one takes the place of: a note where a pack means to, a warning where none can."""
-    needs = needs_of(composition.packs)
+    """Report values that another one takes the place of."""
     known: dict[tuple[str, str], Given] = {}
     for value in given_values(composition):
         pack, name, element, key, syntax = value
-        if element not in composition.elements or not (
-            name in composition.properties or name in composition.fields
-        ):
-            continue
-        other = known.get((name, element))
-        known[name, element] = value
-        if other is None or _meaning(other[4]) == _meaning(syntax):
-            continue
-        if other[0] in needs[pack]:
-            reporter.report(
-                "PD317", f"`{pack}` replaces the `{name}` of `{element}`", key.span, "this value holds",
-                secondary=[Label(other[3].span, f"the value that `{other[0]}` gives")],
-            )  # fmt: skip
-        else:
-            reporter.report(
-                "PD316", f"packs `{other[0]}` and `{pack}` give `{element}` different values of `{name}`",
-                key.span, "this one holds", secondary=[Label(other[3].span, "this one is lost")],
-                helps=[f"say `needs: {other[0]}` in `{pack}` if it means to replace the value", "or remove one of them"],
-            )  # fmt: skip
+        if element in composition.elements and (name in composition.properties or name in composition.fields):
+            other = known.get((name, element))
+            known[name, element] = value
+            if other is not None and _meaning(other[4]) != _meaning(syntax):
+                report_replaced(
+                    name, element, (other[0], other[3].span), (pack, key.span), composition, reporter
+                )
+
+
+def report_replaced(
+    what: str,
+    element: str,
+    lost: tuple[str, Span],
+    held: tuple[str, Span],
+    composition: Composition,
+    reporter: Reporter,
+) -> None:
+    """Report what an element has twice, as a pack and a place: a note where a pack means to, a warning where none can."""
+    (before, old), (after, new) = lost, held
+    if before in composition.names.needs[after]:
+        reporter.report(
+            "PD317", f"`{after}` replaces the `{what}` of `{element}`", new, "this one holds",
+            secondary=[Label(old, f"the one that `{before}` gives")],
+        )  # fmt: skip
+        return
+    reporter.report(
+        "PD316", f"packs `{before}` and `{after}` give `{element}` a different `{what}`", new, "this one holds",
+        secondary=[Label(old, "this one is lost")],
+        helps=[f"say `needs: {before}` in `{after}` if it means to replace it", "or remove one of them"],
+    )  # fmt: skip
 
 
 def _meaning(value: Syntax) -> object:

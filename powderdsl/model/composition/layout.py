@@ -37,12 +37,12 @@ def matrix_channels(
     gone = names_left_out(composition.ruleset)
     if written:
         for scalar in written:
-            name = scalar.text.removesuffix("?")
+            name = scalar.word
             if name == "elements":
                 channels += first
                 continue
             found = _named(name, composition, symbols)
-            waits = scalar.text.endswith("?") or not gone.isdisjoint(name.split("."))
+            waits = scalar.is_optional or not gone.isdisjoint(name.split("."))
             if not found and not waits:
                 known = ["elements", *symbols.properties, *symbols.fields]
                 helps = [
@@ -53,7 +53,7 @@ def matrix_channels(
                     "PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property", helps=helps
                 )  # fmt: skip
             channels += found or [MatrixChannel(name)]
-        if all(scalar.text.removesuffix("?") != "elements" for scalar in written):
+        if all(scalar.word != "elements" for scalar in written):
             return tuple(channels)  # a ruleset that shows no elements shows none of further packs either
     else:
         channels += [*first, *_holding(own, symbols)]

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from powderdsl.diagnostics import Label, Reporter, Span
-from powderdsl.model.declarations import Block, PackDecl, RulesetDecl, TestDecl
+from powderdsl.model.declarations import PackDecl, RulesetDecl, TestDecl
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Mapping as MappingNode
 from powderdsl.syntax.yaml_tree import Node, Scalar
@@ -56,22 +56,10 @@ def report_misspelled(
 
 def defined_words(pack: PackDecl) -> Iterator[str]:
     """The names that other packs may ask for, and those under `let` and `scratch`."""
-    yield from (one.name.text for one in (*pack.properties, *pack.fields, *pack.params))
-    yield from (one.name.text for one in pack.streams)
-    yield from (one.name.text for one in pack.kernels)
-    yield from (one.name.text for one in pack.elements)
-    for name, _ in (*pack.tags, *pack.sets):
-        yield name.text
+    yield from (one.name.text for one in (*pack.definitions, *pack.params, *pack.passes))
     for one in pack.passes:
-        yield one.name.text
         yield from (item.name.text for item in one.scratch)
-        yield from _block_names(one.block)
-
-
-def _block_names(block: Block) -> Iterator[str]:
-    yield from (name.text for name, _ in block.lets)
-    for inner in (*block.blocks, *block.then):
-        yield from _block_names(inner)
+        yield from (name.text for block in one.block.walk() for name, _ in block.lets)
 
 
 def words_of_tree(tree: Node | None) -> Iterator[str]:

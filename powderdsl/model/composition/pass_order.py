@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
 
-from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.composition.names import Names
+from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.composition.names import Named, Names, in_order, report_unknown
 from powderdsl.model.declarations import PassDecl
-
-if TYPE_CHECKING:
-    from powderdsl.model.composition.compose import Named
 
 MAX_PASSES = 200
 
@@ -18,7 +14,7 @@ MAX_PASSES = 200
 def order_passes(
     passes: dict[str, Named[PassDecl]], names: Names, reporter: Reporter
 ) -> tuple[Named[PassDecl], ...]:
-    """Sort passes by `after` and `before`; what those leave open is decided by load order."""
+    """Sort passes by `after` and `before`; what those leave open is decided by load order. `names` are those of passes."""
     if len(passes) > MAX_PASSES:
         last = list(passes.values())[MAX_PASSES].decl.name.span
         reporter.error(
@@ -29,31 +25,15 @@ def order_passes(
     for name, named in passes.items():
         for scalars, is_after in ((named.decl.after, True), (named.decl.before, False)):
             for scalar in scalars:
-                word = scalar.text.removesuffix("?")
-                other = names.of_pass(named.pack, word)
+                other = names.of(named.pack, scalar.word)
                 if other in passes:
                     first, second = (other, name) if is_after else (name, other)
                     earlier[second][first] = scalar.span
-                elif not scalar.text.endswith("?"):
-                    reporter.error(
-                        "PD301",
-                        f"unknown pass `{word}`",
-                        scalar.span,
-                        "no loaded pack has it",
-                        helps=[
-                            *suggest(word, passes, "passes"),
-                            f"if its pack may be absent, write `{word}?`",
-                        ],
-                    )
-    ordered: list[str] = []
-    waiting = list(passes)
-    while waiting:
-        ready = next((name for name in waiting if not set(earlier[name]) & set(waiting)), None)
-        if ready is None:
-            _report_cycle(waiting, earlier, reporter)
-            return tuple(passes[name] for name in [*ordered, *waiting])
-        waiting.remove(ready)
-        ordered.append(ready)
+                elif not scalar.is_optional:
+                    report_unknown("pass", scalar, passes, reporter)
+    ordered, stuck = in_order(passes, earlier)
+    if stuck:
+        _report_cycle(stuck, earlier, reporter)
     return tuple(passes[name] for name in ordered)
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.diagnostics import Label, Reporter, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS, grid_kernel
-from powderdsl.model.composition.compose import Composition, Named
+from powderdsl.model.composition.compose import Composition
+from powderdsl.model.composition.names import Named
 from powderdsl.model.declarations import TypedDecl
 from powderdsl.model.expressions.literals import read_bounds
 from powderdsl.model.expressions.operands import Coercer, Items, Operand, Place, SetOf
@@ -64,17 +65,8 @@ class Symbols:
 
     def is_declared(self, name: str, pack: str) -> bool:
         """Whether some pack declares the name, even if its declaration is wrong."""
-        found = self.composition
-        tables = (
-            found.properties,
-            found.fields,
-            found.streams,
-            found.kernels,
-            found.sets,
-            found.element_decls,
-        )
-        meant = found.names.of(pack, name)
-        return any(meant in table for table in tables) or f"{pack}.{name}" in found.params
+        meant = self.composition.names.of(pack, name)
+        return meant in self.composition.definitions or f"{pack}.{name}" in self.composition.params
 
 
 def base_symbols(composition: Composition) -> Symbols:
@@ -166,30 +158,23 @@ def settled(default: Value, kind: Kind) -> Value:
 
 def field_from(named: Named[TypedDecl], kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
     decl = named.decl
-    word = decl.name.text if decl.name.text != named.name else ""
-    return Field(named.name, kind, default, decl.at, decl.resets, of, named.pack, decl.name.span, word=word)
+    resets = decl.resets is not None
+    return Field(named.name, kind, default, decl.at, resets, of, named.pack, named.span, word=named.word)
 
 
 def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
     """A parameter may not hide a global word that its pack knows: a rule would read the other one without a sign."""
     composition = symbols.composition
-    spans: dict[str, Span] = {name: element.span for name, element in composition.elements.items()}
-    spans |= composition.tag_spans
-    tables: tuple[dict[str, Named[TypedDecl]], ...] = (composition.properties, composition.fields)
-    for table in tables:
-        spans |= {name: named.decl.name.span for name, named in table.items()}
-    spans |= {name: named.decl.name.span for name, named in composition.streams.items()}
-    spans |= {name: named.decl[0].span for name, named in composition.sets.items()}
-    spans |= {name: named.decl.name.span for name, named in composition.kernels.items()}
     for named in composition.params.values():
         name = composition.names.of(named.pack, named.decl.name.text)
-        if name in spans and composition.names.knows(named.pack, name):
+        other = composition.definitions.get(name)
+        if other is not None and composition.names.knows(named.pack, name):
             reporter.error(
                 "PD308",
                 f"the parameter `{name}` hides another `{name}`",
-                named.decl.name.span,
+                named.span,
                 "the same word",
-                secondary=[Label(spans[name], "this one")],
+                secondary=[Label(other.span, "this one")],
                 helps=["rename the parameter"],
             )
 

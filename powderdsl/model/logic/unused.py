@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.declarations import Block, PackDecl
+from powderdsl.model.declarations import PackDecl
 from powderdsl.model.expressions.typer import Typer
 
 
@@ -17,18 +17,18 @@ def report_unused(composition: Composition, typer: Typer, produced: frozenset[in
     values = [str(value) for prop in typer.symbols.properties.values() for value in prop.values]
     for qualified, param in composition.params.items():
         if qualified not in typer.used and qualified not in values:
-            _unused("parameter", qualified, param.decl.name.span, reporter)
+            _unused("parameter", qualified, param.span, reporter)
     for name, named_set in composition.sets.items():
         if name not in typer.used:
-            _unused("set", name, named_set.decl[0].span, reporter)
-        elif not typer.set_of(typer.symbols.constants[name], named_set.decl[0].span).ids:
+            _unused("set", name, named_set.span, reporter)
+        elif not typer.set_of(typer.symbols.constants[name], named_set.span).ids:
             reporter.report(
-                "PD505", f"the set `{name}` is empty", named_set.decl[1].span, "no element of the loaded packs is in it",
+                "PD505", f"the set `{name}` is empty", named_set.decl.members.span, "no element of the loaded packs is in it",
                 helps=["load a pack with such elements, or widen the set"],
             )  # fmt: skip
     for name, kernel in composition.kernels.items():
         if name not in typer.used:
-            _unused("kernel", name, kernel.decl.name.span, reporter)
+            _unused("kernel", name, kernel.span, reporter)
     _report_unwritten(composition, reporter)
     for element in composition.elements.values():
         if element.id not in produced:
@@ -60,19 +60,19 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     for name, field in composition.fields.items():
         if name not in words and field.decl.name.text not in words:
             _unused("field", name, field.decl.name.span, reporter)
-    for pack in composition.packs:
-        for pass_ in pack.passes:
-            _report_lets(pass_.block, reporter)
-
-
-def _report_lets(block: Block, reporter: Reporter) -> None:
-    later: set[str] = set(_block_words(block, with_lets=False))
-    for scalar, value in reversed(block.lets):
-        if scalar.text not in later:
-            _unused("value", scalar.text, scalar.span, reporter)
-        later |= set(words_of(value))
-    for inner in (*block.blocks, *block.then):
-        _report_lets(inner, reporter)
+    for block in (block for pack in composition.packs for one in pack.passes for block in one.block.walk()):
+        later = {word for line in block.lines[len(block.lets) :] for word in words_of(line)}
+        later |= {
+            word
+            for inner in block.walk()
+            if inner is not block
+            for line in inner.lines
+            for word in words_of(line)
+        }
+        for scalar, value in reversed(block.lets):
+            if scalar.text not in later:
+                _unused("value", scalar.text, scalar.span, reporter)
+            later |= set(words_of(value))
 
 
 def pack_words(pack: PackDecl) -> Iterator[str]:
@@ -80,22 +80,12 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
     for ramp in (*(one.ramp for one in pack.elements), *(one.ramp for one in pack.also)):
         if ramp is not None:
             yield ramp.field.text.removesuffix("?").rpartition(".")[2]
-    for pass_ in pack.passes:
-        yield from _block_words(pass_.block)
     for lines in (
+        pack.lines,
         pack.invariants,
-        [syntax for _, syntax in pack.sets],
+        [one.members for one in pack.sets],
         [line for test in pack.tests for line in test.always],
         [decl.of for decl in pack.fields if decl.of is not None],
     ):
         for line in lines:
             yield from words_of(line)
-
-
-def _block_words(block: Block, with_lets: bool = True) -> Iterator[str]:
-    for syntax in (*block.rules, *([block.header] if block.header else [])):
-        yield from words_of(syntax)
-    for _, value in block.lets if with_lets else ():
-        yield from words_of(value)
-    for inner in (*block.blocks, *block.then):
-        yield from _block_words(inner)

@@ -62,8 +62,8 @@ def names_of(packs: Sequence[PackDecl], pack: PackDecl) -> Names:
     own: set[str] = set()
     for one in packs:
         found: dict[str, str] = {}
-        found |= dict.fromkeys((scalar.text for scalar, _ in one.tags), "tag")
-        found |= dict.fromkeys((scalar.text for scalar, _ in one.sets), "set")
+        found |= dict.fromkeys((decl.name.text for decl in one.tags), "tag")
+        found |= dict.fromkeys((decl.name.text for decl in one.sets), "set")
         found |= dict.fromkeys((decl.name.text for decl in one.elements), "element")
         found |= dict.fromkeys((decl.name.text for decl in one.streams), "stream")
         found |= dict.fromkeys((decl.name.text for decl in one.kernels), "kernel")

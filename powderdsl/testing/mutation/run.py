@@ -113,7 +113,7 @@ def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
     import re
 
     words = set(re.findall(r"\w+", mutant.diff))
-    tags = words & {scalar.text for pack in original.packs for scalar, _ in pack.tags}
+    tags = words & {tag.name.text for pack in original.packs for tag in pack.tags}
     own = {element.name for element in original.ruleset.elements if element.pack == mutant.pack}
     return tuple(
         element.id

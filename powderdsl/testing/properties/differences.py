@@ -161,13 +161,13 @@ def _doings(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
     assert ruleset.declared is not None
     decl: PackDecl = next(one for one in ruleset.declared.packs if one.name.text == pack)
     for also in decl.also:
-        name = also.element.text.removesuffix("?")
+        name = also.name.word
         if ruleset.element(name) is not None:
             given = [
                 *(f"the tag `{tag.text.removesuffix('?')}`" for tag in also.tags),
                 *(f"`{key.text.removesuffix('?')}`" for key, _ in also.values),
             ]
-            yield name, Cause(pack, also.element.span, f"gives `{name}` {' and '.join(given)}")
+            yield name, Cause(pack, also.name.span, f"gives `{name}` {' and '.join(given)}")
     for element in decl.elements:
         if element.override:
             name = element.name.text
