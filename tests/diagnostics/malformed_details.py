@@ -43,6 +43,8 @@ DETAILS: list[tuple[str, str, str, str | None]] = [
     ('a drawn element that is unknown', 'tests: [{t: {given: w s, expect: w s, fields: {seed: wed s}}}]\n', 'PD110', 'wed'),
     ('a drawn flag that is a number', 'tests: [{t: {given: w s, expect: w s, fields: {wet: 3 yes}}}]\n', 'PD110', '3'),
     ('a drawn property that nothing assigns', 'tests: [{t: {given: w s, expect: w s, fields: {weight: 1 2}}}]\n', 'PD407', 'weight'),
+    ('a legend that is a list', 'tests: [{t: {given: w s, expect: w s, legend: [w]}}]\n', 'PD107', '[w]'),
+    ('a legend with a list', 'tests: [{t: {given: w s, expect: w s, legend: {x: [weed]}}}]\n', 'PD107', '[weed]'),
     ('a drawing that is a list', 'tests: [{t: {given: w s, expect: w s, fields: {age: [1 2]}}}]\n', 'PD107', '[1 2]'),
     ("a kernel of even sides", 'kernels: {k: ["1 1", "1 1"]}\n', "PD110", '"1 1"'),
     ("a ragged kernel", 'kernels: {k: ["1 1 1", "1", "1 1 1"]}\n', "PD110", '"1"'),

@@ -77,6 +77,7 @@ FILES: list[tuple[str, str | bytes, str, str | None]] = [
     ("text after a bar", "about: | text\n  more\n", "PD103", "text"),
     ("a value that starts with @", "about: @home\n", "PD103", "@"),
     ("a value that starts with %", "about: %home\n", "PD103", "%"),
+    ("parameters of a ruleset as a list", "ruleset: yard\npacks: core\nparams: [a]\n", "PD107", "[a]"),
     ("two commas", "a: {b: 1, , c: 2}\n", "PD103", ","),
     ("a directive", "%YAML 9.9\n---\npack: yard\n", "PD103", "%YAML 9.9"),
     ("text after the end", "pack: yard\n...\nabout: x\n", "PD103", "about: x"),
