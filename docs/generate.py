@@ -185,8 +185,7 @@ def scene_statements() -> str:
 
 def tasks() -> str:
     """The tasks that come with powderdsl: what may be placed, how often, and their knobs."""
-    from powderdsl.tasks.names import shipped_tasks
-    from powderdsl.tasks.shipped import load_task
+    from powderdsl.tasks.shipped import load_task, shipped_tasks
     from powderdsl.tasks.task import BLOW, NO_CHANGE
 
     rows = []

@@ -15,8 +15,7 @@ from powderdsl.cli.options import check_writable
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
 from powderdsl.cli.plain_table import table
 from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
-from powderdsl.tasks.names import is_task
-from powderdsl.tasks.shipped import check_split, load_task
+from powderdsl.tasks.shipped import check_split, is_task, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task
 
 if TYPE_CHECKING:

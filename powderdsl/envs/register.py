@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gymnasium
 
-from powderdsl.tasks.names import shipped_tasks
+from powderdsl.tasks.shipped import shipped_tasks
 
 
 def env_id(task: str) -> str:

@@ -147,15 +147,11 @@ def _tile(
 
 def _block(task: Task, row: int, column: int) -> NDArray[np.bool_]:
     """The cells that an action at a bin changes: bool [H, W]."""
-    cells = np.ones(task.size, dtype=bool)
-    agent = task.agent
-    for axis, place in enumerate((row, column)):
-        side, bins, brush = task.size[axis], agent.bins[axis], agent.brush[axis]
-        first = (2 * place + 1) * side // (2 * bins) - brush // 2
-        lines = np.arange(side)
-        within = (lines >= first) & (lines < first + brush)
-        cells &= within[:, None] if axis == 0 else within[None]
-    return cells
+    lines = []
+    for axis, (place, side) in enumerate(zip((row, column), task.size, strict=True)):
+        first = task.agent.first_line(axis, place, side)
+        lines.append((np.arange(side) >= first) & (np.arange(side) < first + task.agent.brush[axis]))
+    return lines[0][:, None] & lines[1]
 
 
 def _words(task: Task, choice: int, blow: list[int]) -> str:

@@ -12,7 +12,10 @@ from powderdsl.syntax import yaml_tree
 from powderdsl.tasks.drawings import choice_ids
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
 from powderdsl.worlds.raster import Size
+from powderdsl.worlds.scene.read import two_integers
 from powderdsl.worlds.scene.statements import read_choice, text_span
+
+Entries = dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]]
 
 MAX_ACTIONS = 1_000_000
 MAX_STEPS = 100_000
@@ -33,11 +36,9 @@ def read_agent(
     choices = _choices(reader, entries, ruleset)
     speed = _read_speed(reader, entries)
     field = _speed_field(reader, entries, ruleset, BLOW in choices, entry[0].span)
-    if BLOW in choices and speed is None and "speed" not in entries:
-        helps = ["`speed: 20` is the paper's"]
-        reader.reporter.error(
-            "PD109", "an agent that may blow lacks `speed`", entry[0].span, "how fast?", helps=helps
-        )
+    if BLOW in choices and "speed" not in entries:
+        message, helps = "an agent that may blow lacks `speed`", ["`speed: 20` is the paper's"]
+        reader.reporter.error("PD109", message, entry[0].span, "how fast?", helps=helps)
     brush, bins = _pair(reader, entries, "brush", 10, size), _pair(reader, entries, "bins", 16, size)
     actions = reader.number(entries, "actions", 1, MAX_ACTIONS)
     steps = reader.number(entries, "steps_per_action", 0, MAX_STEPS)
@@ -54,9 +55,7 @@ def read_agent(
     )
 
 
-def _choices(
-    reader: Reader, entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], ruleset: Ruleset
-) -> tuple[int, ...]:
+def _choices(reader: Reader, entries: Entries, ruleset: Ruleset) -> tuple[int, ...]:
     """Element ids ascending, then what is not an element."""
     found: set[int] = set()
     acts: set[int] = set()
@@ -66,7 +65,7 @@ def _choices(
             acts.add(ACTS[word.text])
             continue
         span = text_span(word, reader.reporter)
-        choice = read_choice(span, reader.reporter) if span is not None else None
+        choice = read_choice(span, reader.reporter) if span else None
         if choice is not None:
             found |= set(choice_ids(choice, ruleset, reader.reporter, {}))
     if "may" in entries and not words:
@@ -75,7 +74,7 @@ def _choices(
     return (*sorted(found), *sorted(acts, reverse=True))
 
 
-def _read_speed(reader: Reader, entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]]) -> float | None:
+def _read_speed(reader: Reader, entries: Entries) -> float | None:
     value = reader.scalar(entries, "speed")
     if value is None:
         return None
@@ -87,7 +86,7 @@ def _read_speed(reader: Reader, entries: dict[str, tuple[yaml_tree.Scalar, yaml_
 
 def _speed_field(
     reader: Reader,
-    entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]],
+    entries: Entries,
     ruleset: Ruleset,
     blows: bool,
     span: Span,
@@ -104,23 +103,21 @@ def _speed_field(
         return None
     if named is not None:
         return slot_name(ruleset, named.text)
-    if len(vectors) != 1:
-        message = (
-            "these rules have no field that blowing could set"
-            if not vectors
-            else "blowing could set several fields"
+    if not vectors:
+        message, helps = (
+            "these rules have no field that blowing could set",
+            ("load a pack with a vector field",),
         )
-        helps = ("load a pack with a vector field",)
-        if vectors:
-            helps = (f"`speed_field`: one of {', '.join(vectors)}",)
-        reader.reporter.error("PD804", message, span, "which one?" if vectors else "no vector", helps=helps)
-        return None
-    return vectors[0]
+        reader.reporter.error("PD804", message, span, "no vector", helps=helps)
+    elif len(vectors) > 1:
+        message, helps = "blowing could set several fields", (f"`speed_field`: one of {', '.join(vectors)}",)
+        reader.reporter.error("PD804", message, span, "which one?", helps=helps)
+    return vectors[0] if len(vectors) == 1 else None
 
 
 def _pair(
     reader: Reader,
-    entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]],
+    entries: Entries,
     key: str,
     usual: int,
     size: Size,
@@ -129,14 +126,11 @@ def _pair(
     if key not in entries:
         return min(usual, size[0]), min(usual, size[1])
     node = entries[key][1]
-    items = node.items if isinstance(node, yaml_tree.Sequence) else (node, node)
-    words = [one.text for one in items if isinstance(one, yaml_tree.Scalar)]
-    numbers = [int(word) for word in words if re.fullmatch(r"[0-9]{1,5}", word)]
-    fits = len(items) == len(numbers) == 2 and all(
-        1 <= one <= most for one, most in zip(numbers, size, strict=True)
+    pair = two_integers(
+        yaml_tree.Sequence((node, node), node.span) if isinstance(node, yaml_tree.Scalar) else node
     )
-    if not fits:
+    if pair is None or not all(1 <= one <= most for one, most in zip(pair, size, strict=True)):
         label = f"one number, or [rows, columns], from 1 to {size[0]} and {size[1]}"
         reader.reporter.error("PD804", f"`{key}` does not fit the world", node.span, label)
         return min(usual, size[0]), min(usual, size[1])
-    return numbers[0], numbers[1]
+    return pair

@@ -11,6 +11,7 @@ from powderdsl.tasks.statement_lists import BROKEN, Item, Repeat
 from powderdsl.tasks.task import MAX_NUMBER, MAX_REPEATS, Drawing, Generator, Group, Region, Stamp, Target
 from powderdsl.worlds.raster import Shape, Size, mask
 from powderdsl.worlds.scene.amounts import Amount, Interval, filled_in, integers, interval, number
+from powderdsl.worlds.scene.read import covers_nothing
 from powderdsl.worlds.scene.statements import NUMBERS, RANGES, ElementChoice, Statement, Word
 
 MAX_DRAWINGS = 4_096
@@ -51,12 +52,15 @@ class Drawer:
 
     def generator(self) -> Generator:
         plan = self.plan
-        lets = self.lets(plan.lets, self.names)
-        regions = tuple(self.region(name, shapes) for name, shapes in plan.regions.items())
-        groups = self.groups(plan.items)
-        targets = tuple(Target(name, self.groups(items)) for name, items in plan.targets.items())
-        stamps = tuple(plan.stamps.values())
-        return Generator(plan.name, plan.fill, lets, groups, regions, targets, stamps)
+        return Generator(
+            plan.name,
+            plan.fill,
+            lets=self.lets(plan.lets, self.names),
+            regions=tuple(self.region(name, shapes) for name, shapes in plan.regions.items()),
+            groups=self.groups(plan.items),
+            targets=tuple(Target(name, self.groups(items)) for name, items in plan.targets.items()),
+            stamps=tuple(plan.stamps.values()),
+        )
 
     def lets(
         self, written: Sequence[tuple[Word, Amount]], names: dict[str, Interval]
@@ -65,21 +69,16 @@ class Drawer:
         found = []
         for word, amount in written:
             filled = self.filled(amount, names) if amount is not BROKEN else None
-            names[word.text] = (0, 0)
             if filled is None:
                 self.broken.add(word.text)
             else:
-                names[word.text] = self.bounds(filled, names)
                 found.append((word.text, filled))
+            names[word.text] = (0, 0) if filled is None else interval(filled, names)
         return tuple(found)
 
     def region(self, name: str, shapes: Sequence[Statement]) -> Region:
-        found = [self.drawing(one, self.names) for one in shapes]
-        drawings = tuple(one for one in found if one is not None)
-        drawn = any(
-            part.op in ("draw", "name") for one in drawings for a in one.amounts if a for part in a.walk()
-        )
-        return Region(name, drawings, drawn)
+        drawings = tuple(filter(None, (self.drawing(one, self.names) for one in shapes)))
+        return Region(name, drawings, any(integers(one.amounts) is None for one in drawings))
 
     def groups(self, items: Sequence[Item], inside: tuple[str, ...] = ()) -> tuple[Group, ...]:
         """Repetitions, and what stands between them, each a group."""
@@ -88,20 +87,21 @@ class Drawer:
             if isinstance(item, Repeat):
                 found += self.repeated(item)
             elif item.kind == "part":
-                found += self.part(item, inside)
+                found += self.part(item.name or Word("", item.span), inside)
             else:
-                found += self.single(item)
+                self.count += 1
+                self.cells += 1
+                drawing = self.drawing(item, self.names)
+                found += [Group(self.count, number(1), 1, (), (drawing,))] if drawing else []
             if self.cells > MAX_DRAWINGS:
                 message = f"a world of more than {MAX_DRAWINGS:,} drawings"
                 self.reporter.error("PD508", message, item.span, "here it is too much", helps=["draw less"])
                 break
         return tuple(found)
 
-    def part(self, statement: Statement, inside: tuple[str, ...]) -> tuple[Group, ...]:
-        name = statement.name
-        assert name is not None
+    def part(self, name: Word, inside: tuple[str, ...]) -> tuple[Group, ...]:
         if name.text not in self.plan.parts:
-            self.unknown("part", name, self.plan.parts)
+            report_unknown("part", name, self.plan.parts, self.reporter)
             return ()
         self.used_parts.add(name.text)
         if name.text in inside:
@@ -109,21 +109,14 @@ class Drawer:
             return ()
         return self.groups(self.plan.parts[name.text], (*inside, name.text))
 
-    def single(self, statement: Statement) -> tuple[Group, ...]:
-        self.count += 1
-        self.cells += 1
-        drawing = self.drawing(statement, self.names)
-        return () if drawing is None else (Group(self.count, number(1), 1, (), (drawing,)),)
-
     def repeated(self, repeat: Repeat) -> tuple[Group, ...]:
         self.count += 1
         place = self.count
         names = dict(self.names)
         for word, _ in repeat.lets:
             if word.text in self.names or word.text in self.plan.knobs:
-                self.reporter.error(
-                    "PD308", f"`{word.text}` already means something", word.span, "second meaning"
-                )
+                message = f"`{word.text}` already means something"
+                self.reporter.error("PD308", message, word.span, "second meaning")
         count = self.filled(repeat.count, self.names)
         lets = self.lets(repeat.lets, names)
         drawings = []
@@ -134,27 +127,26 @@ class Drawer:
                 self.reporter.error("PD605", "a part in a repetition", statement.span, label)
                 continue
             drawings.append(self.drawing(statement, names))
-        if count is None or any(one is None for one in drawings):
+        known = tuple(filter(None, drawings))
+        if count is None or len(known) < len(drawings):
             return ()
-        low, most = self.bounds(count, self.names)
+        low, most = interval(count, self.names)
         if low < 0 or most > MAX_REPEATS:
-            message = f"{low}..{most} repetitions"
-            span = repeat.count.span
-            self.reporter.error("PD606", message, span, f"they must lie in 0..{MAX_REPEATS}")
+            label = f"they must lie in 0..{MAX_REPEATS}"
+            self.reporter.error("PD606", f"{low}..{most} repetitions", repeat.count.span, label)
             return ()
-        self.cells += most * len(drawings)
-        if most == 0 or not drawings:
-            return ()
-        return (Group(place, count, most, lets, tuple(one for one in drawings if one)),)
+        self.cells += most * len(known)
+        return (Group(place, count, most, lets, known),) if most and known else ()
 
     def drawing(self, statement: Statement, names: Mapping[str, Interval]) -> Drawing | None:
-        ids = self.ids(statement.choice) if statement.choice else ()
-        over = frozenset(self.ids(statement.over)) if statement.over else None
+        ids, over = (
+            choice_ids(one, self.ruleset, self.reporter, self.plan.knobs) if one else ()
+            for one in (statement.choice, statement.over)
+        )
         where, stamp = statement.where, statement.name
-        if where is not None and where.text not in self.plan.regions:
-            self.unknown("region", where, self.plan.regions)
-        if stamp is not None and stamp.text not in self.plan.stamps:
-            self.unknown("stamp", stamp, self.plan.stamps)
+        for what, word, known in (("region", where, self.plan.regions), ("stamp", stamp, self.plan.stamps)):
+            if word is not None and word.text not in known:
+                report_unknown(what, word, known, self.reporter)
         amounts = [None if one is None else self.filled(one, names) for one in statement.numbers]
         if any(new is None and old is not None for new, old in zip(amounts, statement.numbers, strict=True)):
             return None
@@ -164,7 +156,7 @@ class Drawer:
             tuple(amounts),
             ids,
             where.text if where else None,
-            over,
+            frozenset(over) if statement.over else None,
             stamp.text if stamp else None,
             statement.span,
         )
@@ -178,7 +170,7 @@ class Drawer:
         unknown = [part for part in amount.walk() if part.op == "name" and part.value not in known]
         for part in unknown:
             assert part.span is not None
-            self.unknown("number", Word(str(part.value), part.span), known)
+            report_unknown("number", Word(str(part.value), part.span), known, self.reporter)
         if unknown:
             return None
         try:
@@ -196,20 +188,17 @@ class Drawer:
                     return None
         return found
 
-    def bounds(self, amount: Amount, names: Mapping[str, Interval]) -> Interval:
-        return interval(amount, names)
-
     def numbers_fit(self, drawing: Drawing, names: Mapping[str, Interval]) -> bool:
         """Whether all numbers can be what their statement needs; reports those that cannot."""
         fits = True
         for amount, (what, lowest) in zip(drawing.amounts, NUMBERS[drawing.kind], strict=True):
             if amount is None:
                 continue
-            low, high = self.bounds(amount, names)
-            least = max(lowest, -MAX_NUMBER)
+            low, high = interval(amount, names)
             most = 100 if drawing.kind == "scatter" else MAX_NUMBER
             # A range that begins before the world is cut off, as everything is that lies outside.
-            least = -MAX_NUMBER if drawing.kind in RANGES and lowest == 0 else least
+            outside = drawing.kind in RANGES and lowest == 0
+            least = -MAX_NUMBER if outside else max(lowest, -MAX_NUMBER)
             if low < least or high > most:
                 can_be = f"it can be {low}..{high}" if low < high else f"it is {low}"
                 self.reporter.error("PD606", f"{what} must lie in {least}..{most}", amount.span, can_be)
@@ -223,41 +212,29 @@ class Drawer:
         for i in range(RANGES.get(drawing.kind, 0)):
             start, stop = amounts[2 * i], amounts[2 * i + 1]
             assert start is not None
-            low = self.bounds(start, names)[0]
-            high = self.size[i] if stop is None else self.bounds(stop, names)[1]
+            low = interval(start, names)[0]
+            high = self.size[i] if stop is None else interval(stop, names)[1]
             if low >= high or start == stop or low >= self.size[i] or high <= 0:
                 never = "rows" if i == 0 else "columns"
         values = integers(amounts) if drawing.kind not in ("scatter", "stamp") else None
         if values is not None and not mask(Shape(drawing.kind, values), self.size).any():
             never = never or "cells"
         if never:
-            rows, columns = self.size
-            self.reporter.error(
-                "PD608",
-                "a shape that covers no cell",
-                drawing.span,
-                f"none of its {never} lie in the {rows}×{columns} world",
-                helps=[f"rows are 0 to {rows - 1}, columns 0 to {columns - 1}; rows come first"],
-            )
+            covers_nothing(drawing.span, f"none of its {never} lie", self.size, self.reporter)
         return not never
 
-    def ids(self, choice: ElementChoice) -> tuple[int, ...]:
-        """The elements of a choice, in the order written; empty after a report."""
-        return choice_ids(choice, self.ruleset, self.reporter, self.plan.knobs)
 
-    def unknown(self, what: str, word: Word, known: Mapping[str, object]) -> None:
-        helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
-        self.reporter.error("PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps)
+def report_unknown(what: str, word: Word, known: Mapping[str, object], reporter: Reporter) -> None:
+    """Report a name that the task does not define, PD802."""
+    helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
+    reporter.error("PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps)
 
 
 def choice_ids(
     choice: ElementChoice, ruleset: Ruleset, reporter: Reporter, knobs: Mapping[str, int]
 ) -> tuple[int, ...]:
     """The elements of a choice by id, in the order written, tags in the order of ids. Empty after a report."""
-    named: list[int] = []
-    for word in choice.names:
-        named += element_ids(word, ruleset, reporter)
-    ids = tuple(dict.fromkeys(named))
+    ids = tuple(dict.fromkeys(i for word in choice.names for i in element_ids(word, ruleset, reporter)))
     if choice.how == "any":
         ids = tuple(element.id for element in ruleset.elements if element.id not in ids)
     if choice.how == "first":
@@ -268,9 +245,7 @@ def choice_ids(
             reporter.error("PD606", "how many of them must be fixed", choice.count.span, label)
             return ()
         ids = ids[: count.integer]
-    if not ids and not choice.names:
-        reporter.error("PD604", "a choice among no elements", choice.span, "nothing is left")
-    if not ids and choice.how == "any" and choice.names:
+    if not ids and (choice.how == "any" or not choice.names):
         reporter.error("PD604", "a choice among no elements", choice.span, "nothing is left")
     return ids
 

@@ -14,11 +14,20 @@ from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
-from powderdsl.tasks.tensors.actions import Done, Hands, params_of
-from powderdsl.tasks.tensors.generator import Made, WorldMaker
+from powderdsl.tasks.tensors.actions import Hands, params_of
+from powderdsl.tasks.tensors.generator import Made, WorldMaker, joined
 from powderdsl.tasks.tensors.measures import Facts, Given, Meter, measures_of, scalar_value, scalars_of
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
+
+ROWS = ("seed", "acted", "failed", "start", "before")
+"""Tensors of `Episodes`, a row for each."""
+
+CLOCK = ("seed", "index", "step")
+"""Tensors of `World` that draws depend on."""
+
+DONE = ("painted", "placed", "blown")
+"""What `Hands.act` gives for rewards."""
 
 
 @dataclass(frozen=True)
@@ -53,27 +62,23 @@ class TaskProgram:
         self._makers = [WorldMaker(one, task.size, device) for one in task.split(split).variants]
         self.measures = measures_of(task.goal)
         self._places = {measure: number for number, measure in enumerate(self.measures)}
-        fixed = self._makers[0].fixed_cells
-        for maker in self._makers[1:]:
-            same = maker.fixed_cells
-            fixed = {n: v for n, v in fixed.items() if n in same and torch.equal(v, same[n])}
-        self._fixed = fixed
-        self._meter = Meter(simulator.ruleset, self.measures, task.size, fixed, device)
+        cells = [maker.fixed_cells for maker in self._makers]
+        self._fixed = {
+            name: value
+            for name, value in cells[0].items()
+            if all(name in one and torch.equal(value, one[name]) for one in cells)
+        }
+        """Regions that are the same in all worlds of the split, bool [1, H, W]."""
+        self._meter = Meter(simulator.ruleset, self.measures, task.size, self._fixed, device)
         goal = task.goal
         self._counts_always = (goal.each, goal.success, goal.failure) != (None, None, None) or any(
             part.op == "before" for part in scalars_of(goal)
         )
         """Whether measures are needed after every action, and not only after the last."""
-        counts = any(part.op == "action" and part.value == "painted" for part in scalars_of(task.goal))
+        counts = any(part.op == "action" and part.value == "painted" for part in scalars_of(goal))
         self._hands = Hands(simulator, task.agent, task.size, counts=counts)
-        agent = task.agent
-        self.action_nvec: tuple[int, int, int, int, int] = (
-            agent.bins[1],
-            agent.bins[0],
-            len(agent.choices),
-            3,
-            3,
-        )
+        rows, columns = task.agent.bins
+        self.action_nvec: tuple[int, int, int, int, int] = (columns, rows, len(task.agent.choices), 3, 3)
         """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
 
     # Beginning
@@ -94,25 +99,14 @@ class TaskProgram:
         """The start worlds of seeds; where a split has several variants, each world comes from its own."""
         if len(self._makers) == 1:
             return self._makers[0].make(seeds)
-        batch, (height, width) = len(seeds), self.task.size
-        device = seeds.device
         variant = torch.remainder(seeds, len(self._makers))
-        ids = torch.zeros(batch, height, width, dtype=torch.uint8, device=device)
-        regions = dict(self._fixed)
-        for region in self._makers[0].generator.regions:
-            if region.name not in regions:
-                regions[region.name] = torch.zeros(batch, height, width, dtype=torch.bool, device=device)
-        targets = {one.name: torch.zeros_like(ids) for one in self._makers[0].generator.targets}
-        for number, maker in enumerate(self._makers):
-            places = (variant == number).nonzero()[:, 0]
-            if len(places):
-                made = maker.make(seeds[places])
-                ids[places] = made.ids
-                for name in (name for name in regions if name not in self._fixed):
-                    regions[name][places] = made.regions[name]
-                for name, target in targets.items():
-                    target[places] = made.targets[name]
-        return Made(ids, regions, targets)
+        numbers = variant.unique().tolist() or [0]
+        parts = [self._makers[number].make(seeds[variant == number]) for number in numbers]
+        # Back from the order of variants to that of the seeds.
+        order = variant.argsort(stable=True).argsort()
+        made = joined(parts, self._fixed)
+        regions = {name: one if name in self._fixed else one[order] for name, one in made.regions.items()}
+        return Made(made.ids[order], regions, {name: one[order] for name, one in made.targets.items()})
 
     def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
         """The episodes where `mask`, bool [B], is set, rebuilt as worlds `seeds`, int64 [B]; the others unchanged.
@@ -120,13 +114,11 @@ class TaskProgram:
         With `reuse` the tensors of `episodes` are written to, and must not be used afterwards.
         """
         places = mask.nonzero()[:, 0]
-        if len(places) == 0:
-            return episodes
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
-        return self.put(episodes, places, self.start(seeds[places]), reuse=reuse)
+        return self.put(episodes, places, self.start(seeds[places]), reuse=reuse) if len(places) else episodes
 
     def put(self, episodes: Episodes, places: Tensor, new: Episodes, *, reuse: bool = False) -> Episodes:
-        """The episodes with those of numbers `places`, int64 [n], replaced by `new` ones, in order. `reuse` as above."""
+        """The episodes with those of numbers `places`, int64 [n], replaced by `new` ones, in order. `reuse`: see above."""
         if len(places) == len(episodes):
             return new
 
@@ -134,60 +126,51 @@ class TaskProgram:
             return (old if reuse else old.clone()).index_copy_(0, places, fresh)
 
         def all_placed(old: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {
-                name: value if name in self._fixed else placed(value, fresh[name])
-                for name, value in old.items()
-            }
+            return {name: placed(value, fresh[name]) for name, value in old.items()}
 
         world, other = episodes.world, new.world
-        state: Mapping[str, Tensor]
         if isinstance(world.state, PackedState):
-            state = world.state.put(places, other.state, reuse=reuse)
+            state: Mapping[str, Tensor] = world.state.put(places, other.state, reuse=reuse)
         else:
-            state = {name: placed(value, other.state[name]) for name, value in world.state.items()}
-        clock = [placed(getattr(world, name), getattr(other, name)) for name in ("seed", "index", "step")]
+            state = all_placed(world.state, other.state)
+        own = {name: value for name, value in episodes.regions.items() if name not in self._fixed}
         return Episodes(
-            World(self.simulator, state, *clock),
-            placed(episodes.seed, new.seed),
-            placed(episodes.acted, new.acted),
-            placed(episodes.failed, new.failed),
-            all_placed(episodes.regions, new.regions),
-            all_placed(episodes.targets, new.targets),
-            placed(episodes.start, new.start),
-            placed(episodes.before, new.before),
+            World(
+                self.simulator, state, *(placed(getattr(world, one), getattr(other, one)) for one in CLOCK)
+            ),
+            regions={**episodes.regions, **all_placed(own, new.regions)},
+            targets=all_placed(episodes.targets, new.targets),
+            **{name: placed(getattr(episodes, name), getattr(new, name)) for name in ROWS},
         )
 
     # Saving
 
     def saved(self, episodes: Episodes) -> dict[str, Any]:
         """Episodes as plain tensors in dicts, copies on the CPU, that any backend and device can continue from."""
-        world = episodes.world
-        rows = ("seed", "acted", "failed", "start", "before")
-        maps = {"state": world.state, "regions": episodes.regions, "targets": episodes.targets}
+        maps = {"state": episodes.world.state, "regions": episodes.regions, "targets": episodes.targets}
         return {
-            **{name: _copy(getattr(episodes, name)) for name in rows},
+            **{name: _copy(getattr(episodes, name)) for name in ROWS},
             **{name: {key: _copy(value) for key, value in one.items()} for name, one in maps.items()},
-            "clock": [_copy(one) for one in (world.seed, world.index, world.step)],
+            "clock": [_copy(getattr(episodes.world, name)) for name in CLOCK],
         }
 
     def loaded(self, saved: Mapping[str, Any]) -> Episodes:
-        """What `saved` was made of. Raises KeyError and ValueError for episodes of other rules or sizes."""
+        """The episodes that `saved` was given. Raises KeyError and ValueError for those of other rules or sizes."""
         device = self.simulator.device
 
         def tensors(one: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {name: value.to(device, copy=True) for name, value in one.items()}
+            return {name: _copy(value, device) for name, value in one.items()}
 
         state = tensors(saved["state"])
-        names = [slot.name for slot in self.simulator.slots]
-        if set(state) != set(names) or tuple(state["element"].shape[1:]) != self.task.size:
+        names = {slot.name for slot in self.simulator.slots}
+        if set(state) != names or tuple(state["element"].shape[1:]) != self.task.size:
             raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
-        seed, index, step = (one.to(device, copy=True) for one in saved["clock"])
-        rows = tensors({name: saved[name] for name in ("seed", "acted", "failed", "start", "before")})
+        seed, index, step = (_copy(one, device) for one in saved["clock"])
         return Episodes(
             world=World(self.simulator, state, seed, index, step),
             regions={**tensors(saved["regions"]), **self._fixed},
             targets=tensors(saved["targets"]),
-            **rows,
+            **tensors({name: saved[name] for name in ROWS}),
         )
 
     # Acting
@@ -216,14 +199,12 @@ class TaskProgram:
             success, failure, or no action left. With the last action the free steps have run.
         """
         agent, goal = self.task.agent, self.task.goal
-        if actions is None:
-            nobody = torch.zeros_like(episodes.acted)
-            done = Done(episodes.world, nobody, nobody, nobody)
-        else:
-            done = self._hands.act(episodes.world, actions, reuse=reuse)
+        world, done = episodes.world, dict.fromkeys(DONE, torch.zeros_like(episodes.acted))
+        if actions is not None:
+            world, done = self._hands.act(world, actions, reuse=reuse)
         if seen is not None:
-            seen(done.world)
-        world = self._run(done.world, agent.steps_per_action, params, reuse, seen)
+            seen(world)
+        world = self._run(world, agent.steps_per_action, params, reuse, seen)
         acted = episodes.acted + 1
         last = acted >= agent.actions
         if agent.free_steps:
@@ -231,13 +212,7 @@ class TaskProgram:
         now = episodes.before
         if self._counts_always or bool(last.any()):
             now = self._meter.take(self._given(world, episodes.regions, episodes.targets, params or {}))
-        action = {
-            "taken": acted,
-            "left": agent.actions - acted,
-            "painted": done.painted,
-            "placed": done.placed,
-            "blown": done.blown,
-        }
+        action = {"taken": acted, "left": agent.actions - acted, **done}
         facts = Facts(self._places, now, episodes.start, episodes.before, action)
         nothing = torch.zeros(len(acted), dtype=torch.float64, device=acted.device)
         success, failed = (
@@ -305,8 +280,8 @@ class TaskProgram:
         )
 
 
-def _copy(tensor: Tensor) -> Tensor:
-    return tensor.detach().to("cpu", copy=True)
+def _copy(tensor: Tensor, device: torch.device | str = "cpu") -> Tensor:
+    return tensor.detach().to(device, copy=True)
 
 
 def compile_task(

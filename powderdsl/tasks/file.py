@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -20,14 +19,15 @@ from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.parse import reserved_words as rule_words
 from powderdsl.tasks.agents import read_agent
-from powderdsl.tasks.drawings import Drawer, DrawingPlan, element_ids
+from powderdsl.tasks.drawings import Drawer, DrawingPlan, element_ids, report_unknown
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.keys import TASK_KEYS
 from powderdsl.tasks.stamps import read_stamp
 from powderdsl.tasks.statement_lists import BROKEN, read_items, read_lets
 from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Stamp, Task
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene.amounts import filled_in
+from powderdsl.worlds.scene.amounts import Amount, filled_in, integers
+from powderdsl.worlds.scene.read import can_be_called, two_integers
 from powderdsl.worlds.scene.statements import (
     Statement,
     Word,
@@ -138,9 +138,8 @@ class _TaskReader:
 
     def task(self) -> Task:
         name = self.reader.scalar(self.entries, "task")
-        if name is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,59}", name.text):
-            label = "letters, digits, `-` and `_`, up to 60"
-            self.reporter.error("PD111", "a task's name is a word", name.span, label)
+        if name is not None:
+            can_be_called(name, "a task", self.reporter)
         size = self.size()
         fill = self.fill()
         knobs = self.knobs()
@@ -175,20 +174,17 @@ class _TaskReader:
 
     def size(self) -> Size:
         node = self.node("size")
-        items = node.items if isinstance(node, yaml_tree.Sequence) else ()
-        words = [item.text for item in items if isinstance(item, yaml_tree.Scalar)]
-        numbers = [int(word) for word in words if re.fullmatch(r"[0-9]{1,5}", word)]
         if node is None:
             return 64, 64
-        if len(items) != 2 or len(numbers) != 2 or not all(1 <= one <= MAX_SIDE for one in numbers):
+        size = two_integers(node)
+        if size is None or not all(1 <= one <= MAX_SIDE for one in size):
             label = f"two integers from 1 to {MAX_SIDE}"
             helps = ["size: [64, 64]"]
             self.reporter.error("PD607", "a size is [rows, columns]", first_line(node), label, helps=helps)
             return 64, 64
-        if not fits(self.ruleset, (numbers[0], numbers[1])):
-            problem = size_problem(self.ruleset, (numbers[0], numbers[1]))
-            self.reporter.error("PD607", problem, first_line(node), "does not fit")
-        return numbers[0], numbers[1]
+        if not fits(self.ruleset, size):
+            self.reporter.error("PD607", size_problem(self.ruleset, size), first_line(node), "does not fit")
+        return size
 
     def fill(self) -> int:
         scalar = self.reader.scalar(self.entries, "fill")
@@ -202,9 +198,8 @@ class _TaskReader:
         if word.text in reserved_words() | rule_words() | {*ACTION_WORDS, *FUNCTIONS, *RULE_FUNCTIONS}:
             self.reporter.error("PD311", f"`{word.text}` is a word of the language", word.span, "taken")
         elif word.text in self.taken:
-            self.reporter.error(
-                "PD308", f"`{word.text}` already means something", word.span, "second meaning"
-            )
+            message = f"`{word.text}` already means something"
+            self.reporter.error("PD308", message, word.span, "second meaning")
         elif self._is_name(word.text):
             label = "the rules use this word"
             self.reporter.error("PD308", f"`{word.text}` hides another `{word.text}`", word.span, label)
@@ -228,48 +223,43 @@ class _TaskReader:
         for key, node in self.reader.named(self.node("knobs"), "a knob"):
             self.take(key)
             self.broken.add(key.text)
-            entries = self.reader.mapping(node, "knob", "a knob")
-            bounds = self.amount(self.reader.scalar(entries, "range"))
-            default = self.amount(self.reader.scalar(entries, "default"))
-            if bounds is None or default is None:
-                continue
-            ends = [arg.value for arg in bounds.args if arg.is_number]
-            if bounds.op != "draw" or len(ends) != 2:
-                self.reporter.error(
-                    "PD803", "a knob's range has two integers", bounds.span, "such as `0..64`"
-                )
-                continue
-            low, high = int(ends[0] or 0), int(ends[1] or 0)
-            above = {name: knob.value for name, knob in found.items()}
-            try:
-                value = filled_in(default, above)
-            except ZeroDivisionError:
-                value = default
-            if not value.is_number:
-                label = "an integer, or knobs that stand above this one"
-                helps = suggest(default.span.text if default.span else "", found, "knobs above it")
-                self.reporter.error("PD803", f"the default of `{key.text}`", default.span, label, helps=helps)
-                continue
-            about = self.reader.text(entries, "about")
-            usual = value.integer
-            chosen = int(self.given.get(key.text, usual))
-            for one, span in (
-                (usual, default.span),
-                (chosen, None if key.text in self.given else default.span),
-            ):
-                if not low <= one <= high:
-                    message = f"the knob `{key.text}` must lie in {low}..{high}"
-                    self.reporter.error("PD803", message, span, f"{one} lies outside", notes=[f"it is {one}"])
-            self.broken.discard(key.text)
-            found[key.text] = Knob(key.text, usual, low, high, chosen, about, key.span)
+            knob = self.knob(key, self.reader.mapping(node, "knob", "a knob"), found)
+            if knob is not None:
+                self.broken.discard(key.text)
+                found[key.text] = knob
         for name in self.given:
             if name not in self.taken:
                 helps = suggest(name, found, "knobs") or ("the task has no knobs",)
                 self.reporter.error("PD803", f"no knob `{name}`", None, helps=helps)
         return tuple(found.values())
 
-    def amount(self, scalar: yaml_tree.Scalar | None) -> Any:
-        span = text_span(scalar, self.reporter) if scalar is not None else None
+    def knob(self, key: yaml_tree.Scalar, entries: Entries, above: Mapping[str, Knob]) -> Knob | None:
+        bounds, default = (self.amount(entries, name) for name in ("range", "default"))
+        if bounds is None or default is None:
+            return None
+        low, high = integers(bounds.args) or (None, None) if bounds.op == "draw" else (None, None)
+        if low is None or high is None:
+            self.reporter.error("PD803", "a knob's range has two integers", bounds.span, "such as `0..64`")
+            return None
+        try:
+            value = filled_in(default, {name: knob.value for name, knob in above.items()})
+        except ZeroDivisionError:
+            value = default
+        if not value.is_number:
+            label = "an integer, or knobs that stand above this one"
+            helps = suggest(default.span.text if default.span else "", above, "knobs above it")
+            self.reporter.error("PD803", f"the default of `{key.text}`", default.span, label, helps=helps)
+            return None
+        usual = value.integer
+        chosen = int(self.given.get(key.text, usual))
+        for one, span in ((usual, default.span), (chosen, None if key.text in self.given else default.span)):
+            if not low <= one <= high:
+                message = f"the knob `{key.text}` must lie in {low}..{high}"
+                self.reporter.error("PD803", message, span, f"{one} lies outside", notes=[f"it is {one}"])
+        return Knob(key.text, usual, low, high, chosen, self.reader.text(entries, "about"), key.span)
+
+    def amount(self, entries: Entries, key: str) -> Amount | None:
+        span = text_span(self.reader.scalar(entries, key), self.reporter)
         return read_amount(span, self.reporter) if span is not None else None
 
     def regions(self) -> dict[str, tuple[Statement, ...]]:
@@ -304,27 +294,22 @@ class _TaskReader:
     def splits(self, plan: DrawingPlan, size: Size) -> tuple[tuple[Split, ...], set[str]]:
         """All splits, and the parts that any of them uses."""
         about = self.reader.text(self.entries, "about")
-        plans: list[tuple[str, str, list[DrawingPlan]]] = [("train", about, [plan])]
+        plans = [("train", about, [plan])]
         for key, node in self.reader.named(self.node("splits"), "a split"):
             entries = self.reader.mapping(node, "split", "a split")
             base = self.varied(plan, entries, key.text)
-            stands = entries.get("stands")
-            variants = [base] if stands is None else self.stands(base, stands[1])
-            told = self.reader.text(entries, "about")
+            variants = self.stands(base, entries["stands"][1]) if "stands" in entries else [base]
             if key.text == "train":
-                self.reporter.error(
-                    "PD302", "the split `train` is there already", key.span, "it is what the task itself says",
-                    helps=["choose another name, or change `generate`, `let` and `parts` of the task"],
-                )  # fmt: skip
-            plans.append((key.text, told, variants))
+                label = "it is what the task itself says"
+                helps = ["choose another name, or change `generate`, `let` and `parts` of the task"]
+                message = "the split `train` is there already"
+                self.reporter.error("PD302", message, key.span, label, helps=helps)
+            plans.append((key.text, self.reader.text(entries, "about"), variants))
         splits, used = [], set()
-        for name, told, variants in plans:
-            generators = []
-            for variant in variants:
-                drawer = Drawer(variant, self.ruleset, size, self.reporter)
-                generators.append(drawer.generator())
-                used |= drawer.used_parts
-            splits.append(Split(name, told, tuple(generators)))
+        for name, about, variants in plans:
+            drawers = [Drawer(variant, self.ruleset, size, self.reporter) for variant in variants]
+            splits.append(Split(name, about, tuple(drawer.generator() for drawer in drawers)))
+            used |= {part for drawer in drawers for part in drawer.used_parts}
         return tuple(splits), used
 
     def stands(self, base: DrawingPlan, node: yaml_tree.Node) -> list[DrawingPlan]:
@@ -358,28 +343,25 @@ class _TaskReader:
                     self.reporter.error("PD803", "a knob is one number", amount.span, "no draws here")
             changes["knobs"] = values
         if "let" in entries:
-            given = read_lets(entries["let"][1], self.reader)
             here = dict.fromkeys(word.text for word, _ in plan.lets)
-            for word, _ in given:
+            other = {}
+            for word, amount in read_lets(entries["let"][1], self.reader):
                 self.known(word, here, "number")
-            other = {word.text: amount for word, amount in given}
+                other[word.text] = amount
             changes["lets"] = [(word, other.get(word.text, amount)) for word, amount in plan.lets]
         if "parts" in entries:
             parts = dict(plan.parts)
             for key, node in self.reader.named(entries["parts"][1], "a part"):
-                self.known(Word(key.text, key.span), plan.parts, "part")
+                self.known(key, plan.parts, "part")
                 parts[key.text] = read_items(node, self.reader)
             changes["parts"] = parts
         if "generate" in entries:
             changes["items"] = read_items(entries["generate"][1], self.reader)
         return replace(plan, **changes)
 
-    def known(self, word: Word, known: Mapping[str, object], what: str) -> None:
+    def known(self, word: Word | yaml_tree.Scalar, known: Mapping[str, object], what: str) -> None:
         if word.text not in known:
-            helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
-            self.reporter.error(
-                "PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps
-            )
+            report_unknown(what, Word(word.text, word.span), known, self.reporter)
 
     def unused(self, plan: DrawingPlan, used: set[str]) -> None:
         """Warn of parts that nothing uses."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
+from itertools import pairwise
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.expressions.literals import read_number
@@ -73,12 +75,10 @@ class GoalChecker:
     def condition(self, syntax: Syntax) -> Expr | None:
         """A condition that ends an episode, or None after a report."""
         found = self.number(syntax)
-        if found is not None and found.kind != FLAG:
-            self.typer.reporter.error(
-                "PD401", "expected a condition, found a number", syntax.span, "compare it: `… > 0`"
-            )
-            return None
-        return found
+        if found is None or found.kind == FLAG:
+            return found
+        self._not_a_condition(syntax)
+        return None
 
     def _checked(self, syntax: Syntax) -> Expr | None:
         self.typer.start_rule(syntax.span)
@@ -106,10 +106,9 @@ class GoalChecker:
             return Expr("neg", REAL, (self.scalar(parts[0]),))
         if kind in _BINARY:
             first, second = self.scalar(parts[0]), self.scalar(parts[1])
-            if kind in ("divide", "mod") and _always_zero(second):
-                raise self.typer.fail(
-                    "PD402", "division by zero", parts[1].span, "this is 0", "divide by another number"
-                )
+            if kind in ("divide", "mod") and _constant(second) == 0:
+                fix = "divide by another number"
+                raise self.typer.fail("PD402", "division by zero", parts[1].span, "this is 0", fix)
             return Expr(_BINARY[kind], REAL, (first, second))
         if kind == "choose":
             yes, condition, no = parts
@@ -126,24 +125,22 @@ class GoalChecker:
     def truth(self, syntax: Syntax) -> Expr:
         found = self.scalar(syntax)
         if found.kind != FLAG:
-            raise self.typer.fail(
-                "PD401", "expected a condition, found a number", syntax.span, "compare it: `… > 0`"
-            )
+            raise self._not_a_condition(syntax)
         return found
+
+    def _not_a_condition(self, syntax: Syntax) -> Poisoned:
+        message = "expected a condition, found a number"
+        return self.typer.fail("PD401", message, syntax.span, "compare it: `… > 0`")
 
     def compare(self, syntax: Syntax) -> Expr:
         values = [self.scalar(part) for part in syntax.children]
-        found: Expr | None = None
-        for i, sign in enumerate(syntax.text.split()):
-            left, right = values[i], values[i + 1]
+        found = []
+        for sign, (left, right) in zip(syntax.text.split(), pairwise(values), strict=True):
             if sign in (">", ">="):
                 left, right, sign = right, left, sign.replace(">", "<")
             one = Expr(_COMPARE.get(sign, "eq"), FLAG, (left, right))
-            if sign == "!=":
-                one = Expr("not", FLAG, (one,))
-            found = one if found is None else Expr("and", FLAG, (found, one))
-        assert found is not None
-        return found
+            found.append(Expr("not", FLAG, (one,)) if sign == "!=" else one)
+        return reduce(lambda a, b: Expr("and", FLAG, (a, b)), found)
 
     def name(self, syntax: Syntax) -> Expr:
         if syntax.text in self.knobs:
@@ -158,9 +155,8 @@ class GoalChecker:
         text = syntax.span.text
         if syntax.kind == "name" and self.typer.find(syntax.text, syntax.span, self.scope) is None:
             helps = suggest(syntax.text, [*names, *self.typer.symbols.names()])
-            return self.typer.fail(
-                "PD301", f"unknown name `{syntax.text}`", syntax.span, "not defined", *helps
-            )
+            message = f"unknown name `{syntax.text}`"
+            return self.typer.fail("PD301", message, syntax.span, "not defined", *helps)
         return self.typer.fail(
             "PD401",
             "expected one number of the whole world",
@@ -185,7 +181,7 @@ class GoalChecker:
             raise self.typer.fail("PD406", message, syntax.span, "", *usage)
         if name in ARITHMETIC:
             values = [self.scalar(part) for part in parts]
-            if len(values) == 1:
+            if name == "abs":
                 return Expr(name, REAL, (values[0],))
             return reduce(lambda a, b: Expr(name, REAL, (a, b)), values)
         if name in MEMORIES:
@@ -200,10 +196,7 @@ class GoalChecker:
     def measure(self, how: str, cells: Syntax) -> Measure:
         if how == "match":
             if cells.kind != "name" or cells.text not in self.targets:
-                helps = suggest(cells.text, self.targets, "targets") or ("the task defines no targets",)
-                raise self.typer.fail(
-                    "PD802", f"unknown target `{cells.text}`", cells.span, "not defined", *helps
-                )
+                raise self._unknown("target", cells, self.targets)
             return Measure("match", None, None, cells.text)
         region = None
         if cells.kind == "in_" and cells.children[1].kind == "name":
@@ -211,12 +204,12 @@ class GoalChecker:
             if word.text in self.regions:
                 region, cells = word.text, cells.children[0]
             elif self.typer.find(word.text, word.span, self.scope) is None:
-                helps = suggest(word.text, self.regions, "regions") or ("the task defines no regions",)
-                raise self.typer.fail(
-                    "PD802", f"unknown region `{word.text}`", word.span, "not defined", *helps
-                )
-        value = self.cells(how, cells)
-        return Measure(how, value, region)
+                raise self._unknown("region", word, self.regions)
+        return Measure(how, self.cells(how, cells), region)
+
+    def _unknown(self, what: str, word: Syntax, known: frozenset[str]) -> Poisoned:
+        helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
+        return self.typer.fail("PD802", f"unknown {what} `{word.text}`", word.span, "not defined", *helps)
 
     def cells(self, how: str, syntax: Syntax) -> Expr:
         """The expression of each cell that a measure is taken of."""
@@ -225,7 +218,7 @@ class GoalChecker:
             found = self.typer.flag(operand, syntax.span)
         else:
             value = self.typer.value(operand, syntax.span)
-            if isinstance(value, Number) or value.kind.name not in _SUMMABLE:
+            if isinstance(value, Number) or value.kind.name not in ("int", "flag", "real"):
                 raise self.typer.wrong(value, "a number of each cell", syntax.span, "such as a field")
             found = value
         if any(part.op == "draw" for part in found.walk()):
@@ -246,29 +239,21 @@ class GoalChecker:
         return Syntax("and_", parts, "", syntax.span)
 
 
-_SUMMABLE = ("int", "flag", "real")
-
-
 _CONSTANT: dict[str, Callable[..., float]] = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "mod": lambda a, b: a % b,
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "mod": operator.mod,
     "min": min,
     "max": max,
-    "neg": lambda a: -a,
+    "neg": operator.neg,
     "abs": abs,
 }
 
 
-def _always_zero(scalar: Expr) -> bool:
-    """Whether a number comes to 0 in every world."""
-    return _constant(scalar) == 0
-
-
 def _constant(scalar: Expr) -> float | None:
-    """What numbers alone come to; None where the world matters. Divisors are known not to be 0."""
+    """The value of numbers alone; None where the world matters. Divisors are known not to be 0."""
     if scalar.op == "const":
         return float(scalar.value)
     args = [_constant(arg) for arg in scalar.args]

@@ -1,18 +1,43 @@
-"""Tasks by name or path. Needs no torch."""
+"""Tasks by name or path. Which names mean tasks is known without reading one; nothing here needs torch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.compiler import shipped
-from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, suggest
-from powderdsl.model.composition.palette import Palette
+from powderdsl.diagnostics import Diagnostic, Reporter, Severity, suggest
 from powderdsl.syntax.sources import read_source
-from powderdsl.tasks.file import read_task
-from powderdsl.tasks.names import shipped_tasks
-from powderdsl.tasks.task import Task
+from powderdsl.system.reading import open_regular
+from powderdsl.system.writing import failure
+
+if TYPE_CHECKING:
+    from powderdsl.model.composition.palette import Palette
+    from powderdsl.tasks.task import Task
+
+MAX_HEAD = 1 << 16
+"""Bytes of comments that a task's file may begin with."""
+
+
+def shipped_tasks() -> list[str]:
+    """Names of the tasks that come with powderdsl."""
+    return sorted(path.stem for path in shipped("tasks").glob("*.yaml"))
+
+
+def is_task(name: str) -> bool:
+    """Whether a name or path means a task: a shipped one, or a file that begins with ``task:``."""
+    if name in shipped_tasks():
+        return True
+    if not name.lower().endswith((".yaml", ".yml")):
+        return False
+    try:
+        with open_regular(name) as file:
+            head = file.read(MAX_HEAD).decode("utf-8-sig", errors="replace")
+    except OSError:
+        return False
+    lines = (line.strip() for line in head.splitlines())
+    return next((line for line in lines if line and not line.startswith("#")), "").startswith("task:")
 
 
 def load_task(
@@ -22,6 +47,7 @@ def load_task(
     params: Mapping[str, Any] | None = None,
     packs: Sequence[str] = (),
     palette: Palette | None = None,
+    reporter: Reporter | None = None,
 ) -> Task:
     """A shipped task by name, or a file.
 
@@ -30,37 +56,31 @@ def load_task(
         params: values for parameters of its rules, by qualified name.
         packs: names or files of packs that are added to its rules.
         palette: ids that were recorded, as `compiler.load` takes them.
+        reporter: where warnings and notes go.
 
     Raises:
         CompileError: with everything that is wrong.
     """
-    return load_task_with_diagnostics(name_or_path, knobs=knobs, params=params, packs=packs, palette=palette)[
-        0
-    ]
+    from powderdsl.tasks.file import read_task  # brings numpy
 
-
-def load_task_with_diagnostics(
-    name_or_path: str | Path,
-    *,
-    knobs: Mapping[str, int] | None = None,
-    params: Mapping[str, Any] | None = None,
-    packs: Sequence[str] = (),
-    palette: Palette | None = None,
-) -> tuple[Task, tuple[Diagnostic, ...]]:
-    """Like `load_task`; the second value has the warnings and notes."""
-    reporter = Reporter()
+    reporter = reporter or Reporter()
     for name, value in (knobs or {}).items():
         if isinstance(value, bool) or not isinstance(value, int):
             raise TypeError(f"the knob `{name}` takes an integer, found {value!r}")
-    text = str(name_or_path)
-    path = shipped("tasks") / f"{text}.yaml" if text in shipped_tasks() else Path(text)
-    if text not in shipped_tasks() and not text.lower().endswith((".yaml", ".yml")):
-        helps = suggest(text, shipped_tasks()) or ("shipped: " + ", ".join(shipped_tasks()),)
-        reporter.error("PD801", f"no task `{text[:80]}`", None, helps=helps)
-    source = None if reporter.has_errors else read_source(path, reporter)
+    text, known = str(name_or_path), shipped_tasks()
+    if text not in known and not text.lower().endswith((".yaml", ".yml")):
+        helps = suggest(text, known) or ("shipped: " + ", ".join(known),)
+        raise failure("PD801", f"no task `{text[:80]}`", helps=helps)
+    source = read_source(shipped("tasks") / f"{text}.yaml" if text in known else Path(text), reporter)
     reporter.raise_if_errors()
     assert source is not None
-    task = read_task(source, reporter, knobs=knobs, params=params, packs=packs, palette=palette)
+    return read_task(source, reporter, knobs=knobs, params=params, packs=packs, palette=palette)
+
+
+def load_task_with_diagnostics(name_or_path: str | Path, **how: Any) -> tuple[Task, tuple[Diagnostic, ...]]:
+    """Like `load_task`; the second value has the warnings and notes."""
+    reporter = Reporter()
+    task = load_task(name_or_path, reporter=reporter, **how)
     return task, tuple(one for one in reporter.diagnostics if one.severity is not Severity.ERROR)
 
 
@@ -68,7 +88,5 @@ def check_split(task: Task, split: str) -> None:
     """Raises CompileError (PD801) for a split that the task does not have."""
     names = [one.name for one in task.splits]
     if split not in names:
-        reporter = Reporter()
         helps = suggest(split, names, "splits") or ("splits: " + ", ".join(names),)
-        reporter.error("PD801", f"the task {task.name} has no split `{str(split)[:80]}`", None, helps=helps)
-        raise CompileError(reporter.diagnostics)
+        raise failure("PD801", f"the task {task.name} has no split `{str(split)[:80]}`", helps=helps)

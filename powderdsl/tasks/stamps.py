@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from powderdsl.diagnostics import CompileError, Span, suggest
+from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.model.schema import Reader
 from powderdsl.model.types import Element, Ruleset
 from powderdsl.syntax import yaml_tree
@@ -30,20 +30,16 @@ def read_stamp(key: yaml_tree.Scalar, node: yaml_tree.Node, reader: Reader, rule
         label = "neither `art` nor `scene`" if art is None else "both `art` and `scene`"
         reader.reporter.error("PD109", f"the stamp `{key.text}` needs one picture", key.span, label)
         return None
-    ids: np.ndarray | None
-    if scene is not None:
-        ids = _named(scene, reader, ruleset)
-    else:
-        assert art is not None
+    ids = _named(scene, reader, ruleset) if scene is not None else None
+    if art is not None:
         ids = _drawn(art, _legend(entries, reader), reader, ruleset)
     if ids is None:
         return None
     if max(ids.shape) > MAX_SIDE:
-        reader.reporter.error(
-            "PD607", f"a stamp of {ids.shape[0]}×{ids.shape[1]} cells", key.span, "too large"
-        )
+        message = f"a stamp of {ids.shape[0]}×{ids.shape[1]} cells"
+        reader.reporter.error("PD607", message, key.span, "too large")
         return None
-    return Stamp(key.text, tuple(tuple(int(one) for one in row) for row in ids))
+    return Stamp(key.text, tuple(map(tuple, ids.tolist())))
 
 
 def _legend(entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], reader: Reader) -> dict[str, str]:
@@ -67,19 +63,14 @@ def _drawn(
         helps = ["write `art: |`, and the rows below it"]
         reader.reporter.error("PD107", "art with escapes", art.span, "quoted, on one line", helps=helps)
         return None
-    span = art.content
     try:
-        return parse_ascii(span, [*elements, hole], reader.reporter, {"?": "?", **legend})
+        return parse_ascii(art.content, [*elements, hole], reader.reporter, {"?": "?", **legend})
     except CompileError as error:
         for one in error.diagnostics:
-            reader.reporter.error(one.code, one.message, one.primary.span or _first(art), helps=one.helps)
+            reader.reporter.error(one.code, one.message, one.primary.span or art.span, helps=one.helps)
     except ValueError as error:
-        reader.reporter.error("PD110", str(error), _first(art))
+        reader.reporter.error("PD110", str(error), art.span)
     return None
-
-
-def _first(scalar: yaml_tree.Scalar) -> Span:
-    return scalar.span
 
 
 def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> np.ndarray | None:
@@ -103,10 +94,8 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> np.ndarr
         found = find_scene(beside)
         setting = next((one for one in found.paints if isinstance(one, Setting)), None)
         if setting is not None:
-            label = "a picture is made of elements only"
-            reader.reporter.error(
-                "PD605", f"the scene `{found.name}` sets `{setting.name}`", word.span, label
-            )
+            message = f"the scene `{found.name}` sets `{setting.name}`"
+            reader.reporter.error("PD605", message, word.span, "a picture is made of elements only")
             return None
         return draw_scene(found, ruleset)
     except CompileError as error:

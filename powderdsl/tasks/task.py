@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.types import Expr, Ruleset
@@ -141,6 +142,10 @@ class Agent:
     """Steps that run inside the last action, after its own."""
     speed_field: str | None
     speed: float
+
+    def first_line(self, axis: int, place: Any, side: int) -> Any:
+        """The first row (axis 0) or column of the brush at bins `place`, integers or tensors; perhaps outside the grid."""
+        return (2 * place + 1) * side // (2 * self.bins[axis]) - self.brush[axis] // 2
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from powderdsl.envs.vector import PowderVectorEnv
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import TaskProgram, load_task
-from powderdsl.tasks.names import shipped_tasks
+from powderdsl.tasks.shipped import shipped_tasks
 
 
 @pytest.fixture(scope="module")

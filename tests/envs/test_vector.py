@@ -329,7 +329,7 @@ def test_two_copies_agree_step_by_step(small: TaskProgram, make: Callable[..., A
 def test_every_shipped_task_is_registered_and_batched() -> None:
     import powderdsl.envs  # noqa: F401
     from powderdsl.envs.register import env_id
-    from powderdsl.tasks.names import shipped_tasks
+    from powderdsl.tasks.shipped import shipped_tasks
 
     assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())
     env = gymnasium.make_vec("powderdsl/SandPushing-v0", num_envs=3, backend="torch", observation="compact")

@@ -10,8 +10,7 @@ import pytest
 
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.tasks.file import read_task
-from powderdsl.tasks.names import shipped_tasks
-from powderdsl.tasks.shipped import load_task
+from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.worlds.raster import Shape, mask
 from powderdsl.worlds.scene import load_scenes
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from powderdsl.tasks.names import shipped_tasks
-from powderdsl.tasks.shipped import load_task
+from powderdsl.tasks.shipped import load_task, shipped_tasks
 from tests.tasks.conftest import RULES
 from tests.tasks.witnesses import WITNESSES, Act, Seen
 

@@ -19,7 +19,7 @@ from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short
 from powderdsl.model.types import Ruleset
-from powderdsl.tasks.names import is_task
+from powderdsl.tasks.shipped import is_task
 
 if TYPE_CHECKING:
     from powderdsl.ir.cost import PassCost

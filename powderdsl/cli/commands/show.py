@@ -17,7 +17,7 @@ from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
 from powderdsl.model.types import Element, Pass, Property, Ruleset, Value
-from powderdsl.tasks.names import is_task
+from powderdsl.tasks.shipped import is_task
 
 
 @click.command("show")

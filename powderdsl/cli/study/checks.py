@@ -17,8 +17,7 @@ from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.experiments.studies.study import Study, StudyStep
-from powderdsl.tasks.names import is_task
-from powderdsl.tasks.shipped import check_split, load_task
+from powderdsl.tasks.shipped import check_split, is_task, load_task
 
 if TYPE_CHECKING:
     from powderdsl.tasks.task import Task

@@ -8,7 +8,7 @@ Painting happens on bits: an id is a few planes, a word is 64 rows of a column.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,6 +45,15 @@ class Made:
     ids: Tensor
     regions: Mapping[str, Tensor]
     targets: Mapping[str, Tensor]
+
+
+def joined(parts: Sequence[Made], fixed: Mapping[str, Tensor]) -> Made:
+    """The worlds of all parts in a row. Regions of `fixed` are the same in all worlds."""
+    regions = dict(fixed)
+    for name in (name for name in parts[0].regions if name not in fixed):
+        regions[name] = torch.cat([one.regions[name].expand(len(one.ids), -1, -1) for one in parts])
+    targets = {name: torch.cat([one.targets[name] for one in parts]) for name in parts[0].targets}
+    return Made(torch.cat([one.ids for one in parts]), regions, targets)
 
 
 class DrawTable:
@@ -187,13 +196,7 @@ class WorldMaker:
         if self.device.type == "cpu":
             chunk = max(1, CHUNK_CELLS // max(self.size[0] * self.size[1], self.table.size))
         made = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
-        if len(made) == 1:
-            return made[0]
-        regions = dict(made[0].regions)
-        for name in (name for name in regions if name not in self.fixed_cells):
-            regions[name] = torch.cat([one.regions[name] for one in made])
-        targets = {name: torch.cat([one.targets[name] for one in made]) for name in made[0].targets}
-        return Made(torch.cat([one.ids for one in made]), regions, targets)
+        return made[0] if len(made) == 1 else joined(made, self.fixed_cells)
 
     def _chunk(self, seeds: Tensor) -> Made:
         hashes = Hashes(seeds, self.table)
@@ -287,7 +290,8 @@ class WorldMaker:
             assert count is not None
             repeats = group.most
             if planes.device.type == "cpu" and repeats > 1:
-                repeats = int(count.max())  # what no world of the batch repeats is not drawn
+                # What no world of the batch repeats is not drawn.
+                repeats = int(count.max()) if count.numel() else 0
             if repeats == 0:
                 continue
             active = torch.arange(repeats, device=self.device) < count

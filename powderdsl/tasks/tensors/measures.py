@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -143,7 +143,7 @@ class _Part:
             name: ir_type(slot.kind, ruleset.slots) for slot in table.values() for name in slot_names(slot)
         }
         exprs = [measure.value for _, measure in measures if measure.value is not None]
-        regions = sorted({name for expr in exprs for name in _regions_of(expr)})
+        regions = sorted({str(part.value) for expr in exprs for part in expr.walk() if part.op == "let"})
         state = {name: build.input(name, type) for name, type in types.items()}
         lets: dict[str, Node | tuple[Node, Node]] = {name: build.input(name, FLAG) for name in regions}
         outputs = []
@@ -151,9 +151,8 @@ class _Part:
             node = lower_expression(expr, Context(ruleset, build, state, lets, table))
             assert isinstance(node, Node)
             outputs.append((f"measure {number}", node))
-        rows = [SlotType(name, type, 0, False) for name, type in types.items()]
-        rows += [SlotType(name, FLAG, 0, False) for name in regions]
-        rows += [SlotType(name, node.type, 0, False) for name, node in outputs]
+        every = {**types, **dict.fromkeys(regions, FLAG), **{name: node.type for name, node in outputs}}
+        rows = [SlotType(name, type, 0, False) for name, type in every.items()]
         params = tuple((p.name, p.kind.name) for p in ruleset.params)
         streams = tuple((s.name, s.ident, s.bits) for s in ruleset.streams)
         graph = PassGraph("measures", ruleset.name, (), tuple(outputs))
@@ -184,10 +183,6 @@ class _Part:
 _WORKING = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
 
 
-def _regions_of(expr: Expr) -> set[str]:
-    return {str(part.value) for part in expr.walk() if part.op == "let"}
-
-
 @dataclass(frozen=True)
 class Facts:
     """What a scalar is calculated from: measures now, at the start and before the action, float64 [B, n]; and the action."""
@@ -210,43 +205,29 @@ def scalar_value(scalar: Expr, facts: Facts) -> Tensor:
             return facts.action[scalar.value].double()
         case "start" | "before":
             then = facts.start if scalar.op == "start" else facts.before
-            past = Facts(facts.measures, then, facts.start, facts.before, facts.action)
-            return scalar_value(scalar.args[0], past)
-    a, *rest = (scalar_value(arg, facts) for arg in scalar.args)
-    b = rest[0] if rest else a
-    match scalar.op:
-        case "add":
-            return a + b
-        case "sub":
-            return a - b
-        case "mul":
-            return a * b
-        case "div":
-            return torch.where(b == 0, torch.zeros_like(a), a / b)
-        case "quotient":
-            return torch.where(b == 0, torch.zeros_like(a), torch.floor(a / b))
-        case "mod":
-            return torch.where(b == 0, torch.zeros_like(a), torch.remainder(a, b))
-        case "neg":
-            return -a
-        case "abs":
-            return a.abs()
-        case "min":
-            return torch.minimum(a, b)
-        case "max":
-            return torch.maximum(a, b)
-        case "lt":
-            return (a < b).double()
-        case "le":
-            return (a <= b).double()
-        case "eq":
-            return (a == b).double()
-        case "and":
-            return a * b
-        case "or":
-            return torch.maximum(a, b)
-        case "not":
-            return 1 - a
-        case "choose":
-            return torch.where(a != 0, b, rest[1])
-    raise AssertionError(scalar.op)
+            return scalar_value(scalar.args[0], replace(facts, now=then))
+    args = [scalar_value(arg, facts) for arg in scalar.args]
+    found = _VALUES[scalar.op](*args)
+    return found.masked_fill(args[1] == 0, 0) if scalar.op in ("div", "quotient", "mod") else found
+
+
+_VALUES: Mapping[str, Callable[..., Tensor]] = {
+    "add": torch.add,
+    "sub": torch.sub,
+    "mul": torch.mul,
+    "div": torch.div,
+    "quotient": lambda a, b: torch.floor(a / b),
+    "mod": torch.remainder,
+    "neg": torch.neg,
+    "abs": torch.abs,
+    "min": torch.minimum,
+    "max": torch.maximum,
+    "lt": lambda a, b: (a < b).double(),
+    "le": lambda a, b: (a <= b).double(),
+    "eq": lambda a, b: (a == b).double(),
+    "and": torch.mul,
+    "or": torch.maximum,
+    "not": lambda a: 1 - a,
+    "choose": lambda condition, yes, no: torch.where(condition != 0, yes, no),
+}
+"""What operations do with numbers float64 [B], flags among them. Divisions by 0 give 0: see `scalar_value`."""
