@@ -68,7 +68,7 @@ class Integer(click.ParamType):
 
 
 class CountType(click.ParamType):
-    """A whole number, also written as ``1e6`` or ``200_000``. Whether it is in range the settings say."""
+    """An integer, also written as ``1e6`` or ``200_000``. The settings check whether it is in range."""
 
     name = "N"
 
@@ -201,6 +201,10 @@ def backend_option(
     default: str, about: str = "Backend that runs the rules."
 ) -> Callable[[Decorated], Decorated]:
     return click.option("--backend", type=BackendType(), default=default, help=about)
+
+
+def device_option(function: Decorated) -> Decorated:
+    return click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")(function)
 
 
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:

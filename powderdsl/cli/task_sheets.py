@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,22 +107,12 @@ def _agent_text(agent: Agent, task: Task) -> str:
 
 
 def _data(task: Task) -> dict[str, Any]:
-    agent = task.agent
     return {
         "name": task.name,
         "about": task.about,
         "rules": task.ruleset.name,
         "size": list(task.size),
-        "agent": {
-            "choices": list(agent.choices),
-            "brush": list(agent.brush),
-            "bins": list(agent.bins),
-            "actions": agent.actions,
-            "steps_per_action": agent.steps_per_action,
-            "free_steps": agent.free_steps,
-            "speed": agent.speed,
-            "speed_field": agent.speed_field,
-        },
+        "agent": asdict(task.agent),
         "splits": [
             {"name": one.name, "about": one.about, "stands": [v.name for v in one.variants]}
             for one in task.splits
@@ -150,9 +142,7 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
     if longest * factor > MAX_SIDE:
         raise BadInput(f"a picture of {longest * factor:,} pixels a side: show fewer --seeds")
     images = scale(drawn, factor)
-    for number, (name, masks) in enumerate(episodes.regions.items()):
-        del name
-        color = OUTLINES[number % len(OUTLINES)]
+    for color, masks in zip(cycle(OUTLINES), episodes.regions.values(), strict=False):
         for world, image in enumerate(images):
             outline(image, masks[world % len(masks)].numpy(), factor, color)
     write_png(out, contact_sheet(images, columns=columns))

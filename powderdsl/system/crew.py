@@ -1,4 +1,4 @@
-"""Processes that work through tasks: one that dies or hangs costs its task and says so, and the others continue."""
+"""Processes that work through tasks. If one dies or hangs, its task is reported as lost, and the others continue."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -19,7 +20,7 @@ from powderdsl.system.interrupts import held_back
 
 Tell = Callable[[Any], None]
 Work = Callable[[Any, Tell], Any]
-"""What a process does with a task: it gives a result, and may tell where it is. Must be importable by name."""
+"""What a process does with a task: returns a result, and may report how far it is. Must be importable by name."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Lost:
-    """A task whose process died (`reason` says how) or was ended for taking too long, and what it told last."""
+    """A task whose process died or took too long (`reason` says which), and what it reported last (`told`)."""
 
     task: Any
     reason: str
@@ -47,18 +48,18 @@ class _Worker:
     busy: bool = False
     told: Any = None
     since: float = 0.0
-    tasks: int = field(default=0)
+    tasks: int = 0
 
 
 def work_through(
     tasks: deque[Any], work: Work, jobs: int, limit: float = math.inf, recycle: int = 200
 ) -> Iterator[Done | Lost]:
-    """Results in the order in which they come. Tasks that the caller appends meanwhile are done too.
+    """Yield results in the order in which they come. Tasks that the caller appends meanwhile are done too.
 
     Args:
         work: runs in `jobs` fresh processes; one is replaced after `recycle` tasks, so that it cannot grow forever.
-        limit: seconds that a task may take, busy or not. Without one, outcomes do not depend on how busy the
-            machine is; tasks must then end by themselves.
+        limit: seconds that a task may take. Without a limit, outcomes do not depend on how busy the machine is;
+            tasks must then end by themselves.
     """
     workers: list[_Worker] = []
     try:
@@ -72,11 +73,8 @@ def work_through(
                     _give(worker, tasks.popleft())
             ready = wait([worker.pipe for worker in workers], timeout=1.0)
             for worker in list(workers):
-                late = worker.busy and time.monotonic() - worker.since > limit
-                if worker.pipe not in ready and not late:
-                    continue
                 outcome = _hear(worker) if worker.pipe in ready else None
-                if outcome is None and late:
+                if outcome is None and worker.busy and time.monotonic() - worker.since > limit:
                     outcome = Lost(worker.task, f"took more than {limit:g} s", worker.told)
                 if outcome is None:
                     continue
@@ -102,14 +100,12 @@ def _start(work: Work) -> _Worker:
 
 def _give(worker: _Worker, task: Any) -> None:
     worker.task, worker.busy, worker.told, worker.since = task, True, None, time.monotonic()
-    try:
+    with suppress(OSError):  # it is dead, which `_hear` reports
         worker.pipe.send(task)
-    except OSError:  # it is dead: `_hear` says so
-        return
 
 
 def _hear(worker: _Worker) -> Done | Lost | None:
-    """What a worker says: a result, its end, or where it is, which is no outcome."""
+    """The outcome that a worker reports: a result or its end. None if it only reports how far it is."""
     try:
         kind, value = worker.pipe.recv()
     except (EOFError, OSError):
@@ -132,8 +128,8 @@ def _end(worker: _Worker) -> None:
 
 
 def _serve(pipe: Connection, work: Work) -> None:
-    """What a process does: tasks from the pipe, results into it, until nobody is there."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started us
+    """The loop of a worker process: tasks from the pipe, results into it, until its other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started us
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:
@@ -144,7 +140,7 @@ def _serve(pipe: Connection, work: Work) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent is gone, whatever it is doing: nobody waits for the result."""
+    """End this process as soon as its parent has ended: nobody waits for the result."""
     parent = parent_process()
     assert parent is not None
     wait([parent.sentinel])

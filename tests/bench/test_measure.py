@@ -10,9 +10,9 @@ import pytest
 
 import powderdsl
 from powderdsl.experiments.bench import make_plan, measure, report_data, report_text
-from powderdsl.experiments.bench.figures import Costs, Ready, Sample, Started, make_report
+from powderdsl.experiments.bench.figures import CellFigures, make_report
 from powderdsl.experiments.bench.machine import Machine, Memory, peak_growth
-from powderdsl.experiments.bench.measure import interleaved, measure_events
+from powderdsl.experiments.bench.measure import interleaved, measuring
 from powderdsl.experiments.bench.tables import aligned, number
 from powderdsl.experiments.bench.workloads import start_worlds
 from powderdsl.model.state import slots
@@ -139,16 +139,16 @@ def test_rounds_are_interleaved():
 
 def test_all_cells_are_ready_before_the_first_round_and_costs_come_last(rules, torch):
     plan = make_plan(rules, backends=["torch", "arrays"], profile=True, **TINY)
-    kinds = [type(event) for event in measure_events(plan)]
-    assert kinds == [Started, Ready] * 4 + [Sample] * 8 + [Started, Costs] * 4
+    kinds = [kind for kind, _ in measuring(plan, [])]
+    assert kinds == ["compile"] * 4 + ["measure"] * 8 + ["profile"] * 4
 
 
 def test_torch_has_its_threads_back(rules, torch):
     before = torch.get_num_threads()
-    events = measure_events(make_plan(rules, backends=["torch"], threads=[before + 1], **TINY))
-    next(event for event in events if isinstance(event, Ready))
+    parts = measuring(make_plan(rules, backends=["torch"], threads=[before + 1], **TINY), [])
+    next(kind for kind, _ in parts if kind == "measure")
     assert torch.get_num_threads() == before + 1
-    events.close()
+    parts.close()
     assert torch.get_num_threads() == before
 
 
@@ -217,17 +217,16 @@ def test_a_busy_machine_is_warned_of(rules):
 
 def test_half_a_measurement_is_reported(rules):
     plan = make_plan(rules, rounds=3)
-    first, second = plan.cells
     memory = Memory(None, "not here")
-    events = [Ready(cell, 1.0, 1.0, memory, 100, 2, 5) for cell in plan.cells]
-    report = make_report(plan, MACHINE, [*events, Sample(first, 0, 2.0, 1.0)], interrupted=True)
-    assert [figures.cell for figures in report.cells] == [first]
+    first, second = (CellFigures(cell, 1.0, 1.0, memory, 100, 2, 5) for cell in plan.cells)
+    first.seconds, first.processor_seconds = [2.0], [1.0]
+    report = make_report(plan, MACHINE, [first, second], interrupted=True)
+    assert report.cells == (first,)
     assert report.cells[0].rate.median == 5.0
     assert report.cells[0].processors == 0.5
     text = report_text(report)
     assert "interrupted: 1 of 3 rounds" in text
     assert "memory: not here" in text
-    assert make_report(plan, MACHINE, [Started(second, "compile")]).cells == ()
 
 
 def test_peak_memory_sees_what_was_freed():

@@ -9,7 +9,7 @@ from PIL import Image
 
 import powderdsl
 from powderdsl.experiments.bench import make_plan
-from powderdsl.experiments.bench.figures import Ready, Sample, make_report
+from powderdsl.experiments.bench.figures import CellFigures, make_report
 from powderdsl.experiments.bench.machine import Machine, Memory
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
 
@@ -18,9 +18,9 @@ MACHINE = Machine("Linux", "some processor", 4, "cpu", "3", "2", "none", "0", lo
 
 def a_report(sizes):
     plan = make_plan(powderdsl.load("life"), backends=["arrays", "native"], batches=[1, 32], sizes=sizes)
-    events = [Ready(cell, 1.0, 1.0, Memory(0, "not at all"), 100, 2, 5) for cell in plan.cells]
-    samples = [Sample(cell, number, 1.0 + number, 1.0) for number in range(2) for cell in plan.cells]
-    return make_report(plan, MACHINE, [*events, *samples])
+    memory, times = Memory(0, "not at all"), [1.0, 2.0]
+    cells = [CellFigures(cell, 1.0, 1.0, memory, 100, 2, 5, times, times) for cell in plan.cells]
+    return make_report(plan, MACHINE, cells)
 
 
 def test_several_sizes_have_a_figure_of_their_own(tmp_path):

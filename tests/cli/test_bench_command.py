@@ -9,7 +9,7 @@ import pytest
 
 from powderdsl.cli import exits
 from powderdsl.cli.commands import bench as bench_command
-from powderdsl.experiments.bench.measure import measure_events
+from powderdsl.experiments.bench.measure import measuring
 from tests.cli.commands import powderdsl
 
 QUICK = ("bench", "life", "--size", "6x8", "--rounds", "2", "--seconds", "0.001", "--steps", "2")
@@ -85,13 +85,13 @@ def test_a_plot_is_written(tmp_path):
 
 
 def test_ctrl_c_reports_what_was_measured(monkeypatch, tmp_path):
-    def interrupted(plan):
-        events = measure_events(plan)
-        for _ in range(3):  # a cell begun, the cell ready, one round
-            yield next(events)
+    def interrupted(plan, cells):
+        parts = measuring(plan, cells)
+        for _ in range(2):  # the cell is compiled, one round
+            yield next(parts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench_command, "measure_events", interrupted)
+    monkeypatch.setattr(bench_command, "measuring", interrupted)
     result = powderdsl(*TORCH, "--out", "x.json")
     assert result.exit_code == exits.INTERRUPTED
     assert "interrupted: 1 of 2 rounds" in result.stdout
@@ -101,10 +101,10 @@ def test_ctrl_c_reports_what_was_measured(monkeypatch, tmp_path):
 
 
 def test_ctrl_c_before_anything_was_measured(monkeypatch):
-    def interrupted(plan):
+    def interrupted(plan, cells):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench_command, "measure_events", interrupted)
+    monkeypatch.setattr(bench_command, "measuring", interrupted)
     result = powderdsl(*TORCH, "--plot", "x.png")
     assert result.exit_code == exits.INTERRUPTED
     assert "interrupted: 0 of 2 rounds" in result.stdout

@@ -9,11 +9,20 @@ from typing import Any
 import click
 
 from powderdsl.cli.exits import OK, print_json, user_values
-from powderdsl.cli.options import PATH, BackendType, Integer, SizeType, check_writable, load_rules, set_option
+from powderdsl.cli.options import (
+    PATH,
+    BackendType,
+    Integer,
+    SizeType,
+    check_writable,
+    device_option,
+    load_rules,
+    set_option,
+)
 from powderdsl.cli.progress import progress
-from powderdsl.experiments.bench.figures import Event, Report, Started, make_report, report_data
+from powderdsl.experiments.bench.figures import CellFigures, Report, make_report, report_data
 from powderdsl.experiments.bench.machine import load_average, this_machine
-from powderdsl.experiments.bench.measure import measure_events
+from powderdsl.experiments.bench.measure import measuring
 from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
 from powderdsl.experiments.bench.tables import report_text
@@ -42,29 +51,41 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     help="Backend that runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
 )
 @click.option(
-    "--batch", "batches", type=Integer(1, 1 << 20), multiple=True, default=(1, 32), help="Worlds at once."
+    "--batch",
+    "batches",
+    type=Integer(1, 1 << 20),
+    multiple=True,
+    default=(1, 32),
+    help="Number of worlds in a batch.",
 )
 @click.option("--size", "sizes", type=SizeType(), multiple=True, help="Rows and columns.  [default: 64]")
 @click.option(
-    "--elements", type=Integer(1, 256), multiple=True, help="Only the first N elements in the worlds."
+    "--elements", type=Integer(1, 256), multiple=True, help="Use only the first N elements in the worlds."
 )
-@click.option("--only", metavar="NAME,NAME", callback=_names, help="Only these elements in the worlds.")
+@click.option("--only", metavar="NAME,NAME", callback=_names, help="Use only these elements in the worlds.")
 @click.option("--threads", type=Integer(1, 1024), multiple=True, default=(1,), help="CPU threads.")
 @click.option(
     "--workload", type=click.Choice(list(WORKLOADS)), default="gusts", help="The worlds to start from."
 )
-@click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
-@click.option("--steps", type=Integer(1, 1 << 20), default=16, help="Steps a call, at most.")
-@click.option("--seconds", type=float, default=2.0, help="Measured time of each combination.")
+@device_option
+@click.option("--steps", type=Integer(1, 1 << 20), default=16, help="Maximum steps per call.")
+@click.option("--seconds", type=float, default=2.0, help="Measuring time per combination, in seconds.")
 @click.option(
-    "--rounds", type=Integer(1, 1000), default=5, help="Parts it is measured in, in turn with the others."
+    "--rounds",
+    type=Integer(1, 1000),
+    default=5,
+    help="Rounds: in each, all combinations are measured in turn.",
 )
-@click.option("--seed", type=Integer(0, 2**63 - 1), default=0, help="Of the worlds.")
+@click.option("--seed", type=Integer(0, 2**63 - 1), default=0, help="Seed of the start worlds.")
 @set_option
-@click.option("--profile", is_flag=True, help="Time of each pass.")
+@click.option("--profile", is_flag=True, help="Also measure the time of each pass.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of tables.")
-@click.option("--out", "data", type=PATH, metavar="FILE.json", help="Where else to write the JSON object.")
-@click.option("--plot", type=PATH, metavar="FILE.png", help="Draw rates against batches. Needs matplotlib.")
+@click.option(
+    "--out", "data", type=PATH, metavar="FILE.json", help="Also write the JSON object to this file."
+)
+@click.option(
+    "--plot", type=PATH, metavar="FILE.png", help="Plot rates against batch sizes. Needs matplotlib."
+)
 def command(
     rules: str,
     backends: tuple[str, ...],
@@ -125,17 +146,12 @@ def _usual_backends(device: str) -> tuple[str, ...]:
 def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
     """The report of a plan, or of as much of it as was done when Ctrl-C or another signal came."""
     machine = this_machine(plan.device)
-    events: list[Event] = []
+    cells: list[CellFigures] = []
     interrupt: KeyboardInterrupt | None = None
-    done = 0
     try:
         with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
-            for event in measure_events(plan):
-                events.append(event)
-                what = event.what if isinstance(event, Started) else "measure"
-                done += not isinstance(event, Started)
-                show(done, f"{what} {event.cell.backend}, batch {event.cell.batch}")
+            for done, (what, cell) in enumerate(measuring(plan, cells)):
+                show(done, f"{what} {cell.backend}, batch {cell.batch}")
     except KeyboardInterrupt as caught:
         interrupt = caught
-    report = make_report(plan, machine, events, load_average(), interrupted=interrupt is not None)
-    return report, interrupt
+    return make_report(plan, machine, cells, load_average(), interrupted=interrupt is not None), interrupt

@@ -38,7 +38,7 @@ def command() -> None:
 
 
 @command.command("list")
-@click.option("--json", "as_json", is_flag=True, help="One JSON list, with all that is known.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON list with all details.")
 def list_entries(as_json: bool) -> None:
     """What has been compiled, the last used first."""
     from powderdsl.targets.cache import entries
@@ -64,7 +64,7 @@ def list_entries(as_json: bool) -> None:
     type=AgeType(),
     default=0.0,
     show_default=False,
-    help="Only what was not used for so long, such as 30d.",
+    help="Remove only what has not been used for this time, such as 30d.",
 )
 def clear_entries(older_than: float) -> None:
     """Remove compiled code. What still runs continues; it will be compiled again when it is next needed."""

@@ -50,10 +50,10 @@ class Checked:
 @layout_options("One JSON list instead of text.", ("short", "One line for each mistake, without carets."))
 @click.option("--notes", is_flag=True, help="Also list notes, such as inactive rules.")
 @click.option("--warnings-as-errors", is_flag=True, help="Exit with 1 if there are warnings.")
-@click.option("--quick", is_flag=True, help="Do not try invariants: only what the rules themselves say.")
-@click.option("--cost", is_flag=True, help="Also say what each pass costs; in JSON as a second key.")
+@click.option("--quick", is_flag=True, help="Check only the rules themselves; do not try invariants.")
+@click.option("--cost", is_flag=True, help="Also report what each pass costs; in JSON as a second key.")
 @click.option(
-    "--ledger", is_flag=True, help="Also say what rules create, destroy and move; in JSON as a key."
+    "--ledger", is_flag=True, help="Also report what rules create, destroy and move; in JSON as a key."
 )
 def command(
     rules: tuple[str, ...],

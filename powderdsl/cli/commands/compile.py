@@ -18,6 +18,7 @@ from powderdsl.syntax.ast import Syntax
 
 if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
+    from powderdsl.ir.segments import Segment
 
 STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 
@@ -34,10 +35,12 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 )
 @backend_option("auto", "Whose schedule or kernels are printed.")
 @click.option(
-    "--after", metavar="STAGE", help="The schedule after this stage of the planner; default: the last."
+    "--after",
+    metavar="STAGE",
+    help="Print the schedule after this stage of the planner.  [default: the last]",
 )
-@click.option("--pass", "pass_name", metavar="NAME", help="Only this pass of the rules.")
-@click.option("-o", "--out", type=PATH, metavar="FILE", help="Where to write it.")
+@click.option("--pass", "pass_name", metavar="NAME", help="Print only this pass of the rules.")
+@click.option("-o", "--out", type=PATH, metavar="FILE", help="Write to this file instead of stdout.")
 @set_option
 def command(
     rules: str,
@@ -71,37 +74,30 @@ def _checked(
     """The stages from the checked model on."""
     ruleset = load_rules(rules, settings)
     if pass_name is not None:
-        _check_pass(pass_name, [p.name for p in ruleset.passes])
+        _check_known("pass", pass_name, [p.name for p in ruleset.passes], "passes")
     if stage == "model":
         return print_model(ruleset, None if pass_name is None else [pass_name])
     program = lower(ruleset)
-    if stage == "ir":
-        from powderdsl.ir.text import print_program
-
-        return print_program(program, pass_name)
-    if stage == "planes":
-        return _planes(program, pass_name)
-    if stage == "schedule":
-        return _schedules(program, backend, after, pass_name)
-    return _kernels(program, backend, pass_name)
-
-
-def _planes(program: Program, pass_name: str | None) -> str:
-    """The program on bit planes, part by part; passes that planes cannot carry as they are."""
     from powderdsl.ir.segments import segments
     from powderdsl.ir.text import print_program
 
-    parts = [one.planes or one.program for one in segments(program)]
-    return "\n".join(
-        print_program(part, pass_name)
-        for part in parts
-        if pass_name in (None, *(p.name for p in part.passes))
-    )
+    match stage:
+        case "ir":
+            return print_program(program, pass_name)
+        case "planes":
+            parts = [one.planes or one.program for one in segments(program)]
+            chosen = [one for one in parts if pass_name in (None, *(p.name for p in one.passes))]
+            return "\n".join(print_program(part, pass_name) for part in chosen)
+        case "schedule":
+            return "\n\n".join(_schedules(segments(program), backend, after, pass_name)) + "\n"
+        case _:
+            return "\n\n".join(text for text in _kernels(program, backend, pass_name) if text)
 
 
-def _schedules(program: Program, backend: str, after: str | None, pass_name: str | None) -> str:
-    """The schedules of a backend's passes after a stage of the planner."""
-    from powderdsl.ir.segments import segments
+def _schedules(
+    parts: Sequence[Segment], backend: str, after: str | None, pass_name: str | None
+) -> Iterator[str]:
+    """The schedule of each pass of a backend after a stage of the planner."""
     from powderdsl.schedule.stages import PLANNERS, steps
     from powderdsl.schedule.text import print_schedule
 
@@ -109,54 +105,50 @@ def _schedules(program: Program, backend: str, after: str | None, pass_name: str
     if stages is None:
         raise BadInput(f"the {backend} backend has no schedule: it computes pass by pass what the IR says")
     names = ["lower", *(stage.name for stage in stages)]
-    if after is not None and after not in names:
-        raise BadInput("; ".join([f"no stage `{after}`", *suggest(after, names, "stages")]))
-    texts = []
-    for part in segments(program):
+    last = after or names[-1]
+    _check_known("stage", last, names, "stages")
+    for part in parts:
         for pass_ in part.planes.passes if part.planes else ():
             if pass_name in (None, pass_.name):
-                schedules = dict(steps(pass_, stages))
-                texts.append(print_schedule(schedules[after or names[-1]]))
-    return "\n\n".join(texts) + "\n"
+                yield print_schedule(dict(steps(pass_, stages))[last])
 
 
 SHOWN_SHARED = 227 << 10
 """Bytes of shared memory of the GPU for which kernels are shown, on a grid of 64 × 64."""
 
 
-def _kernels(program: Program, backend: str, pass_name: str | None) -> str:
+def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[str]:
     """The generated source of a backend: part by part, where planes cannot carry all passes."""
     from powderdsl.ir.segments import segments
-    from powderdsl.targets.arrays.source import kernel_source as array_source
     from powderdsl.targets.torch.program import kernel_source
 
-    match backend:
-        case "reference":
-            raise BadInput("the reference backend runs the checked model: it has no kernels")
-        case "torch":
-            return kernel_source(program, pass_name)
-        case "native" | "cuda" if pass_name is not None:
-            raise BadInput(f"{backend} source is one text: --pass does not go with it")
-    texts = []
+    if backend == "reference":
+        raise BadInput("the reference backend runs the checked model: it has no kernels")
+    if backend in ("native", "cuda") and pass_name is not None:
+        raise BadInput(f"{backend} source is one text: --pass does not go with it")
+    if backend == "torch":
+        yield kernel_source(program, pass_name)
+        return
     for part in segments(program):
         if part.planes is None:
-            texts.append(kernel_source(part.program, pass_name))
+            yield kernel_source(part.program, pass_name)
         elif backend == "native":
             from powderdsl.targets.cpp.source import native_source
 
-            texts.append(native_source(part.planes)[0])
+            yield native_source(part.planes)[0]
         elif backend == "cuda":
             from powderdsl.targets.cuda.source import cuda_source
 
-            texts.append(cuda_source(part.planes, 64, 64, SHOWN_SHARED).text)
+            yield cuda_source(part.planes, 64, 64, SHOWN_SHARED).text
         else:
-            texts.append(array_source(part.planes, pass_name))
-    return "\n\n".join(text for text in texts if text)
+            from powderdsl.targets.arrays.source import kernel_source as array_source
+
+            yield array_source(part.planes, pass_name)
 
 
-def _check_pass(name: str, known: Sequence[str]) -> None:
+def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> None:
     if name not in known:
-        raise BadInput("; ".join([f"no pass `{name}`", *suggest(name, known, "passes")]))
+        raise BadInput("; ".join([f"no {what} `{name}`", *suggest(name, known, plural)]))
 
 
 # Syntax trees
@@ -167,7 +159,8 @@ def _tree(rules: str, pass_name: str | None) -> str:
     packs, _ = read([rules], reporter)
     reporter.raise_if_errors()
     if pass_name is not None:
-        _check_pass(pass_name, [one.name.text for pack in packs for one in pack.passes])
+        known = [one.name.text for pack in packs for one in pack.passes]
+        _check_known("pass", pass_name, known, "passes")
     return "\n".join(line for pack in packs for line in _pack_lines(pack, pass_name)) + "\n"
 
 

@@ -35,23 +35,31 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @click.command("evaluate", cls=ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option(
-    "--splits", callback=_names, metavar="A,B", help="Split: which worlds.  [default: all splits of the task]"
+    "--splits",
+    callback=_names,
+    metavar="A,B",
+    help="Splits: sets of worlds.  [default: all splits of the task]",
 )
 @click.option(
-    "--policies", callback=_names, metavar="A,B", help="Of trained, random, nothing.  [default: all]"
+    "--policies",
+    callback=_names,
+    metavar="A,B",
+    help="Policies among trained, random, nothing.  [default: all]",
 )
-@click.option("--episodes", type=Integer(1, 10**6), default=256, help="On each split, for each policy.")
+@click.option("--episodes", type=Integer(1, 10**6), default=256, help="Episodes per split and policy.")
 @click.option(
-    "--deterministic/--sampled", default=False, help="The likeliest action, or one drawn as in training."
+    "--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one as in training."
 )
-@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Of what policies draw.")
-@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
+@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Seed of what policies draw.")
+@click.option(
+    "--knob", "knobs", multiple=True, metavar="NAME=N", help="For a task: another value for a knob."
+)
 @set_option
 @packs_option
 @click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @layout_options("One JSON object instead of a table.")
-@click.option("--out", type=PATH, metavar="FILE.json", help="Where else to write the JSON object.")
+@click.option("--out", type=PATH, metavar="FILE.json", help="Also write the JSON object to this file.")
 def command(
     run: str,
     knobs: tuple[str, ...],

@@ -12,7 +12,15 @@ from typing import Any
 import click
 
 from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, counted, user_values, write_diagnostics
-from powderdsl.cli.options import PATH, Integer, ManyWords, backend_option, packs_option, set_option
+from powderdsl.cli.options import (
+    PATH,
+    Integer,
+    ManyWords,
+    backend_option,
+    device_option,
+    packs_option,
+    set_option,
+)
 from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
@@ -25,41 +33,45 @@ SCRIPTED = ("random", "nothing")
 
 @click.command("record", cls=ManyWords)
 @click.argument("task", required=False)
-@click.option("--out", type=PATH, metavar="FOLDER", help="Where the dataset goes.")
-@click.option("--episodes", type=Integer(1, 1 << 32), help="How many are recorded.")
-@click.option("--split", default="train", help="Split: which worlds.")
+@click.option("--out", type=PATH, metavar="FOLDER", help="Folder of the dataset.")
+@click.option("--episodes", type=Integer(1, 1 << 32), help="Number of episodes to record.")
+@click.option("--split", default="train", help="Split: the set of worlds.")
 @click.option(
     "--policy",
     metavar="random|nothing|RUN",
     default="random",
-    help="What acts in them: every action equally likely, one that does nothing, or a trained agent.",
+    help="Policy: every action equally likely, no action, or a trained agent.",
 )
 @click.option(
     "--observation",
     type=click.Choice(("ids", "compact")),
     default="ids",
-    help="Elements, or everything that lasts.",
+    help="Record elements only, or the whole state.",
 )
 @click.option(
     "--seed",
     type=Integer(0, (1 << 61) - 1),
     default=0,
-    help="The first episode's world, and the policy's draws.",
+    help="World of the first episode, and seed of the policy.",
 )
 @click.option(
     "--worlds",
     type=Integer(1, (1 << 61) - 1),
     default=1_000_000,
-    help="How many worlds there are: their numbers lie below.",
+    help="Number of worlds: they are numbered from 0.",
 )
-@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another value for a knob.")
+@click.option(
+    "--knob", "knobs", multiple=True, metavar="NAME=N", help="Another value for a knob of the task."
+)
 @set_option
 @packs_option
-@click.option("--shard", type=Integer(1, 1 << 32), help="Episodes a file.  [default: 256, or 256 MiB]")
+@click.option("--shard", type=Integer(1, 1 << 32), help="Episodes per file.  [default: 256, or 256 MiB]")
 @click.option("--compress", is_flag=True, help="Smaller files, slower to read.")
-@click.option("--envs", type=Integer(1, 1 << 20), default=256, help="Episodes at once, at most.")
+@click.option(
+    "--envs", type=Integer(1, 1 << 20), default=256, help="Maximum number of episodes played at once."
+)
 @backend_option("auto")
-@click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
+@device_option
 @click.option("--verify", type=PATH, metavar="FOLDER", help="Record nothing: read every byte of a dataset.")
 def command(
     task: str | None, out: Path | None, episodes: int | None, policy: str, verify: Path | None, **how: Any

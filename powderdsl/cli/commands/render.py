@@ -12,10 +12,10 @@ from powderdsl.cli.options import PATH, Integer, SizeType, check_writable, load_
 
 @click.command("render")
 @click.argument("world", metavar="WORLD")
-@click.option("--rules", required=True, metavar="RULES", help="The rules whose elements the world has.")
-@click.option("--out", required=True, metavar="FILE", type=PATH, help="x.png.")
+@click.option("--rules", required=True, metavar="RULES", help="Rules whose elements the world has.")
+@click.option("--out", required=True, metavar="FILE", type=PATH, help="The .png file to write.")
 @click.option("--size", type=SizeType(), help="Rows and columns of a scene, such as 48x64.")
-@click.option("--scale", type=Integer(1, 64), help="Pixels a cell.  [default: about 400 a side]")
+@click.option("--scale", type=Integer(1, 64), help="Pixels per cell.  [default: about 400 a side]")
 def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
     """Draw a world as a picture, without running it.
 

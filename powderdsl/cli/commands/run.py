@@ -17,6 +17,7 @@ from powderdsl.cli.options import (
     SizeType,
     backend_option,
     check_writable,
+    device_option,
     load_rules,
     rules_argument,
     set_option,
@@ -63,21 +64,25 @@ def _out(ctx: click.Context, param: click.Parameter, value: str | None) -> Path 
 
 @click.command("run")
 @rules_argument
-@click.option("--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml, or a scene's name.")
+@click.option(
+    "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
+)
 @click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
-@click.option("--batch", type=Integer(1, 1 << 20), help="How many worlds.  [default: 1]")
-@click.option("--steps", type=Integer(0, 10**9), default=240, help="How many steps.")
-@click.option("--seed", type=Integer(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
+@click.option("--batch", type=Integer(1, 1 << 20), help="Number of worlds.  [default: 1]")
+@click.option("--steps", type=Integer(0, 10**9), default=240, help="Number of steps.")
+@click.option("--seed", type=Integer(0, 2**63 - 1), help="Seed of all random numbers.  [default: 0]")
 @backend_option("auto")
-@click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
+@device_option
 @set_option
-@click.option("--out", metavar="FILE", callback=_out, help="x.png, x.gif, x.mp4, or x.npz to save.")
-@click.option("--scale", type=Integer(1, 64), help="Pixels a cell.  [default: about 400 a side]")
+@click.option(
+    "--out", metavar="FILE", callback=_out, help="Write a .png, .gif or .mp4, or save the world as .npz."
+)
+@click.option("--scale", type=Integer(1, 64), help="Pixels per cell.  [default: about 400 a side]")
 @click.option("--every", type=Integer(1, 10**6), default=1, help="Show every n-th step.")
-@click.option("--fps", type=Integer(1, 240), default=30, help="Frames a second.")
+@click.option("--fps", type=Integer(1, 240), default=30, help="Frames per second.")
 @click.option("--watch", is_flag=True, help="Show the first world in the terminal while it runs.")
 @click.option("--threads", type=Integer(1, 1024), help="CPU threads.  [default: 1 for small batches]")
-@click.option("-v", "--verbose", is_flag=True, help="Say how fast, and what became of it.")
+@click.option("-v", "--verbose", is_flag=True, help="Report the speed, and how many cells each element has.")
 def command(
     rules: str,
     world: str | None,

@@ -24,11 +24,13 @@ from powderdsl.tasks.shipped import is_task
 @click.argument("rules", metavar="RULES|TASK")
 @layout_options("One JSON object instead of tables.")
 @set_option
-@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
-@click.option("--split", default="train", help="Of a task: which worlds.")
-@click.option("--seeds", type=Integer(1, 256), default=16, help="Of a task: how many worlds.")
 @click.option(
-    "--out", type=PATH, metavar="FILE.png", help="Of a task: draw these worlds, with regions outlined."
+    "--knob", "knobs", multiple=True, metavar="NAME=N", help="For a task: another value for a knob."
+)
+@click.option("--split", default="train", help="For a task: the set of worlds.")
+@click.option("--seeds", type=Integer(1, 256), default=16, help="For a task: the number of worlds.")
+@click.option(
+    "--out", type=PATH, metavar="FILE.png", help="For a task: draw these worlds, with regions outlined."
 )
 def command(
     rules: str,
@@ -68,15 +70,35 @@ def rule_spans(pass_: Pass) -> tuple[Span, ...]:
 def _text(ruleset: Ruleset, styled: bool) -> Iterator[str]:
     yield printable(f"{ruleset.name}{': ' if ruleset.about else ''}{ruleset.about}")
     yield f"packs: {' '.join(ruleset.packs)}"
-    for title, rows in (
-        (f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", _element_rows(ruleset, styled)),
-        ("Reactions", _reaction_rows(ruleset)),
-        ("Passes, in order", _pass_rows(ruleset)),
-        ("Parameters (--set NAME=VALUE)", _param_rows(ruleset)),
-    ):
+    for title, rows in _tables(ruleset, styled):
         yield ""
         yield title
         yield from table(rows)
+
+
+def _tables(ruleset: Ruleset, styled: bool) -> Iterator[tuple[str, list[list[str]]]]:
+    """The title and the rows of each table."""
+    rows = [["id", "element", "pack", "glyph", "color", *(p.name for p in ruleset.properties), "tags"]]
+    for element in ruleset.elements:
+        head = [str(element.id), element.name, element.pack, element.glyph, _color(element, styled)]
+        values = [_property_text(ruleset, prop, element) for prop in ruleset.properties]
+        rows.append([*head, *values, " ".join(sorted(element.tags))])
+    yield f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", rows
+    rows = [["from", "to", "pass", "rule", "where"]]
+    for one in reactions(ruleset):
+        before, after = show_set(ruleset, one.before), show_set(ruleset, one.after)
+        rows.append([before, after, one.pass_name, one_line(one.span), place_of(one.span)])
+    yield "Reactions", rows
+    rows = [["", "pass", "pack", "moments", "rules", "where"]]
+    for number, pass_ in enumerate(ruleset.passes, 1):
+        counts = [str(len(pass_.moments)), str(len(rule_spans(pass_)))]
+        rows.append([str(number), pass_.name, pass_.pack, *counts, place_of(pass_.span)])
+    yield "Passes, in order", rows
+    rows = [["name", "value", "kind", "about", "where"]]
+    for param in ruleset.params:
+        value = show_value(ruleset, param.kind, param.default)
+        rows.append([param.name, value, str(param.kind), param.about, place_of(param.span)])
+    yield "Parameters (--set NAME=VALUE)", rows
 
 
 def _swatch(color: str, styled: bool) -> str:
@@ -96,44 +118,10 @@ def _color(element: Element, styled: bool) -> str:
     return Painted(text) if styled else text
 
 
-def _element_rows(ruleset: Ruleset, styled: bool) -> list[list[str]]:
-    rows = [["id", "element", "pack", "glyph", "color", *(p.name for p in ruleset.properties), "tags"]]
-    for element in ruleset.elements:
-        values = [_property_text(ruleset, prop, element) for prop in ruleset.properties]
-        shown = _color(element, styled)
-        head = [str(element.id), element.name, element.pack, element.glyph, shown]
-        rows.append([*head, *values, " ".join(sorted(element.tags))])
-    return rows
-
-
 def _property_text(ruleset: Ruleset, prop: Property, element: Element) -> str:
     """Its value; `*` where cells may hold one of their own."""
     text = show_value(ruleset, prop.kind, prop.values[element.id])
     return f"{text}*" if element.id in prop.stored else text
-
-
-def _reaction_rows(ruleset: Ruleset) -> list[list[str]]:
-    rows = [["from", "to", "pass", "rule", "where"]]
-    for one in reactions(ruleset):
-        before, after = show_set(ruleset, one.before), show_set(ruleset, one.after)
-        rows.append([before, after, one.pass_name, one_line(one.span), place_of(one.span)])
-    return rows
-
-
-def _pass_rows(ruleset: Ruleset) -> list[list[str]]:
-    rows = [["", "pass", "pack", "moments", "rules", "where"]]
-    for number, one in enumerate(ruleset.passes, 1):
-        counts = [str(len(one.moments)), str(len(rule_spans(one)))]
-        rows.append([str(number), one.name, one.pack, *counts, place_of(one.span)])
-    return rows
-
-
-def _param_rows(ruleset: Ruleset) -> list[list[str]]:
-    rows = [["name", "value", "kind", "about", "where"]]
-    for param in ruleset.params:
-        value = show_value(ruleset, param.kind, param.default)
-        rows.append([param.name, value, str(param.kind), param.about, place_of(param.span)])
-    return rows
 
 
 # JSON

@@ -79,16 +79,19 @@ def called(words: tuple[str, ...]) -> click.Command:
 @click.option(
     "--size", type=click.Choice(SIZES), default="small", help="Size of the study: values of its settings."
 )
+@click.option("--seeds", type=Integer(1, 1000), help="Runs of each combination.  [default: the study's]")
+@click.option("--jobs", type=Integer(1, 256), default=2, help="Processes that run at a time.")
+@click.option("--threads", type=Integer(1, 256), default=1, help="Threads per process.")
 @click.option(
-    "--seeds", type=Integer(1, 1000), help="How many runs of each combination, instead of the study's."
+    "--only",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Run only combinations with this value. May be repeated.",
 )
-@click.option("--jobs", type=Integer(1, 256), default=2, help="Processes at a time.")
-@click.option("--threads", type=Integer(1, 256), default=1, help="Threads of each process.")
 @click.option(
-    "--only", multiple=True, metavar="NAME=VALUE", help="Only combinations with this value. May be repeated."
+    "--out", type=PATH, metavar="FOLDER", help="Folder of the results.  [default: studies/STUDY-SIZE]"
 )
-@click.option("--out", type=PATH, metavar="FOLDER", help="studies/STUDY-SIZE by default.")
-@click.option("--dry-run", is_flag=True, help="Print the commands, and run none.")
+@click.option("--dry-run", is_flag=True, help="Print the commands without running them.")
 def command(
     study: str | None,
     size: str,

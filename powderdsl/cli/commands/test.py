@@ -18,13 +18,13 @@ MAX_SECONDS = 24 * 3600
 @backend_option("arrays")
 @set_option
 @click.option("--examples", type=Integer(0, 10_000_000), default=1000,
-              help="Random worlds that each invariant is tried on.")  # fmt: skip
+              help="Random worlds on which each invariant is tried.")  # fmt: skip
 @click.option("--drawn", type=Integer(0, 1_000_000), default=100,
-              help="More worlds, drawn by Hypothesis.")  # fmt: skip
+              help="Additional worlds, drawn by Hypothesis.")  # fmt: skip
 @click.option("--seconds", type=Integer(1, MAX_SECONDS), default=60,
               help="Time limit for random worlds, per RULES, in seconds.")  # fmt: skip
 @click.option("--seed", type=Integer(0, 2**31 - 1), default=0,
-              help="Other worlds for another seed, the same for the same.")  # fmt: skip
+              help="Seed of the random worlds.")  # fmt: skip
 @click.option(
     "--replay", type=click.Path(dir_okay=False, path_type=Path), help="Only try this counterexample again."
 )
@@ -43,9 +43,9 @@ MAX_SECONDS = 24 * 3600
               help="With --mutate: only mistakes in this pack. May be repeated.")  # fmt: skip
 @click.option("--mutants", type=Integer(1, 1_000_000), metavar="N",
               help="With --mutate: maximum number of mutants, of each kind in proportion.")  # fmt: skip
-@click.option("--write", is_flag=True, help="With --mutate: add a test for each of them to its pack.")
+@click.option("--write", is_flag=True, help="With --mutate: add tests that notice them to their packs.")
 @click.option("--jobs", type=Integer(1, 256), metavar="N",
-              help="With --mutate: processes.  [default: one a processor]")  # fmt: skip
+              help="With --mutate: number of processes.  [default: one per processor]")  # fmt: skip
 def command(
     rules: tuple[str, ...],
     backend: str,

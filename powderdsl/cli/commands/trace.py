@@ -31,17 +31,23 @@ class CellType(click.ParamType):
 
 @click.command("trace")
 @rules_argument
-@click.option("--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml, or a scene's name.")
+@click.option(
+    "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
+)
 @click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
-@click.option("--seed", type=Integer(0, 2**63 - 1), help="Of all random numbers.  [default: 0]")
-@click.option("--at", "cell", type=CellType(), required=True, help="The cell, counted from 0.")
+@click.option("--seed", type=Integer(0, 2**63 - 1), help="Seed of all random numbers.  [default: 0]")
+@click.option("--at", "cell", type=CellType(), required=True, help="Row and column of the cell, from 0.")
 @click.option("--step", type=Integer(1, 10**9), required=True, help="Step of the run, from 1.")
 @click.option(
-    "--of", "names", multiple=True, metavar="NAME", help="Only the element, or this field. May be repeated."
+    "--of",
+    "names",
+    multiple=True,
+    metavar="NAME",
+    help="Explain only `element`, or this field. May be repeated.",
 )
-@click.option("--number", type=Integer(0, 1 << 20), default=0, help="World of a saved batch.")
-@click.option("--all", "every_rule", is_flag=True, help="Every rule that did not happen, and why.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object.")
+@click.option("--number", type=Integer(0, 1 << 20), default=0, help="Number of the world in a saved batch.")
+@click.option("--all", "every_rule", is_flag=True, help="List every rule that did not happen, and why.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @backend_option("auto", "Backend that runs the steps before it.")
 @set_option
 def command(

@@ -24,14 +24,16 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 
 @click.command("train", cls=ManyWords)
 @click.argument("task", metavar="TASK", required=False)
-@click.option("--run", "folder", type=PATH, metavar="DIR", help="[default: runs/TASK-seedN]")
-@click.option("--resume", type=PATH, metavar="DIR", help="Continue with a run, as it was asked for.")
+@click.option(
+    "--run", "folder", type=PATH, metavar="DIR", help="Folder of the run.  [default: runs/TASK-seedN]"
+)
+@click.option("--resume", type=PATH, metavar="DIR", help="Continue a run with its own settings.")
 @click.option(
     "--preset",
     "preset_name",
     type=click.Choice(list(PRESETS)),
     default="paper",
-    help="Where other options start from: the paper's figures, or a few minutes on one core.",
+    help="Settings that other options change: the paper's, or those for a few minutes on one core.",
 )
 @setting_options(TrainConfig)
 @click.option(
@@ -46,7 +48,7 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 @click.option(
     "--complexity",
     type=Integer(0, 10**6),
-    help="Short for --knob complexity=N: N of each, where the paper's tasks are.",
+    help="Short for --knob complexity=N.",
 )
 @set_option
 @packs_option
@@ -56,7 +58,7 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
     "checkpoint_minutes",
     type=float,
     metavar="MINUTES",
-    help="How much work a kill may cost; 0: one rollout.  [default: 2]",
+    help="Time between checkpoints; 0: after each rollout.  [default: 2]",
 )
 @click.pass_context
 def command(

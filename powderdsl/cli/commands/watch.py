@@ -32,24 +32,29 @@ SUFFIXES = (".gif", ".mp4")
 
 @click.command("watch", cls=ManyWords)
 @click.argument("run", metavar="RUN|TASK")
-@click.option("--split", help="Split: which worlds.  [default: test where the task has it, else train]")
-@click.option("--worlds", type=Integer(1, 64), default=4, help="How many, side by side.")
-@click.option("--first", type=Integer(0, 2**62), default=0, help="Number of the first one.")
+@click.option("--split", help="Split: the set of worlds.  [default: test where the task has it, else train]")
+@click.option("--worlds", type=Integer(1, 64), default=4, help="Number of worlds, side by side.")
+@click.option("--first", type=Integer(0, 2**62), default=0, help="Number of the first world.")
 @click.option(
     "--policy",
     type=click.Choice(("trained", "random", "nothing")),
-    help="Policy.  [default: trained; of a TASK: random]",
+    help="Policy that acts.  [default: trained; for a TASK: random]",
 )
-@click.option("--deterministic/--sampled", default=False, help="The likeliest action, or one drawn.")
-@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Of what the policy draws.")
-@click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Of a task: another value for a knob.")
+@click.option("--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one.")
+@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Seed of what the policy draws.")
+@click.option(
+    "--knob", "knobs", multiple=True, metavar="NAME=N", help="For a task: another value for a knob."
+)
 @set_option
 @packs_option
 @click.option(
-    "--out", type=PATH, metavar="FILE", help="x.gif or x.mp4.  [default: watch.gif, in the run's folder]"
+    "--out",
+    type=PATH,
+    metavar="FILE",
+    help="The .gif or .mp4 to write.  [default: watch.gif in the run's folder]",
 )
-@click.option("--fps", type=Integer(1, 240), default=15, help="Frames a second.")
-@click.option("--scale", type=Integer(1, 32), default=4, help="Pixels a cell.")
+@click.option("--fps", type=Integer(1, 240), default=15, help="Frames per second.")
+@click.option("--scale", type=Integer(1, 32), default=4, help="Pixels per cell.")
 @click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
 def command(
     run: str,

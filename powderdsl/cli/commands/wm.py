@@ -17,6 +17,7 @@ from powderdsl.cli.options import (
     ManyWords,
     backend_option,
     check_writable,
+    device_option,
     layout_options,
     set_option,
 )
@@ -54,44 +55,58 @@ MACHINE = ("device", "threads", "backend", "store", "compiled")
 
 _data_options = _options(
     click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: world-model]"),
-    click.option("--split", metavar="SPLIT", help="The task's worlds to train on.  [default: train]"),
-    click.option("--rules", metavar="RULES", help="The rules of its worlds.  [default: the task's own]"),
-    _words("--packs", "Keep these packs of the rules only, or add them."),
+    click.option("--split", metavar="SPLIT", help="Split of the task to train on.  [default: train]"),
+    click.option("--rules", metavar="RULES", help="Rules of the worlds.  [default: the task's own]"),
+    _words("--packs", "Keep only these packs of the rules, or add them."),
     _words("--held-out", "Leave these packs of the rules out."),
+    click.option("--elements", "kinds", type=Integer(0, 255), help="Number of elements drawn besides empty."),
+    click.option("--lines", type=Integer(0, 256), help="Maximum number of lines per world."),
+    click.option("--disks", type=Integer(0, 256), help="Maximum number of disks per world."),
+    click.option("--squares", type=Integer(0, 256), help="Maximum number of squares per world."),
     click.option(
-        "--elements", "kinds", type=Integer(0, 255), help="How many elements besides empty are drawn."
+        "--knob", "knobs", multiple=True, metavar="NAME=N", help="Another value for a knob of the task."
     ),
-    click.option("--lines", type=Integer(0, 256), help="Up to how many lines a world has."),
-    click.option("--disks", type=Integer(0, 256), help="Up to how many disks."),
-    click.option("--squares", type=Integer(0, 256), help="Up to how many squares."),
-    click.option("--knob", "knobs", multiple=True, metavar="NAME=N", help="Another knob of the task."),
-    click.option("--states", type=Integer(1, 1 << 32), help="How many start worlds there are."),
-    click.option("--buffer", "capacity", type=Integer(1, 1 << 32), help="Pairs that the buffer holds."),
-    click.option("--refresh", type=Integer(1, 1 << 20), help="Pairs that each iteration replaces."),
+    click.option("--states", type=Integer(1, 1 << 32), help="Number of start worlds."),
+    click.option("--buffer", "capacity", type=Integer(1, 1 << 32), help="Capacity of the buffer, in pairs."),
+    click.option(
+        "--refresh", type=Integer(1, 1 << 20), help="Pairs that each iteration replaces in the buffer."
+    ),
     set_option,
     click.option("--rulesets", type=Integer(0, 1024), help="Number of rulesets to draw around the rules."),
-    click.option("--first-ruleset", type=Integer(0, 1 << 31), help="The number of the first.  [default: 0]"),
-    click.option("--chances", type=float, help="Their chances differ by up to this factor."),
-    click.option("--swap", "swaps", multiple=True, metavar="PROPERTY", help="Two elements exchange it."),
-    click.option("--leave-out", type=float, metavar="CHANCE", help="How likely a pack is left out of one."),
+    click.option(
+        "--first-ruleset", type=Integer(0, 1 << 31), help="Number of the first drawn ruleset.  [default: 0]"
+    ),
+    click.option("--chances", type=float, help="Factor by which chances of drawn rulesets differ, at most."),
+    click.option(
+        "--swap",
+        "swaps",
+        multiple=True,
+        metavar="PROPERTY",
+        help="Property whose values two elements swap in drawn rulesets.",
+    ),
+    click.option(
+        "--leave-out", type=float, metavar="CHANCE", help="Probability that a ruleset leaves out a pack."
+    ),
 )
 _machine_options = _options(
     click.option("--threads", type=Integer(1, 1024), default=1, help="CPU threads."),
-    click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1."),
+    device_option,
     backend_option("auto"),
 )
 _training_options = _options(
     _machine_options,
     click.option("--iterations", type=Integer(1, 10**9), help="Steps of Adam."),
-    click.option("--batch", type=Integer(1, 1 << 20), help="Pairs in each."),
-    click.option("--learning-rate", type=click.FloatRange(min=0, min_open=True), help="Of Adam."),
-    click.option("--seed", type=Integer(0, 2**63 - 1), help="Of weights, worlds and batches."),
-    click.option("--run", "folder", metavar="DIR", type=PATH, help="The run's folder."),
+    click.option("--batch", type=Integer(1, 1 << 20), help="Pairs per step."),
+    click.option(
+        "--learning-rate", type=click.FloatRange(min=0, min_open=True), help="Learning rate of Adam."
+    ),
+    click.option("--seed", type=Integer(0, 2**63 - 1), help="Seed of weights, worlds and batches."),
+    click.option("--run", "folder", metavar="DIR", type=PATH, help="Folder of the run."),
     click.option(
         "--store",
         type=click.Choice(["auto", "memory", "disk"]),
         default="auto",
-        help="Where the buffer is kept.",
+        help="Where to keep the buffer.",
     ),
     click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
     click.option("--save-every", type=Integer(1, 10**6), default=60, help="Seconds between checkpoints."),
@@ -114,7 +129,7 @@ def command() -> None:
     "--preset",
     type=click.Choice(["small", "paper"]),
     default="small",
-    help="What other options change: `small` is for a CPU, `paper` for a GPU.",
+    help="Settings that other options change: `small` for a CPU, `paper` for a GPU.",
 )
 @_data_options
 @click.option("--width", type=Integer(1, 1024), help="Features of the first block.")
@@ -185,23 +200,29 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @command.command("eval", cls=ManyWords)
 @click.argument("run", metavar="RUN")
 @click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
-@click.option("--split", metavar="SPLIT", default="designed", help="Its worlds to test on.")
-@click.option("--rules", metavar="RULES", help="Other rules than the run's.")
+@click.option("--split", metavar="SPLIT", default="designed", help="Split of the task to test on.")
+@click.option("--rules", metavar="RULES", help="Rules to test under.  [default: the run's]")
 @_words("--only", "Draw elements of these packs only.  [default: the run's]")
 @click.option(
-    "--knob", "knobs", multiple=True, metavar="NAME=N", help="Knobs of the task.  [default: the run's]"
+    "--knob",
+    "knobs",
+    multiple=True,
+    metavar="NAME=N",
+    help="Another value for a knob of the task.  [default: the run's]",
 )
 @click.option(
-    "--worlds", type=Integer(1, 1 << 20), help="Of a split, or futures of each stand.  [default: 32, 4]"
+    "--worlds",
+    type=Integer(1, 1 << 20),
+    help="Worlds of the split, or futures of each designed world.  [default: 32, 4]",
 )
 @click.option(
     "--rulesets",
     type=Integer(0, 1024),
     default=0,
-    help="Number of rulesets to test under that training never saw.",
+    help="Number of rulesets that training never saw, to test under.",
 )
 @layout_options("One JSON object instead of a table.")
-@click.option("--out", metavar="FILE", type=PATH, help="[default: RUN/evaluation.json]")
+@click.option("--out", metavar="FILE", type=PATH, help="File of the results.  [default: RUN/evaluation.json]")
 @_machine_options
 def eval_command(
     run: str,
@@ -238,13 +259,13 @@ def eval_command(
 
 @command.command("show", cls=ManyWords)
 @click.argument("run", metavar="RUN")
-@click.option("--out", metavar="FILE", required=True, type=PATH, help="A .png file.")
-@click.option("--steps", type=Integer(1, 4096), help="How far ahead.  [default: as it was trained]")
-@click.option("--after", type=Integer(0, 10**6), default=0, help="Steps that worlds run before.")
+@click.option("--out", metavar="FILE", required=True, type=PATH, help="The .png file to write.")
+@click.option("--steps", type=Integer(1, 4096), help="Steps to predict.  [default: as trained]")
+@click.option("--after", type=Integer(0, 10**6), default=0, help="Steps that worlds run before the start.")
 @click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
-@click.option("--split", metavar="SPLIT", default="designed", help="Its worlds.")
-@click.option("--rules", metavar="RULES", help="Other rules than the run's.")
-@click.option("--scale", type=Integer(1, 16), default=2, help="Pixels a cell.")
+@click.option("--split", metavar="SPLIT", default="designed", help="Split of the task.")
+@click.option("--rules", metavar="RULES", help="Rules to test under.  [default: the run's]")
+@click.option("--scale", type=Integer(1, 16), default=2, help="Pixels per cell.")
 @_machine_options
 def show_command(
     run: str,

@@ -101,49 +101,37 @@ class Places:
         return self.study.places.get(key)
 
     def report(
-        self,
-        word: Word | None,
-        step: StudyStep,
-        message: str,
-        label: str = "",
-        *,
-        code: str = "PD806",
-        **more: Any,
+        self, where: Word | StudyStep, message: str, label: str = "", *, code: str = "PD806", **more: Any
     ) -> None:
-        """Report a mistake in a word: where its value is written, and where it is used."""
-        self.wrong.add(step.name)
-        if word is None:
-            self.reporter.error(code, message, self.place("step", step.name), label, **more)
+        """Report a mistake of a step, or in a word: where its value is written, and where it is used."""
+        if isinstance(where, StudyStep):
+            self.wrong.add(where.name)
+            self.reporter.error(code, message, self.place("step", where.name), label, **more)
             return
-        span = self.place("word", step.name, word.option, str(word.number))
-        names = sorted(names_in([word.text]))
-        written = [self._written(name, word) for name in names] if len(names) == 1 else []
-        if written and written[0] is not None:
-            used = Label(span, f"as `{word.written}`")
-            self.reporter.error(code, message, written[0], label, secondary=(used,), **more)
-        else:
-            self.reporter.error(code, message, span, label, **more)
+        self.wrong.add(where.step)
+        span = self.place("word", where.step, where.option, str(where.number))
+        names = names_in([where.text])
+        written = self._written(names.pop(), where) if len(names) == 1 else None
+        if written is not None:
+            more["secondary"] = (Label(span, f"as `{where.written}`"),)
+        self.reporter.error(code, message, written or span, label, **more)
 
     def _written(self, name: str, word: Word) -> Span | None:
-        """Where the value of a name stands that makes a word what it is."""
+        """The place of the value of a name that makes a word what it is."""
         for axis in self.study.axes:
             for size in SIZES:
                 for value in axis.values[size]:
-                    found = {axis.name: value, **axis.sets.get(value, {})}.get(name)
-                    if (
-                        found is not None
-                        and Template(word.text).safe_substitute({name: found}) == word.written
-                    ):
-                        at = (
-                            ("value", axis.name, value)
-                            if name == axis.name
-                            else ("set", axis.name, value, name)
+                    found = {axis.name: value, **axis.sets.get(value, {})}
+                    text = Template(word.text).safe_substitute({name: found[name]}) if name in found else None
+                    if text == word.written:
+                        own = name == axis.name
+                        return self.place(
+                            *(("value", name, value) if own else ("set", axis.name, value, name))
                         )
-                        return self.place(*at)
         return None
 
     @contextmanager
-    def told(self, word: Word | None, step: StudyStep, *, here: bool = False) -> Iterator[list[Exception]]:
+    def told(self, where: Word | StudyStep, *, here: bool = False) -> Iterator[list[Exception]]:
         """Report what the block raises, which the list then holds.
 
         Args:
@@ -155,24 +143,20 @@ class Places:
             yield failed
         except CompileError as error:
             failed.append(error)
-            self.wrong.add(step.name)
+            self.wrong.add(where.name if isinstance(where, StudyStep) else where.step)
             found = error.diagnostics
             if here:
                 found = tuple(one for one in found if one.primary.span is None) or found[:1]
             for one in found:
-                if one.primary.span is not None and not here:
-                    self.reporter.error(
-                        one.code,
-                        one.message,
-                        one.primary.span,
-                        one.primary.text,
-                        secondary=one.secondary,
-                        notes=one.notes,
-                        helps=one.helps,
-                    )
+                more: dict[str, Any] = {"notes": one.notes, "helps": one.helps}
+                label = one.primary
+                if label.span is None or here:
+                    self.report(where, one.message, code=one.code, **more)
                 else:
-                    self.report(word, step, one.message, code=one.code, notes=one.notes, helps=one.helps)
+                    self.reporter.error(
+                        one.code, one.message, label.span, label.text, secondary=one.secondary, **more
+                    )
         except (click.ClickException, ValueError, TypeError) as error:
             failed.append(error)
             said = error.format_message() if isinstance(error, click.ClickException) else str(error)
-            self.report(word, step, " ".join(said.split()))
+            self.report(where, " ".join(said.split()))

@@ -1,9 +1,9 @@
-"""What was measured, as values: events, the figures of each cell, and the report as plain data."""
+"""What was measured: the figures of each cell, and the report as plain data."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any
 
@@ -12,51 +12,6 @@ from powderdsl.experiments.bench.plan import Cell, Plan
 
 FORMAT_VERSION = 1
 """Of `report_data`: raised when a key changes its meaning."""
-
-
-@dataclass(frozen=True)
-class Started:
-    """A cell is about to be compiled or profiled (`what`), which may take a while."""
-
-    cell: Cell
-    what: str
-
-
-@dataclass(frozen=True)
-class Ready:
-    """A cell whose first calls are done. `compile_seconds` are its backend's, shared by all cells that have it.
-
-    `state_bytes` are those of the worlds' tensors in storage dtypes. A sample is `calls` calls of `steps` steps.
-    """
-
-    cell: Cell
-    compile_seconds: float
-    first_step_seconds: float
-    memory: Memory
-    state_bytes: int
-    steps: int
-    calls: int
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Seconds of a cell's calls in one round, and the processor's seconds that this process had in them."""
-
-    cell: Cell
-    round: int
-    seconds: float
-    processor_seconds: float
-
-
-@dataclass(frozen=True)
-class Costs:
-    """Seconds a world and step by pass, in the order they run; empty if the backend cannot say."""
-
-    cell: Cell
-    passes: tuple[tuple[str, float], ...]
-
-
-Event = Started | Ready | Sample | Costs
 
 
 @dataclass(frozen=True)
@@ -78,28 +33,35 @@ class Spread:
         return {name: value * factor for name, value in asdict(self).items()}
 
 
-@dataclass(frozen=True)
+@dataclass
 class CellFigures:
-    """A cell that was measured in at least one round. `seconds` and `processor_seconds` have one value a round."""
+    """What was measured of a cell. `seconds` and `processor_seconds` get one value a round.
 
-    ready: Ready
-    seconds: tuple[float, ...]
-    processor_seconds: tuple[float, ...]
-    passes: tuple[tuple[str, float], ...]
+    `compile_seconds` are its backend's, shared by all cells that have it. `state_bytes` are those of the worlds' tensors
+    in storage dtypes. A round makes `calls` calls of `steps` steps. `passes` has the seconds a world and step of each
+    pass, in the order they run; it is empty if passes were not profiled.
+    """
 
-    @property
-    def cell(self) -> Cell:
-        return self.ready.cell
+    cell: Cell
+    compile_seconds: float
+    first_step_seconds: float
+    memory: Memory
+    state_bytes: int
+    steps: int
+    calls: int
+    seconds: list[float] = field(default_factory=list)
+    processor_seconds: list[float] = field(default_factory=list)
+    passes: tuple[tuple[str, float], ...] = ()
 
     @property
     def world_steps(self) -> int:
-        """Steps of single worlds in a sample."""
-        return self.cell.batch * self.ready.steps * self.ready.calls
+        """Steps of single worlds in a round."""
+        return self.cell.batch * self.steps * self.calls
 
     @property
     def to_first_step(self) -> float:
         """Seconds from the checked rules to the state after one step."""
-        return self.ready.compile_seconds + self.ready.first_step_seconds
+        return self.compile_seconds + self.first_step_seconds
 
     @property
     def processors(self) -> float:
@@ -124,7 +86,10 @@ class CellFigures:
 
 @dataclass(frozen=True)
 class Report:
-    """A plan and what came of it. `load_after` is the load average of the last minute of measuring."""
+    """A plan and the figures of the cells that at least one round has reached.
+
+    `load_after` is the load average of the last minute of measuring.
+    """
 
     plan: Plan
     machine: Machine
@@ -136,22 +101,13 @@ class Report:
 def make_report(
     plan: Plan,
     machine: Machine,
-    events: Sequence[Event],
+    cells: Iterable[CellFigures],
     load_after: float | None = None,
     *,
     interrupted: bool = False,
 ) -> Report:
-    """The report of the events so far; cells that no round has reached are left out."""
-    cells = []
-    for ready in (event for event in events if isinstance(event, Ready)):
-        own = [event for event in events if event.cell == ready.cell]
-        samples = [event for event in own if isinstance(event, Sample)]
-        passes = next((event.passes for event in own if isinstance(event, Costs)), ())
-        if samples:
-            seconds = tuple(sample.seconds for sample in samples)
-            busy = tuple(sample.processor_seconds for sample in samples)
-            cells.append(CellFigures(ready, seconds, busy, passes))
-    return Report(plan, machine, tuple(cells), interrupted, load_after)
+    """The report of what has been measured; cells that no round has reached are left out."""
+    return Report(plan, machine, tuple(one for one in cells if one.seconds), interrupted, load_after)
 
 
 def report_data(report: Report) -> dict[str, Any]:
@@ -172,8 +128,8 @@ def report_data(report: Report) -> dict[str, Any]:
 
 
 def _cell_data(figures: CellFigures) -> dict[str, Any]:
-    cell, ready = figures.cell, figures.ready
-    seconds, growth, cells = figures.world_step_seconds, ready.memory.growth, cell.cells
+    cell = figures.cell
+    seconds, growth, cells = figures.world_step_seconds, figures.memory.growth, cell.cells
     return {
         "backend": cell.backend,
         "batch": cell.batch,
@@ -181,16 +137,16 @@ def _cell_data(figures: CellFigures) -> dict[str, Any]:
         "columns": cell.size[1],
         "elements": list(cell.elements),
         "threads": cell.threads,
-        "compile_seconds": ready.compile_seconds,
-        "first_step_seconds": ready.first_step_seconds,
+        "compile_seconds": figures.compile_seconds,
+        "first_step_seconds": figures.first_step_seconds,
         "peak_memory_bytes": growth,
-        "peak_memory_how": ready.memory.how,
+        "peak_memory_how": figures.memory.how,
         "peak_memory_bytes_per_cell": None if growth is None else growth / cells,
-        "state_bytes_per_cell": ready.state_bytes / cells,
-        "steps_per_call": ready.steps,
-        "calls_per_round": ready.calls,
-        "round_seconds": list(figures.seconds),
-        "round_processor_seconds": list(figures.processor_seconds),
+        "state_bytes_per_cell": figures.state_bytes / cells,
+        "steps_per_call": figures.steps,
+        "calls_per_round": figures.calls,
+        "round_seconds": figures.seconds,
+        "round_processor_seconds": figures.processor_seconds,
         "world_steps_per_second": asdict(figures.rate),
         "cell_updates_per_second": figures.rate.scaled(cell.world_cells),
         "microseconds_per_world_step": seconds.scaled(1e6),

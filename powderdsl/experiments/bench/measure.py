@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from powderdsl.experiments.bench.figures import Costs, Event, Ready, Report, Sample, Started, make_report
+from powderdsl.experiments.bench.figures import CellFigures, Report, make_report
 from powderdsl.experiments.bench.machine import load_average, peak_growth, this_machine
 from powderdsl.experiments.bench.plan import Cell, Plan
 from powderdsl.experiments.bench.workloads import start_worlds
@@ -22,25 +22,25 @@ Clock = Callable[[], float]
 """Gives seconds."""
 
 
-def measure(plan: Plan, on_event: Callable[[Event], None] | None = None) -> Report:
-    """Measure a plan to its end; `on_event` is called with each part of the result when it is there.
+def measure(plan: Plan, on_progress: Callable[[str, Cell], None] | None = None) -> Report:
+    """Measure a plan to its end; `on_progress` is called with what `measuring` yields.
 
     Raises:
         CompileError: PD701 for a backend or device that is not there.
     """
     machine = this_machine(plan.device)
-    events = []
-    for event in measure_events(plan):
-        events.append(event)
-        if on_event is not None:
-            on_event(event)
-    return make_report(plan, machine, events, load_average())
+    cells: list[CellFigures] = []
+    for what, cell in measuring(plan, cells):
+        if on_progress is not None:
+            on_progress(what, cell)
+    return make_report(plan, machine, cells, load_average())
 
 
-def measure_events(plan: Plan) -> Iterator[Event]:
-    """The parts of a measurement, as they come in: whoever stops early has what came so far.
+def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]]:
+    """Measure a plan part by part; yields the kind of part and its cell.
 
-    Torch's number of threads is that of each cell while this runs.
+    Parts are ``compile`` and ``profile``, which begin now, and ``measure``, a sample that is done. Figures are added to `cells`, so whoever stops early has what came so far. Torch's number of threads is that of each
+    cell while this runs.
     """
     import torch
 
@@ -49,15 +49,17 @@ def measure_events(plan: Plan) -> Iterator[Event]:
         simulators: dict[tuple[str, int], tuple[Simulator, float]] = {}
         runs = []
         for cell in plan.cells:
-            yield Started(cell, "compile")
-            run, ready = _make_ready(plan, cell, simulators)
+            yield "compile", cell
+            run, figures = _make_ready(plan, cell, simulators)
             runs.append(run)
-            yield ready
-        for number, index, seconds, busy in interleaved([run.sample for run in runs], plan.rounds):
-            yield Sample(plan.cells[index], number, seconds, busy)
-        for cell, run in zip(plan.cells, runs if plan.profile else (), strict=plan.profile):
-            yield Started(cell, "profile")
-            yield Costs(cell, run.costs())
+            cells.append(figures)
+        for _, index, seconds, busy in interleaved([run.sample for run in runs], plan.rounds):
+            cells[index].seconds.append(seconds)
+            cells[index].processor_seconds.append(busy)
+            yield "measure", plan.cells[index]
+        for figures, run in zip(cells, runs, strict=True) if plan.profile else ():
+            yield "profile", figures.cell
+            figures.passes = run.costs()
     finally:
         torch.set_num_threads(threads)
 
@@ -136,7 +138,7 @@ def synchronize(sim: Simulator) -> None:
 
 def _make_ready(
     plan: Plan, cell: Cell, simulators: dict[tuple[str, int], tuple[Simulator, float]]
-) -> tuple[_Run, Ready]:
+) -> tuple[_Run, CellFigures]:
     """Compile a cell's backend unless another cell has, and run the first calls."""
     import torch
 
@@ -154,4 +156,4 @@ def _make_ready(
     synchronize(sim)
     run = _Run(sim, start, cell.threads)
     memory = peak_growth(lambda: run.begin(plan.steps, plan.seconds / plan.rounds), plan.device)
-    return run, Ready(cell, compiling, run.first, memory, state_bytes, run.steps, run.calls)
+    return run, CellFigures(cell, compiling, run.first, memory, state_bytes, run.steps, run.calls)

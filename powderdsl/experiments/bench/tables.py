@@ -66,7 +66,7 @@ def cell_table(cells: Sequence[CellFigures]) -> str:
         ("CPUs", lambda one: f"{one.processors:.2f}"),
         ("to first step", lambda one: f"{one.to_first_step:.2f} s"),
         ("memory", _memory),
-        ("state", lambda one: f"{one.ready.state_bytes / one.cell.cells:.3g} B/cell"),
+        ("state", lambda one: f"{one.state_bytes / one.cell.cells:.3g} B/cell"),
     ]
     return aligned([[name for name, _ in columns], *([show(one) for _, show in columns] for one in cells)])
 
@@ -115,7 +115,7 @@ def number(value: float) -> str:
 
 
 def _memory(figures: CellFigures) -> str:
-    growth = figures.ready.memory.growth
+    growth = figures.memory.growth
     if growth is None:
         return "?"
     return f"{growth / MEGABYTE:.1f} MiB, {growth / figures.cell.cells:.0f} B/cell"
@@ -123,7 +123,7 @@ def _memory(figures: CellFigures) -> str:
 
 def _footnotes(report: Report) -> list[str]:
     plan = report.plan
-    steps = sorted({figures.ready.steps for figures in report.cells})
+    steps = sorted({figures.steps for figures in report.cells})
     shown = str(steps[0]) if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
     notes = [
         f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
@@ -131,5 +131,5 @@ def _footnotes(report: Report) -> list[str]:
         "to first step: compiling, which all lines of a backend share, and the first step",
         "state: the worlds' tensors, which are there before memory is measured",
     ]
-    hows = dict.fromkeys(figures.ready.memory.how for figures in report.cells)
+    hows = dict.fromkeys(figures.memory.how for figures in report.cells)
     return [*notes, *(f"memory: {how}" for how in hows)]
