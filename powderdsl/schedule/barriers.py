@@ -1,4 +1,4 @@
-"""Where all threads wait for each other: between loops of which one reads or writes what the other wrote."""
+"""Places barriers between loops of which one reads or writes what the other wrote."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from powderdsl.schedule.buffers import Buffer, neighbors
 from powderdsl.schedule.types import ANSWER, Compute, Guard, Schedule, Statement, Sync
 
 Access = tuple[bool, bool, bool]
-"""In a loop over words; at the own word only; written."""
+"""Whether an access is in a loop over words, of the thread's own word only, and a write."""
 
 
 @dataclass
 class Pending:
-    """What threads did to buffers since the last barrier."""
+    """The accesses to each buffer since the last barrier."""
 
     done: dict[Buffer, set[Access]] = field(default_factory=dict)
 
     def clashes(self, buffer: Buffer, access: Access) -> bool:
-        """Whether a barrier must come before an access. Threads have the same words in all loops over words."""
+        """Whether an access needs a barrier before it. A thread has the same words in all loops over words."""
         words, own, written = access
         return any(
             (written or before_written) and not (words and before_words and own and before_own)
@@ -38,7 +38,7 @@ class Pending:
 
 
 def barriers(schedule: Schedule, pending: Pending) -> Schedule:
-    """The schedule with barriers. `pending` goes from pass to pass; an answer is a barrier too."""
+    """The schedule with barriers. `pending` is handed from pass to pass; computing an answer is a barrier too."""
     placing = _Placing(dict(schedule.buffers), pending)
     return replace(schedule, body=placing.block(schedule.body))
 
@@ -65,7 +65,7 @@ class _Placing:
                     result.append(Sync())
                 if statement.held:
                     result.append(statement)
-                    # Its own barrier stands between reading and storing.
+                    # It has a barrier of its own between reading and storing.
                     self.pending.done.clear()
                     self.access(self.writes(statement))
                 else:
@@ -88,7 +88,7 @@ class _Placing:
         ]
 
     def access(self, accesses: list[tuple[Buffer, Access]]) -> bool:
-        """Note what a loop does; True if a barrier must come before it."""
+        """Note the accesses of a loop. True if it needs a barrier before it."""
         wait = any(self.pending.clashes(*one) for one in accesses)
         if wait:
             self.pending.done.clear()

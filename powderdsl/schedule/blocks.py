@@ -1,4 +1,4 @@
-"""Movements for arrays: planes that move together lie in one array, and stay there from movement to movement."""
+"""Movements on arrays: planes that move together share one array, and stay there from movement to movement."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from powderdsl.schedule.types import (
 def blocks(schedule: Schedule) -> Schedule:
     """Each `Move` as one operation on a block of planes.
 
-    `swap by m: x = a, y = b` → `b1 = stack(a, b); b2 = swap(b1, m); x = member(b2, 0); y = member(b2, 1)`. Where a guard
-    holds all of a movement, it keeps the block.
+    `swap by m: x = a, y = b` → `b1 = stack(a, b); b2 = swap(b1, m); x = member(b2, 0); y = member(b2, 1)`. A guard
+    around a whole movement keeps the block.
     """
     return without_unread(_Blocks(schedule).schedule)
 
@@ -36,7 +36,7 @@ def blocks(schedule: Schedule) -> Schedule:
 class _Blocks:
     given: Schedule
     members: dict[str, tuple[Var, int]] = field(default_factory=dict)
-    """Block and position of planes that lie in one."""
+    """The block and position of each plane that lies in one."""
     size: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -56,7 +56,7 @@ class _Blocks:
         return tuple(result)
 
     def guard(self, guard: Guard) -> list[Statement]:
-        """A guard; movements of all that it keeps of some planes keep the block."""
+        """A guard with its movements on blocks. It keeps a block instead of its planes if it keeps all of them."""
         before: list[Statement] = []
         after: list[Statement] = []
         inner: list[Statement] = []
@@ -81,13 +81,13 @@ class _Blocks:
             after.append(members)
             known |= {name: self.members[name] for name in in_order(gone)}
         self.members = known
-        # What the body reads of moved planes, it reads of the block.
+        # The body reads moved planes from the block.
         names = {out.var.name: out for one in after if isinstance(one, Compute) for out in one.outs}
         own = self.with_members(inner, names)
         return [*before, replace(guard, body=tuple(own), keeps=tuple(keeps)), *after]
 
     def with_members(self, body: list[Statement], names: dict[str, Out]) -> list[Statement]:
-        """A body in which planes of blocks are read that get their names only after it."""
+        """A body that reads planes from blocks, since their names are defined only after it."""
 
         def rule(node: Node) -> Node | None:
             return names[node.attr].value if node.op == "load" and node.attr in names else None
@@ -95,10 +95,10 @@ class _Blocks:
         return [with_values(statement, self.graph, rule) for statement in body] if names else body
 
     def gathered(self, move: Move) -> tuple[list[Statement], Var, list[int]]:
-        """The block that the planes lie in, if they are most of it; else a new one."""
+        """The block in which the planes lie, if they are most of it; else a new one."""
         names = [str(plane.old.attr) for plane in move.planes]
         homes = {self.members[name][0].name: self.members[name][0] for name in names if name in self.members}
-        once = len(set(names)) == len(names)  # a plane that becomes two needs two places
+        once = len(set(names)) == len(names)  # a plane that becomes two needs two positions
         if len(homes) == 1 and once and all(name in self.members for name in names):
             block = next(iter(homes.values()))
             if 2 * len(names) > self.size[block.name]:
@@ -112,7 +112,7 @@ class _Blocks:
         return block, Compute((Out(block, self.graph.node("stack", BLOCK, tuple(planes))),), move.place)
 
     def carried(self, move: Move, old: Var, positions: list[int]) -> tuple[Var, Compute, Compute]:
-        """The block after a movement, the statement that makes it, and one that names its planes."""
+        """The block after a movement, the statement that computes it, and one that names its planes."""
         args = (load(self.graph, old), move.movers)
         new = self.namer.var(BLOCK)
         self.size[new.name] = self.size[old.name]
@@ -132,7 +132,7 @@ class _Blocks:
         return Compute(tuple(outs), move.place)
 
     def moved(self, move: Move) -> list[Statement]:
-        """A movement whose planes get their names at once."""
+        """A movement whose planes are named directly after it."""
         if _is_simple(move):
             stack, old, positions = self.gathered(move)
             _, compute, members = self.carried(move, old, positions)
@@ -148,14 +148,14 @@ class _Blocks:
 
 
 def _is_simple(move: Move) -> bool:
-    """Whether cells that movers left hold nothing, or everything, or what was swapped."""
+    """Whether every plane of cells that movers left is all zeros, all ones, or swapped."""
     if move.op == "swap":
         return all(plane.leaves is plane.old for plane in move.planes)
     return _left(move.planes, move.movers, range(len(move.planes))) is not None
 
 
 def _left(planes: Sequence[Carried], movers: Node, positions: Sequence[int]) -> tuple[int, ...] | None:
-    """Positions of planes that hold where something left, if all others do not hold there; None if not as simple."""
+    """Positions of the planes that are set where a mover left, if the others are cleared there; None otherwise."""
     found = []
     for plane, position in zip(planes, positions, strict=True):
         rest = plane.leaves

@@ -1,7 +1,7 @@
-"""Numbered buffers for variables, each for as long as it is needed; what takes another's place takes its buffer.
+"""Assigns numbered buffers to variables for their lifetimes.
 
-A variable that follows on another takes over its buffer if it can, so a guard that is skipped costs nothing. What
-cannot is copied, by statements of its own.
+A variable that replaces another reuses its buffer where possible, so that a skipped guard costs nothing. Elsewhere
+statements are added that copy the old value.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Buffer = tuple[str, int]
 
 @dataclass
 class Pool:
-    """Buffers by kind: how many are the slots' own, and how many there are in all."""
+    """Numbers of buffers by kind: those that belong to slots, and all."""
 
     slots: dict[str, int]
     size: dict[str, int]
@@ -44,7 +44,7 @@ def buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_plac
     Args:
         homes: the number of each slot's own buffer.
         pool: shared by all passes; it grows.
-        in_place: whether a loop may write planes whose other words it reads, holding back all that it writes.
+        in_place: whether a loop may overwrite planes that it reads at neighbors, by storing only after all reads.
     """
     found = {var.name: homes[slot] for slot, var in schedule.finds}
     types = {var.name: var.type.name for _, var in schedule.finds}
@@ -70,15 +70,15 @@ class _Plan:
     in_place: bool
     buffer: dict[str, Buffer] = field(default_factory=dict)
     open: set[Buffer] = field(default_factory=set)
-    """Buffers of all slots that the pass changes: until its end they may hold anything."""
+    """Buffers of the slots that the pass changes; until its end they may hold other values."""
     wanted: dict[str, int] = field(default_factory=dict)
-    """The slot's buffer in which a variable ends."""
+    """The slot's buffer in which a variable must end up."""
     last: dict[str, int] = field(default_factory=dict)
     defined: dict[str, int] = field(default_factory=dict)
     follows: dict[str, str] = field(default_factory=dict)
-    """What a variable is where its statement is skipped."""
+    """The variable whose value each variable has if its statement is skipped."""
     ends: dict[str, int] = field(default_factory=dict)
-    """Where that is made good."""
+    """The position at which that value must be in place."""
 
     def run(self) -> None:
         order = list(_in_order(self.schedule.body))
@@ -103,7 +103,9 @@ class _Plan:
                 found = self.taken_over(out.var, statement, reads, position, busy)
                 if found is None:
                     found = self.free(out.var, busy)
-                    if old := self.follows.get(out.var.name, ""):  # it must still be there to be copied
+                    if old := self.follows.get(
+                        out.var.name, ""
+                    ):  # it is copied there, so it must still exist
                         self.last[old] = max(self.last.get(old, -1), self.ends[out.var.name])
                 kind, number = found
                 self.pool.size[kind] = max(self.pool.size[kind], number + 1)
@@ -111,7 +113,7 @@ class _Plan:
                 busy[found] = out.var.name
 
     def number(self, statement: Statement, position: int) -> None:
-        """First and last places of variables, and what they follow on."""
+        """Note where variables are defined and last read, and what they replace."""
         if isinstance(statement, Compute):
             for name in neighbors(statement):
                 self.last[name] = position
@@ -133,7 +135,7 @@ class _Plan:
     def taken_over(
         self, var: Var, loop: Compute, reads: Mapping[str, bool], position: int, busy: Mapping[Buffer, str]
     ) -> Buffer | None:
-        """The buffer of a variable that nobody needs after this loop: of what it follows on, or in its slot's home."""
+        """The buffer to reuse: that of the variable it replaces, or its slot's, if nothing reads it after this loop."""
         home = busy.get((var.type.name, self.wanted.get(var.name, -1)), "")
         for old in (self.follows.get(var.name, ""), home):
             if not old or self.last.get(old, -1) > position:
@@ -143,12 +145,12 @@ class _Plan:
             if reads.get(old) and not (self.in_place and loop.over == "words"):
                 continue
             if old in reads and loop.over == "cells" and var.type == FLAG:
-                continue  # one lane writes what the others read
+                continue  # one thread would write a word that others read
             return self.buffer[old]
         return None
 
     def free(self, var: Var, busy: Mapping[Buffer, str]) -> Buffer:
-        """The buffer of the slot that the variable ends in, or the first that nobody needs."""
+        """The buffer of the slot in which the variable ends up, or the first free one."""
         kind = var.type.name
         home = self.wanted.get(var.name)
         if home is not None and (kind, home) not in busy:
@@ -161,7 +163,7 @@ class _Plan:
 
 
 def _in_order(body: Sequence[Statement]) -> Iterator[Statement]:
-    """All statements in order of place; a guard after what it holds."""
+    """All statements in order; a guard comes after its body."""
     for statement in body:
         if isinstance(statement, Guard):
             yield from _in_order(statement.body)
@@ -169,7 +171,7 @@ def _in_order(body: Sequence[Statement]) -> Iterator[Statement]:
 
 
 def neighbors(statement: Statement) -> dict[str, bool]:
-    """Variables that a statement reads, and whether also at neighbors."""
+    """The variables that a statement reads, and whether it reads them at neighbors too."""
     found: dict[str, bool] = {}
     for node in ordered(values_of(statement)):
         if node.op == "load":
@@ -180,7 +182,7 @@ def neighbors(statement: Statement) -> dict[str, bool]:
 
 
 def _explicit(schedule: Schedule, plan: _Plan, homes: Mapping[str, int]) -> Schedule:
-    """The schedule with the copies that the plan makes necessary."""
+    """The schedule with the copies that the assignment requires."""
     graph, namer = schedule.graph, Namer(schedule)
     numbers = dict(plan.buffer)
 
@@ -226,7 +228,7 @@ def _explicit(schedule: Schedule, plan: _Plan, homes: Mapping[str, int]) -> Sche
 
 
 def copies(pairs: Sequence[tuple[Var, Node]], graph: Graph) -> Iterator[Compute]:
-    """Loops that give variables their values; each reads everything before it writes anything."""
+    """Loops that assign values to variables; each reads everything before it writes anything."""
     flags = tuple(Out(var, value) for var, value in pairs if var.type == FLAG)
     if flags:
         yield Compute(flags, "", "words")

@@ -1,4 +1,4 @@
-"""A pass on bit planes as it is where all reals that it reads are zero: much less, or nothing at all."""
+"""The calm form of a pass: what remains of it where all floats that it reads are zero."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from powderdsl.ir.gates import Gates
 from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, SubstepGraph, nodes_of
 
 WORTH = 0.75
-"""A quiet form must have this share of the pass's nodes at most."""
+"""A calm form must have at most this share of the pass's nodes."""
 
 
 def real_inputs(pass_: PassGraph) -> tuple[str, ...]:
-    """The slots of reals that a pass reads."""
+    """The float slots that a pass reads."""
     nodes = nodes_of(pass_, substeps=False)
     return tuple(dict.fromkeys(str(n.attr) for n in nodes if n.op == "input" and n.type == REAL))
 
 
 def calm_pass(pass_: PassGraph) -> PassGraph | None:
-    """The pass where its real inputs are zero everywhere; None if that is not much less."""
+    """The pass with zeros for its float inputs; None if that is not much smaller."""
     slots = set(real_inputs(pass_))
     if not slots:
         return None
@@ -47,7 +47,7 @@ def calm_pass(pass_: PassGraph) -> PassGraph | None:
 
 
 def _quiet(node: Node, args: list[Node], gates: Gates) -> Node:
-    """A node on quiet arguments, folded."""
+    """A node on folded arguments, folded."""
     build, op, evaluate = gates.build, node.op, OPS[node.op].evaluate
     known = bool(args) and all(arg.op == "const" for arg in args)
     if op == "input" and node.type == REAL:

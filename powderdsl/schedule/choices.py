@@ -1,4 +1,4 @@
-"""Choices of floats for arrays: where the new value is the old one changed a little, only those cells are touched."""
+"""Choices of floats on arrays: where few cells change, only those are touched."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _choice(node: Node, done: dict[int, Node], users: Counter[int], graph: Graph
 
 
 def _change_of(yes: Node, no: Node) -> Node | None:
-    """What is added to `no`, taken off or multiplied to give `yes`; None if it is not as simple."""
+    """The operand that is added to, subtracted from or multiplied with `no` to give `yes`; None if there is none."""
     if yes.op not in _UPDATES:
         return None
     left, right = yes.args

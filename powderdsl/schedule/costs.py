@@ -1,4 +1,4 @@
-"""What storing a value costs against computing it again at a neighbor."""
+"""The costs of storing a value and of recomputing it at a neighbor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from powderdsl.ir.ops import Node, Offset
 from powderdsl.schedule.floats import of_floats
 
 FAR = 100
-"""The cost of what cannot be computed again."""
+"""The cost of a value that cannot be recomputed."""
 
 UNIFORM = ("const", "param", "coordinate", "inside")
 LOGIC = ("not", "and", "or", "xor", "select", "when")
@@ -20,15 +20,15 @@ Have = Callable[[Node], bool]
 
 @dataclass(frozen=True)
 class Costs:
-    """What storing costs a target. `gates`: summed over all neighbors that ask, up to which a flag is computed again;
-    `floats`: operations up to which a float is."""
+    """Limits of recomputation on a target: `gates` for a flag, summed over all neighbors that read it; operations
+    (`floats`) for a float."""
 
     gates: int
     floats: int
 
 
 def sources_of(node: Node) -> list[tuple[Node, Offset]]:
-    """What a node asks for at neighbors, and where."""
+    """The nodes that a node reads at neighbors, with the offsets."""
     if node.op == "shift":
         return [(node.args[0], node.attr[:2])]
     if node.op in ("swap", "arrive"):
@@ -39,7 +39,7 @@ def sources_of(node: Node) -> list[tuple[Node, Offset]]:
 
 
 def movable(node: Node, have: Have, most: int) -> bool:
-    """Whether a flag can be computed at a neighbor with at most so many gates."""
+    """Whether a flag can be recomputed at a neighbor with at most `most` gates."""
     seen: set[tuple[int, Offset]] = set()
     stack = [(node, (0, 0))]
     while stack:
@@ -66,21 +66,21 @@ def is_constant(node: Node) -> bool:
 
 
 def float_cost(node: Node, have: Have) -> int:
-    """Operations that computing a float at a neighbor takes; FAR if it cannot be done there."""
+    """The number of operations that recompute a float at a neighbor; FAR if that is impossible."""
     if have(node) or node.op in ("const", "param"):
         return 0
     if node.op in ARITHMETIC:
         total = 1
         for arg in node.args:
             total += float_cost(arg, have)
-            if total >= FAR:  # graphs share nodes: counting on would take forever
+            if total >= FAR:  # graphs share nodes: counting all paths would take forever
                 return FAR
         return total
     return float_cost(node.args[0], have) if node.op == "shift" and node.attr[2] else FAR
 
 
 def stored_parts(source: Node, have: Have, most: int) -> list[Node]:
-    """What must be stored so that a float can be computed at a neighbor: itself, or the costly things in it."""
+    """The nodes to store so that a float can be recomputed at a neighbor: itself, or its costly parts."""
     if float_cost(source, have) <= most:
         return []
     if source.op in ARITHMETIC:

@@ -1,7 +1,7 @@
-"""Where one loop ends and the next begins: what must be stored before a loop can read it, what is computed again.
+"""Cuts statements into loops: which values are stored for later loops, and which are recomputed.
 
-A loop over words sees flags of its own word; at a neighbor it reads what is stored, or computes again what is cheap.
-A loop over cells sees floats, and flags that are stored.
+A loop over words reads flags of its own word; at neighbors it reads stored flags, or recomputes cheap ones.
+A loop over cells reads floats and stored flags.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
 
 
 Pairs = Callable[[list[Node]], list[tuple[Var, Node]]]
-"""Nodes with the variables that they are stored in."""
+"""Assigns variables to nodes that are to be stored."""
 
 
 class Cutter:
-    """Loops for targets where a question costs a barrier, and everything is computed word by word."""
+    """Loops for targets where testing a mask costs a barrier and flags are computed word by word."""
 
     def __init__(self, schedule: Schedule, costs: Costs):
         self.namer, self.graph, self.costs = Namer(schedule), schedule.graph, costs
         self.known: dict[int, Var] = {}
-        """Variables of values, by id, that are stored where we are."""
+        """The variables of the values stored so far, by the value's id."""
         self.statements: list[Statement] = []
         nodes = ordered(node for one in flat(schedule.body) for node in values_of(one))
         self.comparisons = [node for node in nodes if is_comparison(node)]
@@ -81,7 +81,7 @@ class Cutter:
             for source, offset in sources_of(node):
                 offsets.setdefault(id(source), set()).add(offset)
         self.askers = {key: len(found) for key, found in offsets.items()}
-        """How many neighbors' values of each node are asked for."""
+        """At how many neighbors each node is read."""
         shifted = [node.args[0] for node in nodes if node.op == "shift" and node.type == REAL]
         self.wanted = {
             id(part)
@@ -89,21 +89,21 @@ class Cutter:
             for part in stored_parts(node, lambda node: node.op == "load", costs.floats)
             if part.op != "load"
         }
-        """Floats that neighbors will be asked for."""
+        """Floats that are read at neighbors later."""
         led = [node for node in nodes if node.op == "led"]
         self.led = {id(node.args[1]): node for node in led}
         self.same: dict[str, Node] = {}
-        """Loads of variables that have the same value as others, by the others' names."""
+        """For each variable that is only another name: the load of the variable that it names."""
 
         self.there = {var.name for _, var in schedule.finds}
-        """Variables that exist where we are."""
+        """The variables defined so far."""
 
     def emit(self, statement: Statement) -> None:
         self.statements.append(statement)
         self.there |= {var.name for var in defined_by(statement)}
 
     def alias(self, names: dict[str, Node]) -> None:
-        """Variables that are only other names."""
+        """Note variables that are only other names of values."""
         self.same |= names
         self.there |= names.keys()
 
@@ -111,7 +111,7 @@ class Cutter:
         return node.op == "load" or id(node) in self.known
 
     def variable(self, node: Node) -> Node:
-        """The load of a node that is stored."""
+        """The load of a stored node."""
         found = node if node.op == "load" else load(self.graph, self.known[id(node)])
         return self.same.get(found.attr, found)
 
@@ -126,7 +126,7 @@ class Cutter:
     def block(
         self, body: Sequence[Statement], kept: frozenset[str] = frozenset(), *, top: bool = False
     ) -> list[Statement]:
-        """`kept`: variables that a guard around the block keeps."""
+        """A block as loops. `kept`: names that the guard around the block keeps."""
         outer, self.statements = self.statements, []
         scope = dict(self.known), set(self.there)
         for i, statement in enumerate(body):
@@ -142,7 +142,7 @@ class Cutter:
                 case Guard() if not (i and isinstance(body[i - 1], Compute)):
                     self.ask([], statement)
                 case Guard():
-                    pass  # with the masks before it
+                    pass  # emitted with the masks before it
                 case Forget():
                     self.emit(statement)
                 case _:
@@ -165,7 +165,7 @@ class Cutter:
                 self.alias({out.var.name: self.variable(out.value)})
 
     def hoist_comparisons(self, masks: list[Node], place: str) -> None:
-        """Comparisons that masks ask for, outside any guard, with all others that can be had in one loop."""
+        """Compute the comparisons of masks before the guard, with all others that the same loop can compute."""
         asked = [
             self.led.get(id(node), node)
             for mask in masks
@@ -185,7 +185,7 @@ class Cutter:
         self.ensure([*asked, *ready], place)
 
     def guarded(self, masks: Compute, guard: Guard) -> None:
-        """Masks and the guard that asks for them: first what is cheap, and the rest only where that leaves something."""
+        """Masks and the guard that tests them: the cheap parts first, the rest only if those hold somewhere."""
         graph, place = self.graph, masks.place
         self.alias({out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)})
         masks = replace(masks, outs=tuple(out for out in masks.outs if out.var.name not in self.same))
@@ -201,7 +201,7 @@ class Cutter:
             self.ensure([need for out in lazy for need in self.needs(out.value)], place)
             self.ask(lazy, guard)
             return
-        # Whether the cheap parts hold anywhere: only then are the others, and what they need, computed.
+        # The other parts, and what they need, are computed only if the cheap parts hold somewhere.
         first = [
             combined("and", cheap[node.attr], graph) if node.attr in cheap else node for node in guard.when
         ]
@@ -219,7 +219,7 @@ class Cutter:
         self.emit(Guard(when, tuple(inner), kept, guard.place))
 
     def ask(self, masks: list[Out], guard: Guard) -> None:
-        """Store masks, ask whether they hold anywhere, and what the guard does then."""
+        """Store masks, test whether they hold anywhere, and emit the guard."""
         values = {out.var.name: out.value for out in masks}
         asked = [values.get(node.attr, node) if node.op == "load" else node for node in guard.when]
         self.ensure([need for node in asked for need in self.needs(node)], guard.place)
@@ -231,12 +231,12 @@ class Cutter:
         self.emit(Guard(when, body, self.kept(guard), guard.place))
 
     def answer(self, flags: Sequence[Node]) -> Out:
-        """Whether one of some flags holds in any cell."""
+        """A new variable: whether one of some flags holds in any cell."""
         some = combined("or", [self.word(flag) for flag in flags], self.graph)
         return Out(self.namer.var(ANSWER), self.graph.node("any", ANSWER, (some,)))
 
     def split(self, mask: Node) -> tuple[list[Node], list[Node]]:
-        """Conjuncts that one loop can compute from what is there, and those that take more."""
+        """The conjuncts that one loop can compute from stored values, and the others."""
         cheap: list[Node] = []
         rest: list[Node] = []
         for part in conjuncts(mask):
@@ -252,7 +252,7 @@ class Cutter:
         return self.under(combined("and", cheap, self.graph), rest)
 
     def under(self, first: Node, rest: list[Node]) -> Node:
-        """What holds under a condition: draws last, each asked for where all before them holds."""
+        """A conjunction under a condition: draws come last, each conditional on everything before it."""
         value = first
         for part in sorted(rest, key=lambda part: part.op in DRAWS):
             if part.op in DRAWS and not self.have(part):
@@ -269,7 +269,7 @@ class Cutter:
         return self.cell_needs(node) if of_floats(node) else self.word_needs(node)
 
     def again(self, node: Node) -> bool:
-        """Whether a flag's value at a neighbor is at hand or cheap."""
+        """Whether a flag's value at a neighbor is stored or cheap to recompute."""
         most = max(1, self.costs.gates // max(1, self.askers.get(id(node), 1)))
         return self.have(node) or movable(node, self.have, most)
 
@@ -295,7 +295,7 @@ class Cutter:
         return list(found.values())
 
     def cell_needs(self, node: Node) -> list[Node]:
-        """Flags, then floats, that a loop over cells reads."""
+        """The flags, then the floats, that a loop over cells reads."""
         found: dict[int, Node] = {}
         seen: set[int] = set()
         stack = [node]
@@ -324,7 +324,7 @@ class Cutter:
         return sorted(found.values(), key=lambda need: need.type == REAL)
 
     def stands_apart(self, part: Node, node: Node) -> bool:
-        """Whether a part of a node is computed in another way, before the loop of the node."""
+        """Whether a part of a node has a loop of its own before the node's loop."""
         return False
 
     def ensure(
@@ -334,7 +334,7 @@ class Cutter:
         named: dict[int, Var] | None = None,
         when: Node | None = None,
     ) -> None:
-        """Store nodes, and before them everything they need. `when`: see `Compute`."""
+        """Store nodes, after everything that they need. `when`: see `Compute`."""
         named = named or {}
         wanted = [
             node
@@ -353,7 +353,7 @@ class Cutter:
             self.ensure(wanted, place, named, when)
             return
         floats = [node for node in wanted if of_floats(node)]
-        # What neighbors will be asked for later is stored while it is computed anyway.
+        # Floats that are read at neighbors later are stored here, where they are computed anyway.
         floats += [i for node in floats for i in walk(node) if id(i) in self.wanted and not self.have(i)]
         flags = [node for node in wanted if node not in floats]
 
@@ -365,7 +365,7 @@ class Cutter:
     def store(
         self, floats: list[Node], flags: list[Node], pairs: Pairs, place: str, when: Node | None
     ) -> None:
-        """Loops for nodes of which all that they need is there."""
+        """Loops for nodes whose inputs are all stored."""
         if floats:
             self.cells(pairs(floats), place)
         if flags:
@@ -382,7 +382,7 @@ class Cutter:
         place: str,
         over: Literal["cells", "choices"] = "cells",
     ) -> None:
-        """A loop over cells: floats first, then comparisons, those that lead before those that they lead."""
+        """A loop over cells: floats first, then comparisons, each after the one under which it is computed."""
         pairs = sorted(pairs, key=lambda pair: (pair[1].type != REAL, pair[1].op == "led"))
         cells = _Cells(self)
         outs = tuple(Out(var, cells.value(node)) for var, node in pairs)
@@ -392,7 +392,7 @@ class Cutter:
     # Values of a loop
 
     def word(self, root: Node) -> Node:
-        """A flag in a loop over words: neighbors are read from variables only."""
+        """A flag in a loop over words; only variables are read at neighbors."""
         memo: dict[tuple[int, int, int], Node] = {}
         graph = self.graph
 
@@ -436,7 +436,7 @@ class Cutter:
 
 
 class _Cells:
-    """Values of one loop over cells: floats at neighbors are read from variables, or computed again."""
+    """Values of one loop over cells; floats at neighbors are read from variables or recomputed."""
 
     def __init__(self, cutter: Cutter):
         self.cutter, self.graph = cutter, cutter.graph

@@ -1,7 +1,7 @@
-"""Loops for targets that run over whole planes, row by row, and keep whether a plane is empty: questions cost nothing.
+"""Cuts statements into loops for targets that process whole planes row by row and know which planes are empty.
 
-Movements are operations on whole planes, in place where a substep only carries planes along. Long chains of choices
-are laid over a field one after the other.
+Testing a mask is free there. Movements are operations on whole planes, in place where a substep only moves them. Long
+chains of choices are applied to a field one after another.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from powderdsl.schedule.types import (
 )
 
 FEWEST = 3
-"""Choices from which a field of their own pays."""
+"""The shortest chain of choices that is worth a field of its own."""
 
 
 def cut_rows(costs: Costs) -> Callable[[Schedule], Schedule]:
@@ -47,7 +47,7 @@ def cut_rows(costs: Costs) -> Callable[[Schedule], Schedule]:
 
 
 def gate_cost(node: Node, have: Have, limit: int = 1000) -> int:
-    """Gates that computing a flag in another row takes; `limit` if it cannot be done there."""
+    """The number of gates that recompute a flag in another row; `limit` if that is impossible."""
     if have(node) or is_constant(node):
         return 0
     if node.op in UNIFORM:
@@ -66,14 +66,14 @@ def gate_cost(node: Node, have: Have, limit: int = 1000) -> int:
 
 
 def chain_of(node: Node, have: Have) -> list[Node]:
-    """A long chain of choices, the outermost first, whose values are computed from what is stored; else nothing."""
+    """A chain of at least FEWEST choices, outermost first, whose values read stored variables only; else nothing."""
     chain: list[Node] = []
     while node.op == "select" and node.type == REAL and not have(node):
         if node.args[0].op == "param":
             return []
         chain.append(node)
         node = node.args[2]
-    if len(chain) < FEWEST or node.op in UNIFORM:  # what is the same everywhere stands in no field
+    if len(chain) < FEWEST or node.op in UNIFORM:  # a value that is the same in all cells has no field
         return []
     for (
         choice
@@ -93,7 +93,7 @@ def chain_of(node: Node, have: Have) -> list[Node]:
 
 
 def _is_kept(node: Node, found: set[str]) -> bool:
-    """Whether a float is a clamped slot under choices."""
+    """Whether a float is a clamped slot with some cells replaced by choices."""
     if node.op != "settle":
         return False
     node = node.args[0]
@@ -114,7 +114,7 @@ class _RowCutter(Cutter):
                 roots = [out.value for out in masks.outs if out.var.name in asked]
                 counts.update({id(part) for root in roots for part in _conjunctions(root)})
         self.shared = {key for key, count in counts.items() if count > 1}
-        """Parts of several masks: where such a plane is empty, all of them are."""
+        """Conjuncts that several masks have in common: if such a plane is empty, so are all these masks."""
 
     # Masks
 
@@ -138,7 +138,7 @@ class _RowCutter(Cutter):
         masks: Compute,
         guard: Guard,
     ) -> None:
-        """Candidates first; the rest, and what it needs, only where there are some."""
+        """Candidates first; the rest, and what it needs, only if there are any."""
         graph, place = self.graph, masks.place
         candidates = []
         for out in outs:
@@ -170,7 +170,7 @@ class _RowCutter(Cutter):
         self.then(guard)
 
     def shared_parts(self, mask: Node) -> list[Node]:
-        """The largest parts of a mask that other masks have too, if one loop can compute them."""
+        """The largest parts that a mask shares with other masks, if one loop can compute them."""
         if self.have(mask) or mask.op == "not":
             return []
         simple = id(mask) in self.shared and mask.op not in UNIFORM and not self.needs(mask)
@@ -183,7 +183,7 @@ class _RowCutter(Cutter):
     # Guards and movements
 
     def then(self, guard: Guard) -> None:
-        """What a guard does: planes that are only carried along move in place; the rest stands in a guard."""
+        """The body of a guard: planes that only move do so in place; the rest stays in a guard."""
         when = tuple(self.renamed(node) for node in guard.when)
         forgets = [statement for statement in guard.body if isinstance(statement, Forget)]
         outs = [out for one in guard.body if isinstance(one, Compute) for out in one.outs]
@@ -205,7 +205,7 @@ class _RowCutter(Cutter):
             self.move(carried, kept, guard.place)
 
     def carried(self, outs: list[Out], kept: dict[str, Node]) -> list[Out]:
-        """Writes that move what their slot held, all with the same movers and offset."""
+        """Writes that move their slot's old value, all with the same movers and offset."""
         found: list[Out] = []
         for out in outs:
             node = out.value
@@ -251,7 +251,7 @@ class _RowCutter(Cutter):
         return super().needs(node)
 
     def stands_apart(self, part: Node, node: Node) -> bool:
-        """Long chains of choices are laid before the loop that reads them."""
+        """Long chains of choices are applied before the loop that reads them."""
         return part is not node and not _is_kept(node, self.found) and bool(chain_of(part, self.have))
 
     def word_needs(self, node: Node) -> list[Node]:
@@ -295,7 +295,7 @@ class _RowCutter(Cutter):
             self.known[id(node)] = var
 
     def lay(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
-        """Chains of choices; those that depend on the same masks together."""
+        """Loops for chains of choices; chains with the same masks share one."""
         groups: dict[tuple[int, ...], list[tuple[Var, Node]]] = {}
         for var, node in pairs:
             chain = chain_of(node, self.have)
@@ -304,7 +304,7 @@ class _RowCutter(Cutter):
             self.cells(group, place, "choices")
 
     def kept_cells(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
-        """A loop over cells; what it computes of clamped slots stays as it was where no choice is made at all."""
+        """A loop over cells, in a guard if it computes only clamped slots, which change nowhere but under choices."""
         whole = [pair for pair in pairs if _is_kept(pair[1], self.found)]
         if len(whole) < len(pairs):
             self.cells(pairs, place)
@@ -324,7 +324,7 @@ class _RowCutter(Cutter):
 
 
 def _leaves_simply(node: Node) -> bool:
-    """Whether cells that movers left hold nothing, everything, or what was swapped; and arrivals go a row at most."""
+    """Whether cells that movers left become all zeros, all ones, or swapped, and arrivals move at most one row."""
     content, movers, rest = node.args
     if node.op == "arrive" and abs(node.attr[0]) > 1:
         return False
@@ -339,7 +339,7 @@ def _leaves_simply(node: Node) -> bool:
 
 
 def _conjunctions(node: Node) -> Iterator[Node]:
-    """A mask and all parts of it that must hold."""
+    """A mask and its nested conjuncts."""
     yield node
     if node.op == "and":
         for arg in node.args:

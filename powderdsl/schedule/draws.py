@@ -1,4 +1,4 @@
-"""Random bits only where they matter: thresholds of parameters, questions that take no draws, conditions of draws."""
+"""Draws: thresholds of parameters, questions without draws, and the conditions under which a draw is needed."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from powderdsl.schedule.types import (
 )
 
 FEW_BITS = 2
-"""So many random bits are drawn without asking whether they matter."""
+"""Draws of at most this many bits are made unconditionally."""
 
 MAX_CONDITIONS = 8
-"""Flags without which a draw does not matter, at most."""
+"""The largest number of flags in the condition of a draw."""
 
 DRAWS = ("chance", "below_planes", "below_param")
 _POINTWISE = ("and", "or", "xor", "not", "select")
 
 
 def thresholds(schedule: Schedule) -> Schedule:
-    """A draw below all planes of one parameter is a draw below the parameter, which mostly is the same for all worlds.
+    """A draw below all planes of one parameter becomes a draw below the parameter, usually one number for all worlds.
 
     `below_planes(p:16, p:15, …, p:0)` → `below_param(p)`.
     """
@@ -50,7 +50,7 @@ def thresholds(schedule: Schedule) -> Schedule:
 
 
 def cheap_questions(schedule: Schedule) -> Schedule:
-    """A guard asks first for the part of its mask that takes no draws; the draws are made in its body.
+    """A guard first tests the part of its mask that needs no draws; its body makes the draws.
 
     `p = a & b & below(limit); if any p` → `q = a & b; if any q: p = …`.
     """
@@ -86,7 +86,7 @@ def cheap_questions(schedule: Schedule) -> Schedule:
 
 
 def conditions(schedule: Schedule) -> Schedule:
-    """Draws get a last argument: where their result is asked for. Elsewhere it may be anything.
+    """Draws get a last argument: the condition under which their result is read. Elsewhere the result is undefined.
 
     `busy & chance(s)` → `busy & chance(s, busy)`.
     """
@@ -114,7 +114,7 @@ def _with_conditions(statement: Compute, graph: Graph) -> Compute:
                 known = where.get(id(arg), flags)
                 where[id(arg)] = {key: flag for key, flag in known.items() if key in flags}
     done: dict[int, Node] = {}
-    for node in sorted(nodes, key=lambda node: random[id(node)]):  # conditions take no draws
+    for node in sorted(nodes, key=lambda node: random[id(node)]):  # conditions contain no draws
         args = [done[id(arg)] for arg in node.args]
         asked = [done[id(flag)] for flag in where.get(id(node), {}).values()]
         if node.op in DRAWS and takes_bits(node) and asked:
@@ -124,13 +124,13 @@ def _with_conditions(statement: Compute, graph: Graph) -> Compute:
 
 
 def asked_for(draw: Node, where: Node, graph: Graph) -> Node:
-    """A draw with another condition."""
+    """The same draw under another condition."""
     count = draw.attr[1] + 1 if draw.op == "below_planes" else 0
     return graph.node(draw.op, FLAG, (*draw.args[:count], where), draw.attr, draw.places)
 
 
 def takes_bits(node: Node) -> bool:
-    """Whether a node is a draw that takes more than a few random bits."""
+    """Whether a node is a draw of more than FEW_BITS random bits."""
     if node.op == "chance":
         _, bits, limit = node.attr
         return bits - ((limit & -limit).bit_length() - 1) > FEW_BITS
@@ -138,7 +138,7 @@ def takes_bits(node: Node) -> bool:
 
 
 def _without_draws(mask: Node, graph: Graph) -> Node | None:
-    """The part of a mask that takes no draws; None if that is all of it, or nothing."""
+    """The part of a mask without draws; None if that is all of it or nothing."""
     parts = [(part, any(map(takes_bits, ordered([part])))) for part in conjuncts(mask)]
     cheap = [part for part, random in parts if not random]
     return combined("and", cheap, graph) if 0 < len(cheap) < len(parts) else None

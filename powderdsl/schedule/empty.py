@@ -1,4 +1,4 @@
-"""Loops over words that find nothing: where the planes that all their values depend on are empty."""
+"""Skips loops over words whose values are all zero because the planes that they depend on are empty."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from powderdsl.schedule.types import (
 
 
 def empty(schedule: Schedule) -> Schedule:
-    """Loops over words get the answer without which all their values are 0; operations on whole planes stand alone.
+    """Loops over words get a condition without which all their values are 0; operations on whole planes stand alone.
 
-    `m = a & (b | c[0,1])` → when `any a`; `n = a | b`, which sees at once that one of them is empty, needs no loop.
+    `m = a & (b | c[0,1])` → when `any a`; `n = a | b` needs no loop, since it tests its planes itself.
     """
     graph = schedule.graph
 
@@ -70,7 +70,7 @@ def _asked(loop: Compute, graph: Graph) -> Compute:
 
 
 def _conditions(value: Node, memo: dict[int, frozenset[str] | None]) -> list[frozenset[str]]:
-    """Sets of planes, of each of which one must hold something for the value to do so."""
+    """Sets of planes; of each set one plane must be non-empty for the value to hold anywhere."""
     if value.op == "when":
         candidates, rest = value.args
         parts = [candidates, *conjuncts(rest)]
@@ -85,7 +85,7 @@ def _any(names: Iterable[str], loads: dict[str, Node], graph: Graph) -> Node:
 
 
 def holders(node: Node, memo: dict[int, frozenset[str] | None]) -> frozenset[str] | None:
-    """Planes such that if all of them are empty, the flag holds nowhere; None if none are known."""
+    """Planes such that the flag holds nowhere if all of them are empty; None if none are known."""
     for inner in ordered([node]):
         if id(inner) not in memo and inner.type == FLAG:
             memo[id(inner)] = _holders(inner, memo)

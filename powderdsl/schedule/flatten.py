@@ -1,4 +1,4 @@
-"""One operation a statement, for targets that carry out each one over all cells before the next."""
+"""One operation per statement, for targets that execute each on all cells before the next."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Flattener:
     def __init__(self, namer: Namer, graph: Graph):
         self.namer, self.graph = namer, graph
         self.same: dict[str, Node] = {}
-        """What a variable is that is only another name, or a constant."""
+        """The value of each variable that is a constant or another name of a variable."""
 
     def renamed(self, node: Node) -> Node:
         while node.op == "load" and node.attr in self.same:
@@ -35,7 +35,7 @@ class _Flattener:
     def block(
         self, body: Sequence[Statement], known: dict[int, Node], kept: frozenset[str]
     ) -> tuple[Statement, ...]:
-        """`known`: operations that have variables, by id. `kept`: variables that a guard around the block keeps."""
+        """`known`: the variables of operations, by id. `kept`: names that the guard around the block keeps."""
         known = dict(known)
         result: list[Statement] = []
         for given in body:
@@ -61,7 +61,7 @@ class _Flattener:
     def operation(
         self, root: Node, known: dict[int, Node], own: dict[int, Var], result: list[Statement]
     ) -> Node:
-        """A variable or constant for a value; what is missing is added to the statements."""
+        """A variable or constant for a value. Missing operations are appended to `result`."""
         for node in ordered([root]):
             if id(node) in known:
                 continue

@@ -1,4 +1,4 @@
-"""Floats for targets with loops: computed when somebody asks, comparisons only where another comparison holds."""
+"""Floats on targets with loops: computed where they are used; comparisons only where another one holds."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ COMPARISONS = ("eq", "lt", "le")
 
 
 def late(schedule: Schedule) -> Schedule:
-    """Floats that substeps write are not stored: what needs them computes them, from what the pass finds and the masks.
+    """Floats that substeps write are not stored: their users compute them from the pass's inputs and the masks.
 
-    Where a guard's masks fail, the choices in the value give the old one, so it holds outside the guard as well.
+    Where a guard's masks fail, the choices in the value give the old one, so the value is right outside the guard too.
     `if any m: v2 = select(m, a, v1); … v3 = select(n, b, v2)` → `v3 = select(n, b, select(m, a, v1))`.
     """
     graph = schedule.graph
@@ -68,9 +68,9 @@ def late(schedule: Schedule) -> Schedule:
 
 
 def led(schedule: Schedule) -> Schedule:
-    """A comparison that is only asked together with another one is computed only where that holds.
+    """A comparison that matters only together with another one is computed only where that one holds.
 
-    `w & (a | b)` → `w & (led(w, a) | led(w, b))`: all ways from a value to `a` lead through a conjunction with `w`.
+    `w & (a | b)` → `w & (led(w, a) | led(w, b))`: every path from a value to `a` goes through a conjunction with `w`.
     """
     roots = [node for statement in flat(schedule.body) for node in values_of(statement)]
     comparisons = [node for node in ordered(roots) if is_comparison(node)]
@@ -100,12 +100,12 @@ def is_comparison(node: Node) -> bool:
 
 
 def of_floats(node: Node) -> bool:
-    """Whether loops over cells make a node: floats, and flags that compare them."""
+    """Whether a node needs a loop over cells: floats, and flags that compare them."""
     return node.type == REAL or node.op == "led" or is_comparison(node)
 
 
 def _covered(root: Node, node: Node, leader: Node) -> bool:
-    """Whether each way from the root to the node leads through a conjunction with the leader."""
+    """Whether every path from the root to the node goes through a conjunction with the leader."""
     seen: set[int] = set()
     stack = [root]
     while stack:
@@ -118,7 +118,7 @@ def _covered(root: Node, node: Node, leader: Node) -> bool:
         if top.op == "and":
             parts = conjuncts(top)
             if any(part is leader for part in parts):
-                stack.append(leader)  # the other parts are asked together with it
+                stack.append(leader)  # the other parts matter only together with it
                 continue
         stack.extend(top.args)
     return True

@@ -1,4 +1,4 @@
-"""Loops over cells that follow each other become one: what they make of a world is read while it is near."""
+"""Merges consecutive loops over cells, so that values of a world are read while they are in the cache."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from powderdsl.schedule.types import (
 )
 
 Read = tuple[str, int, int]
-"""A field, and how many rows and columns away it is read."""
+"""A field and the rows and columns by which a read is offset."""
 
 
 def join(schedule: Schedule) -> Schedule:
-    """Runs of loops over cells, also of single ones.
+    """Every run of consecutive loops over cells, also a single one, becomes a `Sweeps`.
 
     `loop cells: a = …`, `loop cells: b = a[0,1] + …` → one loop over worlds, row by row.
     """
@@ -67,7 +67,7 @@ def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
 
 
 def field_reads(loop: Compute) -> list[Read]:
-    """The fields that a loop reads, and where; also those that its region asks for."""
+    """The fields that a loop or its region reads, with offsets."""
     found: dict[Read, None] = {}
     nodes: list[Node] = ordered(values_of(loop))
     for node in nodes:
@@ -81,7 +81,7 @@ def field_reads(loop: Compute) -> list[Read]:
 
 
 def _parts(run: Sequence[Compute]) -> list[int]:
-    """Which loops may go together, row by row: those that read other rows of an earlier one come in a later part."""
+    """The part of each loop: a loop that reads other rows of an earlier one is in a later part."""
     parts: list[int] = []
     made: dict[str, int] = {}
     for loop in run:
@@ -92,7 +92,7 @@ def _parts(run: Sequence[Compute]) -> list[int]:
 
 
 def _written_over(run: Sequence[Compute], passing: set[str]) -> dict[str, str]:
-    """Fields that take the place of one which only the run needs, and which is read for the last time: it by it."""
+    """Fields that overwrite, cell by cell, a field of the run that their loop is the last to read."""
     over: dict[str, str] = {}
     earlier: set[str] = set()
     reads = [field_reads(loop) for loop in run]

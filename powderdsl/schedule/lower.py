@@ -1,4 +1,4 @@
-"""IR on bit planes -> the first schedule: a guard for each substep; nothing is shared between statements or skipped."""
+"""IR on bit planes → the first schedule: one guard per substep, nothing shared between statements."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from powderdsl.schedule.types import (
 def lower(pass_: PassGraph) -> Schedule:
     """The schedule of a pass on bit planes.
 
-    A substep whose masks hold nowhere changes nothing, so its writes stand in a guard, which keeps what slots held.
-    What has no such value (the first write of a scratch field) is computed in any case.
+    A substep changes nothing if its masks hold nowhere, so its writes stand in a guard that keeps the old values.
+    Writes without an old value (the first one of a scratch field) are computed unconditionally.
     """
     lowering = _Lowering(pass_)
     for step in pass_.substeps:
@@ -37,12 +37,12 @@ class _Lowering:
         self.body: list[Statement] = []
         self.finds: dict[str, Var] = {}
         self.vars: dict[int, Var] = {}
-        """Variables of the pass's nodes, by id."""
+        """The variable of each node of the pass, by the node's id."""
         self.current: dict[str, Node | None] = {}
-        """What each slot holds now: a node of the pass, None for one that nobody computes."""
+        """The current value of each slot: a node of the pass, or None if nothing reads it."""
         self.alive = {id(node) for node in nodes_of(pass_, substeps=False)}
         self.kept = {slot: node.type for slot, node in pass_.outputs}
-        """Slots of the state that the pass changes: others that it writes are scratch."""
+        """Slots of the state that the pass changes; the other slots that it writes are scratch."""
 
     def substep(self, step: SubstepGraph) -> None:
         new = [(slot, node) for slot, node in step.writes if id(node) in self.alive and self.missing(node)]
@@ -68,7 +68,7 @@ class _Lowering:
         return id(node) not in self.vars and node.op not in ("const", "input")
 
     def old(self, slot: str) -> Node | None:
-        """The value of a slot before a substep, if it stands in a variable."""
+        """The value of a slot before a substep, if a variable holds it."""
         if slot not in self.current:
             return load(self.graph, self.find(slot, self.kept[slot])) if slot in self.kept else None
         node = self.current[slot]
@@ -80,7 +80,7 @@ class _Lowering:
         return self.finds[slot]
 
     def compute(self, nodes: list[Node], place: str = "") -> None:
-        """Variables for some nodes, in one statement."""
+        """Store nodes in variables, in one statement."""
         wanted = [node for node in dict.fromkeys(nodes) if self.missing(node)]
         if wanted:
             outs = tuple(Out(self.namer.var(node.type, node), self.value(node)) for node in wanted)
@@ -88,7 +88,7 @@ class _Lowering:
             self.vars |= {id(out.var.means): out.var for out in outs}
 
     def value(self, root: Node) -> Node:
-        """A node of the pass over the variables that are there."""
+        """A node of the pass in terms of the variables defined so far."""
         return over_variables(root, self.graph, self.stored)
 
     def stored(self, node: Node) -> Node | None:

@@ -1,4 +1,4 @@
-"""Movements: planes that go with the same movers in the same direction move together."""
+"""Movements: planes with the same movers and the same direction move together."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from powderdsl.schedule.types import (
 
 
 def moves(schedule: Schedule) -> Schedule:
-    """Every `swap` and `arrive` of a plane becomes part of a `Move`, by depth: what a movement needs moves before it.
+    """Every `swap` and `arrive` of a plane becomes part of a `Move`; a movement comes after those that it reads.
 
     `x = swap(a, m, a); y = swap(b, m, b)` → `swap by m: x = a, y = b`.
     """
@@ -36,7 +36,7 @@ def is_movement(node: Node) -> bool:
 
 
 def _moved(statement: Compute, graph: Graph, namer: Namer) -> list[Statement]:
-    """A statement as statements: what movements need, the movements, what needs them."""
+    """A statement split into the inputs of movements, the movements, and what reads them."""
     nodes = ordered(out.value for out in statement.outs)
     movements = [node for node in nodes if is_movement(node)]
     if not movements:
@@ -51,7 +51,7 @@ def _moved(statement: Compute, graph: Graph, namer: Namer) -> list[Statement]:
         )
 
     def store(wanted: Iterable[Node]) -> None:
-        """Variables for what movements read in other cells."""
+        """Store in variables what movements read in other cells."""
         outs = []
         for node in dict.fromkeys(wanted):
             if id(node) not in vars and value(node).op != "load":
@@ -80,7 +80,7 @@ def _moved(statement: Compute, graph: Graph, namer: Namer) -> list[Statement]:
 
 
 def _groups(nodes: list[Node], movements: list[Node]) -> list[list[Node]]:
-    """Movements that can be done together, each group after what it needs."""
+    """Groups of movements that can be done together; each comes after the groups that it reads."""
     wanted = set(map(id, movements))
     depth: dict[int, int] = {}
     groups: dict[tuple[int, str, int, Offset], list[Node]] = {}

@@ -1,4 +1,4 @@
-"""Where loops over cells have nothing to do: no choice is made, and all floats that they read are zero."""
+"""Restricts loops over cells to the region where a choice is made or a float that they read is not zero."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from powderdsl.schedule.types import (
 
 
 def narrow(schedule: Schedule) -> Schedule:
-    """Loops over cells get a region, and what they give outside it.
+    """Loops over cells get a region and their values outside it.
 
-    `v' = settle(m ? a : v)`, where v was settled → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
+    `v' = settle(m ? a : v)`, where v was clamped → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
     """
     found = {var.name for _, var in schedule.finds}
 
@@ -40,7 +40,7 @@ def narrow(schedule: Schedule) -> Schedule:
 
 
 def ask_regions(schedule: Schedule) -> Schedule:
-    """Loops over regions stand in guards that ask whether the region holds anywhere.
+    """Loops with a region are put into guards that test whether the region holds anywhere.
 
     `loop over m: x = …, else 0` → `if any m: loop over m: x = …, else x = 0`.
     """
@@ -95,7 +95,7 @@ def _live(field: Node, dy: int, reach: int, graph: Graph) -> Node:
 
 
 def _anywhere(region: Node, graph: Graph) -> Node:
-    """A flag that holds somewhere if a region does: fields are asked in the cell itself."""
+    """A flag that holds somewhere if a region does; fields are tested in the cell itself only."""
 
     def rule(node: Node) -> Node | None:
         return _live(node.args[0], 0, 0, graph) if node.op == "live" else None
@@ -104,7 +104,7 @@ def _anywhere(region: Node, graph: Graph) -> Node:
 
 
 def unchanged(value: Node, found: set[str]) -> tuple[Node, list[Node]] | None:
-    """For a clamped slot under choices: what it was, and the masks without which it still is: it was clamped then."""
+    """For a clamped slot under choices: its old value, and the masks without which it keeps it (it was clamped)."""
     masks = []
     if value.op != "settle":
         return None
@@ -117,8 +117,8 @@ def unchanged(value: Node, found: set[str]) -> tuple[Node, list[Node]] | None:
 
 
 def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
-    """What values are where all floats are zero and no mask holds, and the masks; None if a float is not zero there,
-    or draws and parameters enter."""
+    """The values where all floats are zero and no mask holds, and the masks. None if a float is not zero there, or if
+    values depend on draws or parameters."""
     memo: dict[int, Any] = {}
     masks: dict[int, Node] = {}
 
@@ -129,7 +129,7 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
             result: Any = np.float32(0)
         elif node.op == "led" and node.args[0].op == "load":
             result = visit(node.args[1])
-            if result:  # then it depends on the flag
+            if result:  # the result depends on the flag
                 raise LookupError
         elif node.op == "const":
             result = np.float32(node.attr)
@@ -163,7 +163,7 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
 
 
 def _reads(values: list[Node]) -> list[tuple[Node, int, int]]:
-    """Fields that values read where no mask holds: the field, rows down, and columns at most to either side."""
+    """Fields that values read where no mask holds: field, rows down, and the largest distance in columns."""
     reach: dict[tuple[int, int], int] = {}
     fields: dict[int, Node] = {}
     below = [(value, 0, 0) for value in values]

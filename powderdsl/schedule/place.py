@@ -1,4 +1,4 @@
-"""Arrays of variables: which are released where, and which take over the array of one that nobody needs any more."""
+"""Memory of arrays: where variables are released, and which variables reuse the array of one read for the last time."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _OVER = {
     "add": (0, 1), "mul": (0, 1), "sub": (0,), "settle": (0,),
     "choose": (2,), "update": (1,), "carry": (2,), "swap": (0,), "leave": (0,),
 }  # fmt: skip
-"""Arguments in whose array an operation can leave its result."""
+"""The arguments whose array an operation can overwrite with its result."""
 
 _FULL = ("draw", "shift", "choose", "update", "carry", "settle")
-"""Operations that give a float for each cell, whatever their arguments are."""
+"""Operations that give one float per cell, whatever their arguments are."""
 
 
 def place(schedule: Schedule) -> Schedule:
-    """Where each array comes from and goes: `into` for what is overwritten, `Release` for the rest.
+    """Every variable is released, or its array is reused (`into`) by the operation that reads it last.
 
-    `b = a + c`, where `a` is read for the last time → `b = a + c into a`. Takes single operations (`flatten`).
+    `b = a + c`, where `a` is read for the last time → `b = a + c into a`. Expects single operations (`flatten`).
     """
     placing = _Placing({slot for slot, _ in schedule.leaves})
     live = set(loaded(node for _, node in schedule.leaves))
@@ -50,12 +50,12 @@ def place(schedule: Schedule) -> Schedule:
 @dataclass
 class _Placing:
     changed: set[str]
-    """Slots that the pass changes: their arrays may be overwritten."""
+    """Slots that the pass changes; their arrays may be overwritten."""
     own: set[str] = field(default_factory=set)
-    """Blocks, and floats with a number for each cell, in arrays that nothing else refers to."""
+    """Blocks, and floats with one number per cell, whose arrays nothing else refers to."""
     full: set[str] = field(default_factory=set)
     views: dict[str, set[str]] = field(default_factory=dict)
-    """Planes that lie in each block."""
+    """The planes that are views of each block."""
 
     def found(self, slot: str, name: str, real: bool) -> None:
         if real:
@@ -64,7 +64,7 @@ class _Placing:
                 self.own.add(name)
 
     def block(self, body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ...]:
-        """A block, with the variables that are live at its end."""
+        """A block of statements; `live_end`: the variables that are read after it."""
         lives: list[set[str]] = []
         live = set(live_end)
         for statement in reversed(body):
@@ -89,11 +89,11 @@ class _Placing:
         return tuple(result)
 
     def guard(self, guard: Guard, after: set[str]) -> tuple[Guard, set[str]]:
-        """A guard, and the variables from outside whose arrays its body takes over."""
+        """A guard, and the outer variables whose arrays its body reuses."""
         before = set(self.own)
         kept = {var.name for var, _ in guard.keeps}
         outside = reads(guard) - made_in(guard.body)
-        # What dies in the body is released after the guard, so that both ways leave the same behind.
+        # Outer variables are released after the guard, whether its body ran or not.
         body = self.block(guard.body, after | kept)
         body = tuple(_without(statement, outside) for statement in body)
         body = tuple(one for one in body if not isinstance(one, Release) or one.names)
@@ -111,18 +111,18 @@ class _Placing:
                 self.own.discard(var.name)
             if value.op != "load" or value.attr not in self.full:
                 self.full.discard(var.name)
-            if value.op == "load":  # then it may be the old one
+            if value.op == "load":  # it may be the old array
                 self.views.setdefault(var.name, set()).update(self.views.get(str(value.attr), ()))
         self.own -= set(olds) - kept
         return replace(guard, body=body), taken
 
     def operation(self, out: Out, after: set[str]) -> Out:
-        """One operation, in the array of an argument that is read for the last time, if there is one."""
+        """One operation, in the array of an argument that it reads last, if there is one."""
         node, name = out.value, out.var.name
         args = [str(arg.attr) if arg.op == "load" else "" for arg in node.args]
         places = _OVER.get(node.op, ())
         if node.op == "div" and node.args[1].op == "const" and node.args[1].attr:
-            places = (0,)  # a division by what may be zero is a call
+            places = (0,)  # a division whose divisor may be zero is a call
         into = next((args[i] for i in places if self.is_last(args[i], args, after)), None)
         if node.type == BLOCK and node.op != "load":
             self.own.add(name)

@@ -1,4 +1,4 @@
-"""Which elements a pass asks for: where none of them is in any world of a group, it need not look at cells at all."""
+"""Which elements must be present for a pass or a mask to do anything. Without them no cell is looked at."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ MAX_PLANES = 6
 """A set of ids is a word of 64 bits."""
 
 MAX_SETS = 4
-"""More are not worth asking."""
+"""More sets than this are not worth testing."""
 
 _ELEMENT = "element:"
 
 Sets = frozenset[int]
-"""Sets of ids (bits of a word): one of each must be there."""
+"""Sets of ids (bits of a word): at least one id of each must be present."""
 
 
 def presence(schedule: Schedule) -> Schedule:
-    """Masks and the whole pass ask which elements there are; what changes elements forgets what was known.
+    """Masks and the whole pass test which elements are present; writes of elements discard that knowledge.
 
     `m = is_a & b[0,1]`, where b is an element too → the loop of `m` runs only when `present(a) & present(b)`. Comes
     before `cut`, which takes masks apart.
@@ -66,7 +66,7 @@ def presence(schedule: Schedule) -> Schedule:
 
 
 def _element_bits(schedule: Schedule) -> dict[str, int]:
-    """The bit of the element that each variable holds; nothing if there are too many to count ids."""
+    """For each variable that holds a bit of the element: which bit. Empty if there are more than MAX_PLANES."""
     bits: dict[str, int] = {}
     for slot, var in schedule.finds:
         if slot.startswith(_ELEMENT):
@@ -81,7 +81,7 @@ def _element_bits(schedule: Schedule) -> dict[str, int]:
         for var, value in statement.keeps
         if value.op == "load"
     ]
-    for new, old in (*pairs, *reversed(pairs)):  # forwards from what is found, backwards from what is left
+    for new, old in (*pairs, *reversed(pairs)):  # forward from the inputs, backward from the outputs
         for known, other in ((old, new), (new, old)):
             if known in bits:
                 bits.setdefault(other, bits[known])
@@ -89,7 +89,7 @@ def _element_bits(schedule: Schedule) -> dict[str, int]:
 
 
 def _only_swaps(guard: Guard, olds: dict[str, Node]) -> bool:
-    """Whether a guard leaves each element as often as it was: it swaps cells, or writes no elements."""
+    """Whether a guard preserves the count of each element: it swaps cells, or writes no elements."""
     values = {out.var.name: out.value for one in guard.body if isinstance(one, Compute) for out in one.outs}
     for name, old in olds.items():
         value = values[name]
@@ -99,10 +99,10 @@ def _only_swaps(guard: Guard, olds: dict[str, Node]) -> bool:
 
 
 def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
-    """What must be there for the pass to change anything; None if nothing can be said.
+    """The condition under which the pass can change anything; None if none is known.
 
-    As long as nothing has been changed, slots hold what they held when the pass began. So every mask is asked as if it
-    came first.
+    Until something changes, slots hold their values from the beginning of the pass, so every mask is judged as if it
+    were the first.
     """
     masks: dict[str, Node] = {}
     chains: dict[str, Guard] = {}
@@ -134,7 +134,7 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
 
 
 def _asked(masks: list[Node], bits: dict[str, int], graph: Graph) -> Node | None:
-    """An answer without which none of some masks holds anywhere; None if nothing can be said."""
+    """An answer that is true whenever one of some masks holds anywhere; None if none is known."""
     needs = _Needs(1 + max(bits.values()), bits)
     ways = dict.fromkeys(needs.of(mask) for mask in masks)
     if not ways or frozenset() in ways:
@@ -146,7 +146,7 @@ def _asked(masks: list[Node], bits: dict[str, int], graph: Graph) -> Node | None
 
 
 def asked_ids(schedule: Schedule) -> int:
-    """All ids that a schedule asks for."""
+    """All ids whose presence a schedule tests."""
     roots = [] if schedule.when is None else [schedule.when]
     roots += [node for statement in flat(schedule.body) for node in values_of(statement)]
     return reduce(or_, (node.attr for node in ordered(roots) if node.op == "present"), 0)
@@ -154,8 +154,8 @@ def asked_ids(schedule: Schedule) -> int:
 
 @dataclass
 class _Needs:
-    """Of each flag: the ids it holds for, if it depends on the cell's element alone; ids that the cell has where it
-    holds; and sets of ids of which one each must be somewhere."""
+    """For each flag: the ids for which it holds, if it depends on the cell's element alone; the ids that a cell
+    can have where it holds; and sets of ids of each of which one must be present somewhere."""
 
     planes: int
     bits: dict[str, int]
@@ -171,7 +171,7 @@ class _Needs:
         ]
 
     def of(self, mask: Node) -> Sets:
-        """Sets of ids of which one each must be there for the mask to hold anywhere."""
+        """Sets of ids of each of which one must be present for the mask to hold anywhere."""
         for node in ordered([mask]):
             if id(node) not in self.exact:
                 exact = self.exact[id(node)] = self._exact(node)
@@ -233,7 +233,7 @@ def _either(a: Sets, b: Sets) -> Sets:
 
 
 def _least(sets: Iterable[int]) -> Sets:
-    """The smallest sets; those that contain another say nothing new, and a few are enough."""
+    """The smallest sets, at most MAX_SETS. A set that contains another adds nothing."""
     kept: list[int] = []
     for ids in sorted(sets, key=lambda ids: (ids.bit_count(), ids)):
         if not any(one & ids == one for one in kept):

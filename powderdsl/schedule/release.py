@@ -1,4 +1,4 @@
-"""Where variables end, for targets that count references: released after the last statement that reads them."""
+"""Lifetimes on targets that count references: variables are released after the last statement that reads them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from powderdsl.schedule.types import (
 
 
 def release(schedule: Schedule) -> Schedule:
-    """Every variable is released once, also what nobody reads; planes that move take the place of old ones that end.
+    """Every variable is released exactly once, even if nothing reads it; moving planes overwrite old ones that end.
 
     `swap by m: b = a`, where `a` is not read again → `b = a into a`.
     """
@@ -44,7 +44,7 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
         if isinstance(statement, Guard):
             outside = reads(statement) - made_in(statement.body)
             kept = {var.name for var, _ in statement.keeps}
-            # What is from outside is released after the guard, whether its body runs or not.
+            # Outer variables are released after the guard, whether its body runs or not.
             inner = _block(statement.body, after | kept | outside)
             statement = replace(statement, body=inner)
             gone = (outside | kept) - after
@@ -76,13 +76,13 @@ def _names(statement: Statement) -> set[str]:
 
 
 def live_before(statement: Statement, after: set[str]) -> set[str]:
-    """The variables that are live before a statement, from those after it."""
+    """The variables that are live before a statement, given those that are live after it."""
     live = after - {var.name for var in defined_by(statement)}
     return live | (reads(statement) - made_in([statement]))
 
 
 def reads(statement: Statement) -> set[str]:
-    """Variables that a statement reads, with what is in it."""
+    """The variables that a statement reads, including nested statements."""
     found = set(loaded(values_of(statement)))
     if isinstance(statement, Guard):
         for inner in statement.body:
@@ -91,7 +91,7 @@ def reads(statement: Statement) -> set[str]:
 
 
 def made_in(body: Sequence[Statement]) -> set[str]:
-    """Variables that statements make, with what is in them."""
+    """The variables that statements define, including nested ones."""
     found = {var.name for statement in body for var in defined_by(statement)}
     for statement in body:
         if isinstance(statement, Guard):

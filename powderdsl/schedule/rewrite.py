@@ -1,4 +1,4 @@
-"""Changes that many stages make: values rewritten everywhere, variables that nobody reads left out."""
+"""Transformations that several stages share: rewriting all values, removing unread variables."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def map_values(schedule: Schedule, rule: Rule) -> Schedule:
 
 
 def with_values(statement: Statement, graph: Graph, rule: Rule) -> Statement:
-    """One statement with the values rewritten that it reads itself."""
+    """One statement with its own values rewritten, without those of nested statements."""
     new = rewritten(values_of(statement), graph, rule)
     match statement:
         case Compute(outs):
@@ -62,7 +62,7 @@ def with_values(statement: Statement, graph: Graph, rule: Rule) -> Statement:
 
 
 def without_unread(schedule: Schedule) -> Schedule:
-    """The schedule without variables that nothing reads, and without keeping what only a guard's own body reads."""
+    """The schedule without unread variables; guards keep only what is read after them."""
     while True:
         read = Counter(loaded(node for _, node in schedule.leaves))
         read.update(_reads(schedule.body))
@@ -78,7 +78,7 @@ def _reads(body: Iterable[Statement]) -> Counter[str]:
 
 
 def _keep(body: Iterable[Statement], read: Counter[str], outside: frozenset[str]) -> tuple[Statement, ...]:
-    """The statements without what is not read; `outside`: what a guard around them keeps."""
+    """The statements without unread variables. `outside`: names that the guard around them keeps."""
     result: list[Statement] = []
     for statement in body:
         match statement:

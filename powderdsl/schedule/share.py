@@ -1,4 +1,4 @@
-"""What several statements compute is computed once, before the first of them."""
+"""Common subexpressions of several statements are computed once, before the first of them."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from powderdsl.schedule.types import (
 _CHEAP = ("const", "param", "coordinate", "inside", "load")
 
 Path = tuple[int, ...]
-"""Where a statement stands: its index in each block that it lies in."""
+"""The position of a statement: its index in each of the nested blocks around it."""
 
 
 def share(schedule: Schedule) -> Schedule:
-    """Values that more than one statement computes get variables, outside the guards that not all of them lie in.
+    """Values that more than one statement computes get variables, outside guards that do not contain all of them.
 
     `if any a: x = f & g; if any b: y = f & h` → `t = f; if any a: x = t & g; if any b: y = t & h`.
     """
@@ -46,7 +46,7 @@ def share(schedule: Schedule) -> Schedule:
                     nodes[id(node)] = node
                     users.setdefault(id(node), []).append(path)
     count = Counter({key: len(found) for key, found in users.items()})
-    most = Counter[int]()  # the users of the parent that has most of them
+    most = Counter[int]()  # the largest number of users of any parent
     for node in nodes.values():
         for arg in node.args:
             most[id(arg)] = max(most[id(arg)], count[id(node)])
@@ -66,9 +66,9 @@ def share(schedule: Schedule) -> Schedule:
 
 
 def _places(schedule: Schedule, cut: list[Node], users: dict[int, list[Path]]) -> dict[int, Path]:
-    """Before which statement each value is computed, by its id; values that cannot be shared are left out.
+    """The statement before which each value is computed, by the value's id. Values that cannot be shared are omitted.
 
-    What a guard keeps has one name in its body and after it: users in the body then compute for themselves.
+    What a guard keeps has one name in its body and after it; users in the body then compute the value themselves.
     """
     defined: dict[str, list[Path]] = {var.name: [()] for _, var in schedule.finds}
     for path, statement in _paths(schedule.body):
@@ -88,7 +88,7 @@ def _places(schedule: Schedule, cut: list[Node], users: dict[int, list[Path]]) -
 
 
 def _before(definition: Path, path: Path) -> bool:
-    """Whether what a statement defines is there when another begins."""
+    """Whether the definitions of one statement are visible at another."""
     if not definition:
         return True
     outer = len(definition) - 1
@@ -103,7 +103,7 @@ def _paths(body: Sequence[Statement], outer: Path = ()) -> Iterator[tuple[Path, 
 
 
 def _common(paths: list[Path]) -> Path:
-    """The first statement, or the guard around it, that has all the others after it in the same block."""
+    """The first of some statements, or the guard around it, in the innermost block that contains all of them."""
     depth = 0
     while all(len(path) > depth + 1 and path[depth] == paths[0][depth] for path in paths):
         depth += 1
@@ -116,12 +116,12 @@ def _inserted(
     graph = schedule.graph
 
     def shared(node: Node, path: Path) -> bool:
-        """Whether a value has been computed before a statement."""
+        """Whether a value is computed before a statement."""
         place = vars[id(node)][0] if id(node) in vars else None
         return place is not None and (path[: len(place)] == place or _before(place, path))
 
     def value(root: Node, path: Path, *, itself: bool) -> Node:
-        """A value over the variables, with one for itself or not."""
+        """A value in terms of the shared variables; `itself`: also if the whole value is one of them."""
 
         def known(node: Node) -> Node | None:
             other = itself or node is not root

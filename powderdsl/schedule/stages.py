@@ -1,4 +1,4 @@
-"""The planner: what each target's schedules go through, in order, each stage with the reason for its place."""
+"""The planner: the stages of each target in order, each with the reason for its position."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from powderdsl.schedule.verify import verify
 
 @dataclass(frozen=True)
 class Stage:
-    """A change to schedules that keeps what they mean."""
+    """A transformation of schedules that preserves their meaning."""
 
     name: str
     apply: Callable[[Schedule], Schedule]
@@ -61,7 +61,7 @@ ARRAYS = (
     Stage("flatten", flatten, "one operation per statement; no later stage creates operations"),
     Stage("place", place, "which arrays are released and which are overwritten"),
 )
-"""For targets that carry out one operation over all cells of all worlds before the next."""
+"""For targets that execute one operation on all cells of all worlds before the next."""
 
 
 CUDA = (
@@ -78,7 +78,7 @@ CUDA = (
     Stage("narrow", narrow, "in which cells a loop has anything to do"),
     Stage("regions", ask_regions, "loops that have nothing to do anywhere are skipped"),
 )
-"""For blocks of threads that share some worlds."""
+"""For blocks of threads, each of which holds some worlds in shared memory."""
 
 
 CPP = (
@@ -102,7 +102,7 @@ CPP = (
     Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read"),
     Stage("release", release, "when a plane is no longer needed; last, after all reads have their place"),
 )
-"""For a thread that works on eight worlds side by side, plane by plane."""
+"""For a thread that processes eight worlds side by side, plane by plane."""
 
 
 PLANNERS = {"arrays": ARRAYS, "native": CPP, "cuda": CUDA}
@@ -110,9 +110,9 @@ PLANNERS = {"arrays": ARRAYS, "native": CPP, "cuda": CUDA}
 
 
 def plan(pass_: PassGraph, stages: tuple[Stage, ...]) -> Schedule:
-    """The schedule of a pass on bit planes, and of its calm form if it has one.
+    """The schedule of a pass on bit planes, with its calm form if it has one.
 
-    Only the last schedule is verified here: verifying every one takes as long as making them. Tests do.
+    Only the last schedule is verified: verifying each one takes as long as making them. Tests verify all.
     """
     *_, (_, schedule) = steps(pass_, stages)
     verify(schedule, stages[-1].name)

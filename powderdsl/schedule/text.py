@@ -1,7 +1,7 @@
 """A stable printed form of schedules, for `--emit schedule`, golden tests and bug reports.
 
-`x[dy,dx]` is the value at a neighbor, with `|0` zero outside the grid; `a ? b : c` a choice; `any p3 | p4` asks whether
-a flag holds in some cell; `else p5 = p1` is what a variable is where a guard's body is skipped.
+`x[dy,dx]` is the value at a neighbor, and zero outside the grid with `|0`; `a ? b : c` is a choice; `any p3 | p4` tests
+whether a flag holds in some cell; `else p5 = p1` gives the value of a variable if a guard's body is skipped.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _INFIX = {
 
 
 def print_schedule(schedule: Schedule) -> str:
-    """A schedule as text, and its calm form below it."""
+    """A schedule as text, followed by its calm form."""
     names = _Names()
     lines = [f"schedule {schedule.name}"]
     if schedule.finds:
@@ -49,7 +49,7 @@ def print_schedule(schedule: Schedule) -> str:
 
 
 class _Names:
-    """Variables as they are printed: numbered in the order of the text."""
+    """Printed names of variables, numbered in the order of the text."""
 
     def __init__(self) -> None:
         self.known: dict[str, str] = {}
@@ -110,7 +110,7 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
 
 
 class _Values:
-    """The values of one statement; what is used twice gets a line of its own."""
+    """The values of one statement; a value that is used twice gets a line of its own."""
 
     def __init__(self, roots: Iterable[Node], names: _Names):
         roots = list(roots)
@@ -122,7 +122,7 @@ class _Values:
         self.count = 0
 
     def taken(self) -> list[str]:
-        """Lines that have been added since the last time."""
+        """The lines added since the last call."""
         lines, self.lines = self.lines, []
         return lines
 

@@ -14,17 +14,17 @@ from typing import Literal
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, walk
 
 ANSWER = Type("answer")
-"""Whether a flag holds in some cell: one value for all cells."""
+"""One truth value for all cells, such as whether a flag is set anywhere."""
 
 BLOCK, CELLS, PLACES = Type("block"), Type("cells"), Type("places")
-"""What array kernels have besides flags and floats: planes in one array, flags as bool cells, numbers of cells."""
+"""Types that only array kernels use: planes in one array, flags as bool cells, indices of cells."""
 
 _PREFIX = {"flag": "p", "real": "f", "answer": "q", "block": "b", "cells": "s", "places": "i"}
 
 
 @dataclass(frozen=True, eq=False)
 class Var:
-    """A variable, assigned once. `means` is the node of the pass whose value it holds, None for helpers."""
+    """A variable, assigned once. `means` is the node of the pass whose value it holds; helpers have None."""
 
     name: str
     type: Type
@@ -33,9 +33,9 @@ class Var:
 
 @dataclass(frozen=True)
 class Out:
-    """A variable and its value. `into` names the variable whose array it takes over (set by `place`).
+    """A variable and its value. `into` names the variable whose array it reuses (set by `place`).
 
-    `otherwise` is what it is where the statement's `region` does not hold: a constant, or what a variable holds.
+    `otherwise` is its value outside the statement's `region`: a constant or a load.
     """
 
     var: Var
@@ -46,10 +46,10 @@ class Out:
 
 @dataclass(frozen=True)
 class Compute:
-    """Values of cells, all from what stood in variables before. `place` is the rule: ``rules/acme.yaml:12``.
+    """Computes values of cells; all of them read the variables as they were before. `place`: ``rules/acme.yaml:12``.
 
-    `over` says how it loops, once `cut` has decided: over words of flags, over cells for floats, or over choices that
-    are laid over floats one after the other. Where `region` holds nowhere in a word or row, nothing is computed there.
+    `over` is the kind of loop that `cut` chose: over words of flags, over cells for floats, or over choices that are
+    applied to floats one after another. Words or rows in which `region` holds nowhere are skipped.
     """
 
     outs: tuple[Out, ...]
@@ -57,28 +57,28 @@ class Compute:
     over: Literal["", "words", "cells", "choices"] = ""
     region: Node | None = None
     when: Node | None = None
-    """An answer: if it is no, all variables are their `otherwise` (constants) everywhere."""
+    """An answer: if it is false, every variable is its `otherwise` (a constant) everywhere."""
     held: bool = False
-    """Whether all is computed before anything is stored: it writes what it reads at neighbors (set by `buffers`)."""
+    """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
 
 
 @dataclass(frozen=True)
 class Carried:
-    """A plane in a movement: what it is afterwards, what it was, and what stands where movers left if nothing arrives.
+    """A plane in a movement: its new value, its old value, and what a cell holds that its mover left and none entered.
 
-    `leaves` is a flag of that cell: a value over `load`s; the old plane itself means that it stays.
+    `leaves` is a value over loads; if it is `old` itself, the cell keeps its flag.
     """
 
     new: Var
     old: Node
     leaves: Node
     into: bool = False
-    """Whether the old plane is not needed any more, so that the new one takes its place (set by `release`)."""
+    """Whether the new plane may overwrite the old one, which nothing reads later (set by `release`)."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """Planes that move together: `swap` or `arrive` of the IR, by the same movers and offset."""
+    """Planes that move together: `swap` or `arrive` of the IR with the same movers and offset."""
 
     op: str
     offset: tuple[int, int]
@@ -91,7 +91,7 @@ class Move:
 class Guard:
     """Statements that run only if one of the flags `when` holds in some cell.
 
-    `keeps` lists every variable of the body that is needed after it, with its value where the body is skipped.
+    `keeps` lists the variables of the body that are read after it, each with its value if the body is skipped.
     """
 
     when: tuple[Node, ...]
@@ -99,22 +99,22 @@ class Guard:
     keeps: tuple[tuple[Var, Node], ...]
     place: str = ""
     otherwise: tuple[Statement, ...] = ()
-    """What gives `keeps` their values where the body is skipped, if they do not share buffers (set by `buffers`)."""
+    """Statements that give `keeps` their values if the body is skipped and they share no buffers (set by `buffers`)."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """Variables that are not needed any more: their buffers are free."""
+    """Frees the buffers of variables that nothing reads later."""
 
     names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Sweeps:
-    """Loops over cells that follow each other as one loop over worlds: what one world needs stays near.
+    """Consecutive loops over cells, merged into one loop over worlds, so that a world's data stay in the cache.
 
-    `parts` says which may go together row by row: a loop that reads other rows of an earlier one is in a later part.
-    `passing` are fields that only these loops read: they need room for one world.
+    Loops of the same part run together row by row; a loop that reads other rows of an earlier one is in a later part.
+    `passing` lists fields that only these loops read: they need memory for one world.
     """
 
     loops: tuple[Compute, ...]
@@ -124,12 +124,12 @@ class Sweeps:
 
 @dataclass(frozen=True)
 class Forget:
-    """From here on any element may be there, whatever was known (`presence`)."""
+    """Discards what is known about which elements occur (`presence`)."""
 
 
 @dataclass(frozen=True)
 class Sync:
-    """All threads have done what stands before this."""
+    """A barrier: all threads have finished the statements before it."""
 
 
 Statement = Compute | Move | Guard | Release | Sweeps | Forget | Sync
@@ -137,20 +137,20 @@ Statement = Compute | Move | Guard | Release | Sweeps | Forget | Sync
 
 @dataclass(frozen=True)
 class Schedule:
-    """One pass. `finds`: slots that it reads; `leaves`: slots that it changes. Nothing else outlives it."""
+    """One pass. `finds`: the slots that it reads; `leaves`: the slots that it changes. Nothing else outlives the pass."""
 
     name: str
     finds: tuple[tuple[str, Var], ...]
     body: tuple[Statement, ...]
     leaves: tuple[tuple[str, Node], ...]
     graph: Graph = field(compare=False, repr=False)
-    """Interns the values, so that equal ones are one object in all stages."""
+    """Interns values: equal ones are one object in all stages."""
     when: Node | None = None
-    """An answer: if it is no, the pass changes nothing."""
+    """An answer: if it is false, the pass changes nothing."""
     buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
-    """For each variable the kind and number of its buffer, where buffers are numbered."""
+    """The kind and number of each variable's buffer, for targets that number buffers."""
     calm: Schedule | None = None
-    """The pass where all float slots that it reads are zero everywhere, if that is much less work."""
+    """The pass for worlds in which all float slots that it reads are zero, if that is much less work."""
 
 
 # Values
@@ -162,7 +162,7 @@ def load(graph: Graph, var: Var) -> Node:
 
 
 def loaded(nodes: Iterable[Node]) -> Iterator[str]:
-    """Names of the variables that values read, with repetitions."""
+    """The names of the variables that values read, with repetitions."""
     for node in nodes:
         for inner in walk(node):
             if inner.op == "load":
@@ -191,7 +191,7 @@ def with_args(node: Node, args: tuple[Node, ...], graph: Graph) -> Node:
 
 
 def rewritten(roots: Iterable[Node], graph: Graph, rule: Callable[[Node], Node | None]) -> dict[int, Node]:
-    """Values rebuilt bottom-up in a graph, by the id of the old node; `rule` sees nodes with their new arguments."""
+    """Values rebuilt bottom-up, by the id of the old node. `rule` maps nodes that have their new arguments already."""
     done: dict[int, Node] = {}
     for node in ordered(roots):
         new = with_args(node, tuple(done[id(arg)] for arg in node.args), graph)
@@ -200,7 +200,7 @@ def rewritten(roots: Iterable[Node], graph: Graph, rule: Callable[[Node], Node |
 
 
 def over_variables(root: Node, graph: Graph, known: Callable[[Node], Node | None]) -> Node:
-    """A value rebuilt top-down, maybe in another graph: what `known` gives replaces a node with all below it."""
+    """A value rebuilt in `graph`. Where `known` gives a node, that node replaces the old one and all below it."""
     done: dict[int, Node] = {}
     stack = [(root, False)]
     while stack:
@@ -219,7 +219,7 @@ def over_variables(root: Node, graph: Graph, known: Callable[[Node], Node | None
 
 
 def combined(op: Literal["and", "or"], nodes: Iterable[Node], graph: Graph) -> Node:
-    """The conjunction or disjunction of flags or answers, of which there is one at least."""
+    """The conjunction or disjunction of one or more flags or answers."""
     first, *rest = nodes
     for node in rest:
         first = graph.node(op, first.type, (first, node))
@@ -227,7 +227,7 @@ def combined(op: Literal["and", "or"], nodes: Iterable[Node], graph: Graph) -> N
 
 
 def conjuncts(node: Node) -> list[Node]:
-    """What must hold for a flag to hold, each once, in order."""
+    """The flags that must all hold for a flag to hold, each once, in order."""
     seen: dict[int, Node] = {}
     stack = [node]
     while stack:
@@ -242,7 +242,7 @@ def conjuncts(node: Node) -> list[Node]:
 
 
 def values_of(statement: Statement) -> Iterator[Node]:
-    """The values that a statement reads itself, not those of statements in it."""
+    """The values that a statement itself reads, without those of nested statements."""
     match statement:
         case Compute(outs):
             yield from (out.value for out in outs)
@@ -261,7 +261,7 @@ def values_of(statement: Statement) -> Iterator[Node]:
 
 
 def defined_by(statement: Statement) -> Iterator[Var]:
-    """Variables that exist after a statement and did not before."""
+    """The variables that a statement defines for those after it."""
     match statement:
         case Compute(outs):
             yield from (out.var for out in outs)
@@ -275,7 +275,7 @@ def defined_by(statement: Statement) -> Iterator[Var]:
 
 
 def flat(body: Iterable[Statement]) -> Iterator[Statement]:
-    """All statements, also nested ones, each guard before what it holds."""
+    """All statements, including nested ones; a guard comes before its body."""
     for statement in body:
         yield statement
         if isinstance(statement, Guard):
@@ -284,7 +284,7 @@ def flat(body: Iterable[Statement]) -> Iterator[Statement]:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Names of variables by number, so that no order of a set reaches a schedule."""
+    """Names of variables sorted by number, so that no order of a set reaches a schedule."""
     return sorted(sorted(names), key=lambda name: int(name[1:]))
 
 
@@ -299,7 +299,7 @@ def variables(schedule: Schedule) -> dict[str, Var]:
 def map_blocks(
     body: Sequence[Statement], change: Callable[[tuple[Statement, ...]], tuple[Statement, ...]]
 ) -> tuple[Statement, ...]:
-    """A body with a change made to every block of statements, inner ones first."""
+    """A body in which every block of statements is changed, inner blocks first."""
     inner = tuple(
         replace(one, body=map_blocks(one.body, change), otherwise=map_blocks(one.otherwise, change))
         if isinstance(one, Guard)
@@ -310,7 +310,7 @@ def map_blocks(
 
 
 def map_computes(schedule: Schedule, change: Callable[[Compute], Iterable[Statement]]) -> Schedule:
-    """The schedule with other statements for every `Compute`, wherever it stands."""
+    """The schedule with every `Compute`, nested or not, replaced by other statements."""
 
     def block(body: tuple[Statement, ...]) -> tuple[Statement, ...]:
         return tuple(new for one in body for new in (change(one) if isinstance(one, Compute) else (one,)))

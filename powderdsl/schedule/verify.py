@@ -1,4 +1,4 @@
-"""What a legal schedule is. Checked after every stage."""
+"""The rules that every legal schedule obeys."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _KINDS = ("flag", "real", ANSWER.name, BLOCK.name, CELLS.name, PLACES.name)
 def verify(schedule: Schedule, after: str) -> None:
     """Raise InvalidIR unless the schedule is legal.
 
-    Variables are assigned once, and read only where they are: after their statement, in the same block or one in it,
-    and not after their release. A guard keeps what its body has made, of the same type. Values have no inputs.
+    Variables are assigned once, and read only after their statement, in the same block or a nested one, and before their
+    release. A guard keeps variables of its body, with alternatives of the same type. Values contain no slots.
     """
     try:
         checker = _Checker({var.name: var for _, var in schedule.finds})
@@ -49,7 +49,7 @@ class _Checker:
         self.checked: set[int] = set()
 
     def block(self, body: Sequence[Statement], live: set[str]) -> set[str]:
-        """The variables that are there after a block."""
+        """The variables that exist after a block."""
         live = set(live)
         for statement in body:
             if not isinstance(statement, Sweeps):
@@ -61,7 +61,7 @@ class _Checker:
                         all(node.type in (FLAG, ANSWER) for node in when), "a guard asks what is not a flag"
                     )
                     before = set(live)
-                    # The body makes the variables that are kept: outside they come into being at its end.
+                    # The body defines the variables that are kept; outside they exist from its end.
                     end = self.block(inner, live)
                     for var, value in keeps:
                         _demand(var.name in end, f"{var.name} is kept, but not made")
