@@ -110,7 +110,7 @@ _TEXT = ("syntax", "worlds.scene")
 _TORCH = (
     "targets.codec",
     "targets.job",
-    "targets.laps",
+    "targets.profiling",
     "targets.random",
     "targets.words",
     "targets.torch.mixed",

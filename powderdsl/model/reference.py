@@ -453,7 +453,7 @@ def step(
     *,
     passes: frozenset[str] | None = None,
     draws: Mapping[str, Array] | None = None,
-    lap: Callable[[str], None] | None = None,
+    tick: Callable[[str], None] | None = None,
     seen: Seen | None = None,
 ) -> State:
     """One step of every world.
@@ -464,7 +464,7 @@ def step(
         params: [B] arrays by qualified name.
         passes: names of the passes to run; all of them by default.
         draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
-        lap: called with the name of each pass when it is done.
+        tick: called with the name of each pass when it is done.
         seen: called after each substep; it changes nothing and keeps copies of contexts, which continue changing.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
@@ -480,6 +480,6 @@ def step(
     for pass_ in ruleset.passes:
         if passes is None or pass_.name in passes:
             at.state = run_pass(pass_, at, table, seen)
-            if lap is not None:
-                lap(pass_.name)
+            if tick is not None:
+                tick(pass_.name)
     return {name: value.astype(table[name].dtype) for name, value in at.state.items()}

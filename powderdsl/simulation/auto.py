@@ -15,9 +15,9 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from powderdsl.targets.cpp.compilers import CURE, NoCompiler
+from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
 from powderdsl.targets.job import Job, Runnable
-from powderdsl.targets.laps import profile_of
+from powderdsl.targets.profiling import profile_of
 
 WORTH = 2.0
 """Seconds of arrays, done or still to come in the call that runs, from which native code is compiled. Compiling takes
@@ -106,7 +106,7 @@ class AutoProgram:
             )
         elif self._problem:
             found.append(f"arrays: {self._problem}")
-            found.append(f"native code is faster: {CURE}")
+            found.append(f"native code is faster: {INSTALL}")
         elif build is not None and not build.lost:
             found.append(
                 f"arrays for {steps['arrays']} steps; native is being made ready ({build.seconds:.0f} s)"

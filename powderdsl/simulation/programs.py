@@ -16,7 +16,7 @@ from powderdsl.model import reference
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
 from powderdsl.targets.job import Job, Runnable
-from powderdsl.targets.laps import Laps, profile_of, unwatched
+from powderdsl.targets.profiling import PassClock, no_clock, profile_of
 
 
 class ReferenceProgram:
@@ -28,15 +28,15 @@ class ReferenceProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
-        return self._run(job, unwatched)
+        return self._run(job, no_clock)
 
     def profile(self, job: Job) -> Mapping[str, float]:
         """Seconds by pass over `job.steps`. The first pass is charged with what a step begins with."""
-        laps = Laps(torch.device("cpu"))
-        self._run(job, laps)
-        return laps.passes()
+        clock = PassClock(torch.device("cpu"))
+        self._run(job, clock)
+        return clock.passes()
 
-    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
+    def _run(self, job: Job, tick: Callable[[str], None]) -> Mapping[str, Tensor]:
         device = job.state["element"].device
         seed, index, start = (part.cpu().numpy() for part in job.clock)
         arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
@@ -49,9 +49,9 @@ class ReferenceProgram:
         }
         for i in range(job.steps):
             at = reference.Clock(seed, index, start + i)
-            lap("")
+            tick("")
             arrays = reference.step(
-                self.ruleset, arrays, at, numbers, passes=job.passes, draws=given, lap=lap
+                self.ruleset, arrays, at, numbers, passes=job.passes, draws=given, tick=tick
             )
         return {name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()}
 
@@ -142,14 +142,14 @@ def _array_program(program: Program, device: torch.device) -> Runnable:
 
 def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
     from powderdsl.simulation.native_start import native_program
-    from powderdsl.targets.cpp.compilers import CURE, NoCompiler
+    from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
 
     if device.type == "cpu":
         try:
             return native_program(ruleset, lowered, threads)
         except NoCompiler as error:
             problem = str(error)
-            help = f"run on the backend `arrays`, or {CURE}"
+            help = f"run on the backend `arrays`, or {INSTALL}"
     else:
         problem, help = "native code runs on the CPU", _ELSEWHERE.format(device)
     raise _refusal("native", problem, help)

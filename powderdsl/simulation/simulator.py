@@ -24,7 +24,7 @@ from powderdsl.simulation.programs import find_device, make_program
 from powderdsl.simulation.state_checks import check_ids, checked_integers, checked_reals, looked_up
 from powderdsl.system.writing import failure
 from powderdsl.targets.job import Job
-from powderdsl.targets.laps import profile_of
+from powderdsl.targets.profiling import profile_of
 
 MAX_CELLS = 1 << 31
 

@@ -1,1 +1,1 @@
-"""Backends: each turns a program into something that runs. A new one is a module and a row in `registry`."""
+"""Targets: each prints a program as code and runs it. How to add one: docs/architecture.md, "Adding a target"."""

@@ -1,9 +1,9 @@
-"""Compiled code on disk, libraries and kernels for GPUs: a folder for each, which appears whole or not at all, and is checked before it is loaded.
+"""The cache of compiled code: a folder per library or GPU kernel, added atomically and checked before it is loaded.
 
-<key>/program, about.json    a library, and what is known of it
-<key>.json                      what a program needs besides its library (`targets.cpp.code`)
-<key>.lock                      held by who is compiling
-.powderdsl-…                    on the way in, on the way out: see `scratch`
+<key>/program, about.json    a library, and facts about it
+<key>.json                      the rest of a compiled program (`targets.cpp.code`)
+<key>.lock                      held by the process that compiles
+.powderdsl-…                    being added or removed: see `system.scratch`
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-# Not later: a fork in the middle of an import, which a thread makes, leaves the child waiting for it for ever.
+# Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
 from filelock import FileLock, Timeout
 
 from powderdsl.system.reading import read_bytes, read_json
@@ -29,21 +29,21 @@ LIBRARY, ABOUT = "program", "about.json"
 
 KEY = re.compile(r"[0-9A-Za-z_-]{1,64}")
 LATEST = 1e11
-"""Seconds since the epoch; a later time is a mistake."""
+"""Seconds since the epoch; a later time is an error."""
 
 LIMIT = 512 << 20
-"""Bytes of libraries that are kept; of more, those used longest ago go."""
+"""Bytes of libraries to keep; beyond that, those used longest ago are removed."""
 
 UNUSED = 24 * 3600.0
-"""Seconds after which a `<key>.json` without its library is removed: another process may be about to add that."""
+"""Seconds after which a `<key>.json` without a library is removed; until then another process may add the library."""
 
 PATIENCE = 120.0
-"""Seconds to wait for another process that compiles the same; after that both do."""
+"""Seconds to wait for another process that compiles the same source; after that both compile."""
 
 
 @dataclass(frozen=True)
 class About:
-    """What is written down about a library when it is made: `created` in seconds since the epoch."""
+    """Facts recorded when a library is made. `created` is in seconds since the epoch."""
 
     ruleset: str
     backend: str
@@ -56,7 +56,7 @@ class About:
 
 @dataclass(frozen=True)
 class Entry:
-    """A library in the cache; `used` is when last, in seconds since the epoch."""
+    """A library in the cache. `used` is the time of its last use, in seconds since the epoch."""
 
     key: str
     about: About
@@ -85,11 +85,11 @@ _HOLDS: dict[str, Callable[[object], bool]] = {
     "size": lambda value: type(value) is int and 0 <= value <= LIMIT,
     "sha256": lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9a-f]{64}", value)),
 }
-"""What the fields of `About` may be."""
+"""The valid types of the fields of `About`."""
 
 
 def find(folder: Path, key: str) -> Path | None:
-    """The library of a key if it is there and whole; one that is damaged counts as absent. Marks it as used."""
+    """The library of a key, marked as used; None if it is missing or damaged."""
     about = _about(folder / key) if KEY.fullmatch(key) else None
     if about is None:
         return None
@@ -106,7 +106,7 @@ def find(folder: Path, key: str) -> Path | None:
 
 
 def add(folder: Path, key: str, built: Path, about: dict[str, Any]) -> Path:
-    """Take a folder with a LIBRARY into the cache; the library's path. Whoever is first wins.
+    """Take a folder with a LIBRARY into the cache; the library's path. The first of several processes wins.
 
     Args:
         about: the fields of `About` except size and hash.
@@ -133,7 +133,7 @@ def add(folder: Path, key: str, built: Path, about: dict[str, Any]) -> Path:
 
 
 def entries(folder: Path) -> list[Entry]:
-    """What lies in the cache, the last used first."""
+    """The libraries in the cache, most recently used first."""
     found = []
     for place in sorted(folder.iterdir()):
         about = _about(place) if KEY.fullmatch(place.name) else None
@@ -145,13 +145,13 @@ def entries(folder: Path) -> list[Entry]:
 
 
 def clear(folder: Path, older_than: float = 0.0) -> list[Entry]:
-    """Remove libraries not used for `older_than` seconds; returns which. With 0, whatever else lies there goes too."""
+    """Remove libraries not used for `older_than` seconds, and return them. With 0, other files are removed too."""
     gone = [entry for entry in entries(folder) if entry.age >= older_than]
     for entry in gone:
         _discard(folder / entry.key)
     if older_than <= 0:
         for place in sorted(folder.iterdir()):
-            # A lock may be held, and what is being built belongs to another process.
+            # A lock may be held, and a build in progress belongs to another process.
             if place.suffix != ".lock" and not is_scratch(place.name):
                 _discard(place)
     tidy(folder)
@@ -159,7 +159,7 @@ def clear(folder: Path, older_than: float = 0.0) -> list[Entry]:
 
 
 def tidy(folder: Path, limit: int = LIMIT, keep: str = "") -> None:
-    """Remove what killed processes have left, and the libraries used longest ago beyond `limit` bytes, except `keep`."""
+    """Remove leftovers of killed processes and, beyond `limit` bytes, the libraries used longest ago, except `keep`."""
     total = 0
     for entry in sorted(entries(folder), key=lambda entry: entry.key != keep):
         total += entry.about.size
@@ -176,7 +176,7 @@ def tidy(folder: Path, limit: int = LIMIT, keep: str = "") -> None:
 
 
 def _remove_free_lock(path: Path) -> None:
-    """Remove a lock file that nobody holds. Whoever waits for it then compiles too, which costs time and nothing else."""
+    """Remove a lock file that no process holds. A process that waits for it then compiles too, which only costs time."""
     lock = FileLock(path)
     with suppress(OSError, NotImplementedError, Timeout):
         lock.acquire(timeout=0)
@@ -185,7 +185,7 @@ def _remove_free_lock(path: Path) -> None:
 
 
 def _needed(folder: Path, place: Path) -> bool:
-    """Whether a `<key>.json` names a library that is there."""
+    """Whether a `<key>.json` names a library that exists."""
     if place.suffix != ".json":
         return False
     kept = read_object(place)
@@ -195,9 +195,9 @@ def _needed(folder: Path, place: Path) -> bool:
 
 @contextmanager
 def turn(folder: Path, key: str) -> Iterator[None]:
-    """One process at a time inside the block, for a while: they would all compile the same.
+    """Let one process at a time into the block, up to a time limit: all of them would compile the same source.
 
-    The kernel lets go of the lock of a process that dies. Where there are no locks, nobody waits.
+    The operating system releases the lock of a process that dies. Without file locks, nobody waits.
     """
     lock = FileLock(folder / f"{key}.lock")
     try:
@@ -212,13 +212,13 @@ def turn(folder: Path, key: str) -> Iterator[None]:
 
 
 def read_object(path: Path) -> dict[str, Any] | None:
-    """A JSON object, None if there is none or it is damaged."""
+    """A JSON object; None if the file is missing or damaged."""
     value = read_json(path)
     return value if isinstance(value, dict) else None
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Write a file whole or not at all. Raises OSError."""
+    """Write a file atomically. Raises OSError."""
     with scratch_file(path) as temporary:
         temporary.write_text(json.dumps(value), encoding="utf-8")
         os.replace(temporary, path)
@@ -232,7 +232,7 @@ def _about(place: Path) -> About | None:
 
 
 def _discard(place: Path) -> None:
-    """Remove a file or a folder; a folder gets another name first, so that nobody finds half of it."""
+    """Remove a file or a folder. A folder is renamed first, so that no process finds half of it."""
     with suppress(OSError):
         if not place.is_dir():
             place.unlink(missing_ok=True)

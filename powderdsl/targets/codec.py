@@ -1,6 +1,6 @@
-"""How a state's tensors become the slots of a program, and parameters the numbers that kernels read.
+"""The codec of the state: tensors to slots of a program and back, and parameters to the numbers that kernels read.
 
-A state tensor is one slot of the IR, or two if it is a vector; on bit planes a slot of integers is one plane a bit.
+A state tensor is one slot of the IR, or two if it is a vector. On bit planes, an integer slot has one plane per bit.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Piece:
 
     @property
     def signed(self) -> bool:
-        """Whether the highest plane counts as minus."""
+        """Whether the highest plane is a sign bit."""
         return self.type.name == "int" and width(self.type.lo, self.type.hi)[1]
 
     @property
@@ -55,7 +55,7 @@ def pieces(program: Program) -> dict[str, tuple[Piece, ...]]:
 
 
 def limits(values: Tensor, threshold: Threshold) -> Tensor:
-    """Chances, float64 [B], as how many of the draws of so many bits lie below them (or up to them): int64 [B]."""
+    """For chances, float64 [B]: how many of the possible draws lie below each, or not above it if strict: int64 [B]."""
     count = 1 << threshold.bits
     scaled = values * count - 0.5
     limit = scaled.ceil() if threshold.strict else scaled.floor() + 1
@@ -71,7 +71,7 @@ def parameters(
 ) -> tuple[Tensor, Tensor]:
     """Parameters as the bits and floats that compiled code reads: uint8 [n, B], float32 [m, B].
 
-    `planes` and `reals` number what it reads: bits of a value or a threshold, and values.
+    `planes` and `reals` give the numbers of what it reads: bits of a value or of a threshold, and values.
     """
     bits = torch.zeros(max(1, len(planes)), batch, dtype=torch.uint8, device=device)
     views: dict[tuple[str, Threshold | None], Tensor] = {}

@@ -1,4 +1,4 @@
-"""What a backend is asked to do: the one argument of every program's `run`."""
+"""A job: the argument of every program's `run`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ Clock = tuple[Tensor, Tensor, Tensor]
 class Job:
     """Steps of a batch of worlds.
 
-    `state` has a tensor a slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B]; `draws`, int64
-    [B, H, W] below 2^bits, stand in for a stream's own numbers; `passes` names those that run, None all of them.
+    `state` has one tensor per slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B];
+    `draws`, int64 [B, H, W] below 2^bits, replace a stream's own numbers; `passes` names the passes to run, None for all.
     """
 
     state: Mapping[str, Tensor]
@@ -27,7 +27,7 @@ class Job:
     draws: Mapping[str, Tensor]
     passes: frozenset[str] | None
     reuse: bool = False
-    """Whether `state` may be written to: nobody reads it afterwards."""
+    """Whether `state` may be overwritten because nothing reads it afterwards."""
 
 
 class Runnable(Protocol):

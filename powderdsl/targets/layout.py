@@ -1,4 +1,4 @@
-"""Where a program's slots, streams, parameters and fixed planes lie in a native context."""
+"""The numbers of a program's slots, streams, parameters and fixed planes in a native context."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from powderdsl.ir.ops import Node, Program, Threshold, nodes_of
 
 @dataclass
 class Layout:
-    """Where slots, streams, parameters and fixed planes lie in a context."""
+    """The numbers of slots, streams, parameters and fixed planes, and the sizes of a context's tables."""
 
     planes: dict[str, int] = field(default_factory=dict)
     reals: dict[str, int] = field(default_factory=dict)
@@ -19,19 +19,19 @@ class Layout:
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
     active: int = 0
-    """Lists of active rows that the busiest pass keeps."""
+    """The largest number of lists of active rows in a pass."""
     moving: int = 0
-    """Planes that most movements carry along."""
+    """The largest number of planes in a movement."""
     reach: int = 1
-    """Columns beyond a row of reals that are read."""
+    """The largest distance in columns at which a row of floats is read."""
     rows: int = 1
-    """Rows away that reals are read at, at most."""
+    """The largest distance in rows at which floats are read."""
     halo: int = 16
-    """Rows and columns beyond the grid that tables and rows of reals have room for."""
+    """Rows and columns beyond the grid for which tables and rows of floats have room."""
     around: int = 0
-    """Rows away that planes are read at, at most, around the edges."""
+    """The largest distance in rows at which planes are read, wrapping at the edges."""
     beyond: int = 0
-    """The same with nothing outside."""
+    """The same with zeros outside the grid."""
 
 
 def layout_of(program: Program) -> Layout:
@@ -62,7 +62,7 @@ def _place(node: Node, layout: Layout) -> None:
         case "inside":
             number(layout.fixed, (2, attr[0], attr[1]))
         case "shift" | "swap" | "arrive":
-            # What is computed again at a neighbour reads neighbours of its own, a few times over.
+            # A value recomputed at a neighbor reads neighbors itself, up to a few levels deep.
             layout.halo = max(layout.halo, -(-4 * max(abs(attr[0]), abs(attr[1])) // 16) * 16)
             if node.type.name == "real":
                 layout.reach = max(layout.reach, 3 * abs(attr[1]))
@@ -73,7 +73,7 @@ def _place(node: Node, layout: Layout) -> None:
 
 
 def number(table: dict, key: object) -> int:
-    """The position of a key, given on first use."""
+    """The number of a key, assigned on first use."""
     return int(table.setdefault(key, len(table)))
 
 

@@ -1,4 +1,4 @@
-"""What the printers of C++ and CUDA share: values as named temporaries of a block, computed once each."""
+"""Values as named temporaries of a block, each computed once: the common part of the C++ and CUDA printers."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ class Values:
 
 
 class WordValues(Values):
-    """Flags, a word at a time. `type` is a word's type; `leaf` the operation that reads variables by itself."""
+    """Flags, a word at a time. `type` is the type of a word; `leaf` is the operation whose arguments are read directly."""
 
     type: str
     leaf: str
 
     def node(self, node: Node) -> str:
-        """The expression of a node whose arguments are known."""
+        """The expression of a node whose arguments have names."""
         raise NotImplementedError
 
     def lazy(self, node: Node) -> str:
-        """The name of a `when`, whose second argument is computed only where the first holds."""
+        """The name of a `when`; its second argument is computed only where the first holds."""
         raise NotImplementedError
 
     def of(self, root: Node) -> str:
@@ -64,7 +64,7 @@ class CellValues(Values):
         return chain
 
     def alike(self, node: Node) -> list[list[Node]]:
-        """The chain of a choice, and others on the same masks: parts of a vector are tested once for both."""
+        """The chain of a choice, and others on the same masks: the components of a vector share their tests."""
         chain = self.chain(node)
         masks = [choice.args[0] for choice in chain]
         others = [

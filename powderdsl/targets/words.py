@@ -1,4 +1,4 @@
-"""Flags of cells packed into words: 64 columns a word, int64 [..., H, ⌈W/64⌉]. Bits beyond the width are zero."""
+"""Flags of cells packed into words: 64 columns per word, int64 [..., H, ⌈W/64⌉]. Bits beyond the width are zero."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ def command(
 def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """The backends asked for, by default all that are there. Raises CompileError (PD701) if one is not."""
     from powderdsl.system.writing import failure
-    from powderdsl.targets.cpp.compilers import CURE, NoCompiler, find_compiler
+    from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler, find_compiler
     from tests.fuzz.differential import COMPARED
 
     wanted = asked or COMPARED
@@ -152,7 +152,7 @@ def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
         if asked is None:
             click.echo(f"without {names}: {error}", err=True)
             return tuple(name for name in COMPARED if name not in COMPILED)
-        helps = (f"leave {names} out of --backends, or {CURE}",)
+        helps = (f"leave {names} out of --backends, or {INSTALL}",)
         problem = f"{names} cannot be compared here"
         raise failure("PD701", problem, notes=(str(error),), helps=helps) from None
     return wanted

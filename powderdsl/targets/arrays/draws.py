@@ -1,4 +1,4 @@
-"""Counter-based random numbers in NumPy, as bit planes: the same as `targets.random`. Computed where they are asked for."""
+"""Counter-based random numbers in NumPy, as bit planes: the same numbers as `targets.random`, computed where they matter."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from powderdsl.targets.arrays.words import Array, pack, unpack
 START = (0x243F6A88, 0x85A308D3)
 
 FEW, SPARSE = 512, 8
-"""Draws are made word by word where one in `SPARSE` is asked for at most, of `FEW` or more; else all, once a step."""
+"""If there are at least `FEW` words and at most one in `SPARSE` needs draws, only those are drawn; otherwise all, once a step."""
 
 
 def mix(x: Array) -> Array:
-    """A 32-bit finaliser of uint32, as in `targets.random.mix`."""
+    """A 32-bit finalizer of uint32, as in `targets.random.mix`."""
     x = (x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D)
     x = (x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B)
     return x ^ (x >> np.uint32(16))
@@ -48,7 +48,7 @@ def _hash(number: Array, key_0: Array, key_1: Array) -> Array:
 
 
 def _below(planes: Array, limit: int) -> Array:
-    """Draws below an odd limit, from their inverted planes: from the lowest bit up, one gate a plane."""
+    """Draws below an odd limit, from their inverted planes: from the lowest bit up, one gate per plane."""
     result: Array = planes[-1].copy()
     for i in range(1, len(planes)):
         if limit >> i & 1:
@@ -68,11 +68,11 @@ class Draws:
     streams: Mapping[str, tuple[int, int]]
     """Position in `keys`, and bits."""
     given: Mapping[str, Array]
-    """Draws that stand in for a stream's own: int64 [H, B, W]."""
+    """Draws that replace a stream's own: int64 [H, B, W]."""
     base: Array
     idents: Array
     lasting: dict[object, Array]
-    """What hangs on the shape only."""
+    """Values that depend only on the shape."""
     keys: Array = field(init=False)
     """uint32 [S, 2, B]."""
     _planes: dict[str, Array] = field(default_factory=dict)
@@ -130,7 +130,7 @@ class Draws:
         return _hash(h, keys[0][:, None], keys[1][:, None]).view(np.uint64)[..., 0]
 
     def chance(self, stream: str, bits: int, limit: int, where: Array | None = None) -> Array:
-        """Draw below a constant; `where` nothing is asked, anything may come out."""
+        """Whether draws lie below a constant. Cells outside `where` may hold anything."""
         lowest = (limit & -limit).bit_length() - 1
         count = bits - lowest
         known = self._planes.get(stream, ())
@@ -146,7 +146,7 @@ class Draws:
         return result
 
     def below(self, stream: str, bits: int, limit: tuple[Array, ...], where: Array | None = None) -> Array:
-        """Draw below a limit given plane by plane, most significant first: the borrow of a subtraction."""
+        """Whether draws lie below a limit given plane by plane, most significant first: the borrow of a subtraction."""
         result = np.zeros_like(self.valid)
         planes = self.inverted(stream, bits)[:bits]
         for plane, bound in zip(planes[::-1], reversed(limit[1:]), strict=True):

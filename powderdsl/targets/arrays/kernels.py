@@ -1,6 +1,6 @@
-"""What generated code calls on the CPU (`targets.arrays.source`): NumPy's arrays, and nothing done that need not be.
+"""The functions that generated code calls (`targets.arrays.source`), on NumPy arrays. They skip work where they can.
 
-An operation on a small array costs NumPy half a microsecond, torch several times that; a step is thousands of them.
+An operation on a small array takes NumPy half a microsecond and torch several times as long; a step has thousands.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from powderdsl.targets.arrays.draws import Draws
 from powderdsl.targets.arrays.words import WORD, Array, columns, pack, rows, shifted, unpack
 
 PIECE = 1 << 14
-"""Reals that stay in the first-level cache from one operation to the next."""
+"""The number of floats that stay in the first-level cache between operations."""
 
 FEW, SPARSE = 512, 2
-"""Movements are carried out word by word where the movers' words are one in `SPARSE` at most, among `FEW` or more."""
+"""If there are at least `FEW` words and at most one in `SPARSE` has movers, movements touch only those words."""
 
 GLANCE = 61
-"""One in so many floats is looked at before all are."""
+"""A sample of one float in this many is tested before all are."""
 
 _CHANGES: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply}
 
 
 @dataclass
 class ArrayKernels:
-    """Words are uint64 [H, B, Ww], blocks of planes [P, H, B, Ww], reals float32 [H, B, W]; places number cells."""
+    """Words are uint64 [H, B, Ww], blocks of planes [P, H, B, Ww], floats float32 [H, B, W]; places are indices of cells."""
 
     shape: tuple[int, int, int]
     """Rows, worlds, columns."""
@@ -38,7 +38,7 @@ class ArrayKernels:
     kinds: Mapping[str, str]
     draws: Draws
     lasting: dict[object, Array]
-    """What hangs on the shape only: kept from run to run."""
+    """Values that depend only on the shape, kept from run to run."""
     valid: Array
     zero: Array = field(init=False)
     step: Array = field(init=False)
@@ -53,7 +53,7 @@ class ArrayKernels:
         self.chance, self.below, self.draw_real = self.draws.chance, self.draws.below, self.draws.real
 
     def begin(self, step: Array) -> None:
-        """Start a step: [B] numbers of it."""
+        """Start a step; `step` has its number in each world, [B]."""
         self.step = step
         self.draws.begin(step)
 
@@ -78,7 +78,7 @@ class ArrayKernels:
     stack = staticmethod(np.stack)
 
     def swap(self, block: Array, movers: Array, over: bool, dy: int, dx: int) -> Array:
-        """Movers and targets exchanged, in all planes: by the xor of the two. `over`: in the block itself."""
+        """All planes with movers and targets exchanged, by their xor. `over`: in the block itself."""
         block = block if over else block.copy()
         few = self._few_words(movers, dy, dx)
         if few is None:
@@ -98,7 +98,7 @@ class ArrayKernels:
     def leave(
         self, block: Array, movers: Array, over: bool, dy: int, dx: int, left: tuple[int, ...]
     ) -> Array:
-        """Targets get what the movers held; where those were, the planes `left` hold and the others do not."""
+        """All planes with the movers' values at their targets; where movers were, planes in `left` are set, the others cleared."""
         block = block if over else block.copy()
         few = self._few_words(movers, dy, dx)
         if few is None:
@@ -124,7 +124,7 @@ class ArrayKernels:
         return block
 
     def _few_words(self, movers: Array, dy: int, dx: int) -> tuple[Array, Array] | None:
-        """The words that hold movers, and those that hold their targets; None if all had better be done."""
+        """The words that hold movers and those that hold their targets; None if processing all words is faster."""
         rows, worlds, count = self.valid.shape
         if movers.size < FEW or (dx and count > 1):
             return None
@@ -142,7 +142,7 @@ class ArrayKernels:
         return columns(words[..., None], dx, self.width, self.valid[0, 0], True)[..., 0]
 
     def swap_onto(self, block: Array, movers: Array, rest: Array, dy: int, dx: int) -> Array:
-        """The same where something else has changed as well: `rest` has the cells that do not move."""
+        """As `swap`, where other cells changed too: `rest` has the cells that do not move."""
         result = self.arrive(block, movers, rest, dy, dx)
         there = result ^ self.shift(block, dy, dx, True)
         there &= movers
@@ -164,7 +164,7 @@ class ArrayKernels:
         return unpack(words, self.width).view(bool)
 
     def places(self, words: Array) -> Array:
-        """Where a flag holds: int64 [n], numbers of cells in the arrays of reals."""
+        """The cells where a flag holds: int64 [n], indices into arrays of floats."""
         flat = words.reshape(-1)
         busy = np.flatnonzero(flat)
         bits = np.unpackbits(flat[busy].view(np.uint8), bitorder="little")
@@ -176,7 +176,7 @@ class ArrayKernels:
         return start[found >> 6] + (found & (WORD - 1))
 
     def moved(self, places: Array, dy: int, dx: int) -> Array:
-        """The cells whose neighbours (dy, dx) are these, in the same order."""
+        """The cells whose neighbors (dy, dx) are these, in the same order."""
         height, worlds, width = self.shape
         dy, dx = -dy % height, -dx % width
         result = places
@@ -193,7 +193,7 @@ class ArrayKernels:
     def below_param(
         self, stream: str, bits: int, name: str, strict: bool, where: Array | None = None
     ) -> Array:
-        """Draw below a parameter, which mostly is the same for all worlds."""
+        """Whether draws lie below a parameter, which is usually the same for all worlds."""
         limits = self._limits(name, bits, strict)
         limit = int(limits[0])
         if (limits != limit).any():
@@ -204,7 +204,7 @@ class ArrayKernels:
         return self.valid if limit >> bits else self.chance(stream, bits, limit, where)
 
     def _limits(self, name: str, bits: int, strict: bool) -> Array:
-        """A parameter as a chance: how many draws of so many bits lie below it, or up to it. int64 [B]."""
+        """A parameter as a chance: how many of the possible draws lie below it, or not above it: int64 [B]."""
         key = (name, bits, strict)
         if key not in self._params:
             count = 1 << bits
@@ -214,7 +214,7 @@ class ArrayKernels:
         return self._params[key]
 
     def limit(self, name: str, bits: int, strict: bool, bit: int) -> Array:
-        """A bit of a chance as a number of draws: words that are all ones or all zeros in a world."""
+        """A bit of such a number as words that are all ones or all zeros in each world."""
         key = (name, bits, strict, bit)
         if key not in self._params:
             self._params[key] = self._everywhere((self._limits(name, bits, strict) >> bit & 1)[:, None])
@@ -257,13 +257,13 @@ class ArrayKernels:
         return x if x.shape == self.shape else np.broadcast_to(x, self.shape)
 
     def copy(self, x: Array) -> Array:
-        """A copy that is a number for each cell."""
+        """A copy with one number per cell."""
         result = np.empty(self.shape, np.float32)
         result[...] = x
         return result
 
     def shift_cells(self, x: Array, dy: int, dx: int, wraps: bool) -> Array:
-        """The value at a neighbour: always a new array."""
+        """The value at a neighbor, as a new array."""
         x = self.full(x)
         height, _, width = self.shape
         if not wraps:
@@ -280,7 +280,7 @@ class ArrayKernels:
         return result
 
     def update(self, places: Array, no: Array, other: Array, over: bool, change: str) -> Array:
-        """`no`, and at some places `no` + `other`, or what else the change is."""
+        """`no`, changed by `other` (added, subtracted or multiplied) at some places."""
         return self.carry(places, places, no, other, over, change)
 
     def carry(
@@ -294,7 +294,7 @@ class ArrayKernels:
         dy: int = 0,
         dx: int = 0,
     ) -> Array:
-        """`no`, and at the target places changed by what `other` has at the source."""
+        """`no`, changed at the target places by the values of `other` at the source places."""
         result = no if over else self.copy(no)
         flat = result.reshape(-1)
         given = self.full(other).reshape(-1)[source] if other.ndim else other

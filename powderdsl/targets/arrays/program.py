@@ -1,4 +1,4 @@
-"""Bit planes on the CPU: generated passes on NumPy's arrays, as many worlds at a time as fit the cache."""
+"""Bit planes on the CPU: generated passes on NumPy's arrays, as many worlds at a time as fit into the cache."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from powderdsl.targets.arrays.source import pass_source
 from powderdsl.targets.arrays.words import Array, pack, unpack
 from powderdsl.targets.codec import pieces
 from powderdsl.targets.job import Job
-from powderdsl.targets.laps import Laps, unwatched
+from powderdsl.targets.profiling import PassClock, no_clock
 from powderdsl.targets.torch.source import load_source
 
 State = dict[str, Array]
 
 CHUNK = 1 << 17
-"""Cells worked on at a time: a float32 for each fits the second-level cache twice or more."""
+"""Cells processed at a time: a float32 for each fits into the second-level cache at least twice."""
 
 
 PassFunction = Callable[[ArrayKernels, State], State]
@@ -48,20 +48,20 @@ class ArrayProgram:
         self._idents = np.array([ident for _, ident, _ in program.streams], np.uint32)
         self._resets = [slot for slot in planes.slots if slot.resets]
         self._kept: tuple[tuple[int, int, int], dict[object, Array]] = ((0, 0, 0), {})
-        """The last shape of worlds, and what hangs on it only."""
+        """The last shape of worlds and the kernels for it."""
         self._functions = [(pass_.name, _function(pass_, i)) for i, pass_ in enumerate(planes.passes)]
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes."""
-        return self._run(job, unwatched)
+        return self._run(job, no_clock)
 
     def profile(self, job: Job) -> Mapping[str, float]:
         """Seconds that each pass takes over `job.steps`."""
-        laps = Laps(torch.device("cpu"))
-        self._run(job, laps)
-        return laps.passes()
+        clock = PassClock(torch.device("cpu"))
+        self._run(job, clock)
+        return clock.passes()
 
-    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
+    def _run(self, job: Job, tick: Callable[[str], None]) -> Mapping[str, Tensor]:
         batch, height, width = job.state["element"].shape
         result = {name: torch.empty_like(old) for name, old in job.state.items()}
         chunk = max(CHUNK // (height * width), 1)
@@ -75,10 +75,10 @@ class ArrayProgram:
                 for i in range(job.steps):
                     kernels.begin(first + i)
                     self._reset(state, kernels)
-                    lap("")
+                    tick("")
                     for name, function in functions:
                         state.update(function(kernels, state))
-                        lap(name)
+                        tick(name)
                 self._pack(state, result, some, kernels)
         return result
 

@@ -1,6 +1,6 @@
-"""Schedules -> Python: a function for each pass, one line an operation on packed words (flags) or cells (floats).
+"""Schedules -> Python: a function for each pass, one line per operation on packed words (flags) or cells (floats).
 
-What it calls (`k`) is `targets.arrays.kernels.ArrayKernels`.
+The functions that it calls (`k`) are `targets.arrays.kernels.ArrayKernels`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _CALLS = {
     "arrive": "arrive", "swap_onto": "swap_onto", "div": "div", "min": "min", "max": "max", "sqrt": "sqrt", "copy": "copy",
 }  # fmt: skip
 _OVER = {"swap", "leave", "settle", "choose", "update", "carry"}
-"""Calls that are told whether they may write over an argument."""
+"""Functions with an argument that says whether they may overwrite an array."""
 
 
 def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, float]]:
@@ -57,7 +57,7 @@ class _Printer:
     def __init__(self) -> None:
         self.constants: dict[float, str] = {}
         self.names: dict[str, str] = {}
-        """What variables are called: what takes over an array takes over its name."""
+        """The names of variables: a variable that reuses an array has that array's name."""
         self.place = ""
 
     def function(self, schedule: Schedule) -> Iterator[str]:
@@ -133,7 +133,7 @@ class _Printer:
             case "stack":
                 return f"k.stack(({', '.join(args)},))"
             case "div" if node.args[1].op == "const" and node.args[1].attr:
-                return f"{args[0]} / {args[1]}"  # what divides by zero is a call
+                return f"{args[0]} / {args[1]}"  # a division whose divisor may be zero is a call
             case "shift" if node.type == REAL:
                 return _call("shift_cells", args, attr)
             case "below_planes":

@@ -1,6 +1,6 @@
-"""Bit planes in NumPy: 64 columns a word, uint64 [..., H, B, ⌈W/64⌉]. Bits beyond the width are always zero.
+"""Bit planes in NumPy: 64 columns per word, uint64 [..., H, B, ⌈W/64⌉]. Bits beyond the width are always zero.
 
-Rows come first, so that a shift of rows moves one piece of memory.
+Rows come first, so that shifting rows moves one piece of memory.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Array = np.ndarray[Any, Any]
 WORD = 64
 
 _BY = [np.array(i, np.uint64) for i in range(WORD)]
-"""Shift amounts: a Python number would be converted each time."""
+"""Shift amounts as arrays: a Python number would be converted each time."""
 
 
 def pack(flags: Array) -> Array:
@@ -44,7 +44,7 @@ def shifted(x: Array, width: int, dx: int, wraps: bool) -> Array:
     if not -width < dx < width:
         return np.zeros_like(x)
     result = np.empty(x.shape, x.dtype)  # in rows, even if x is one number seen as many
-    # In one piece, over the ends of the rows, which are then put right.
+    # All rows at once, across their ends, which are then corrected.
     flat, cells = result.reshape(-1), x.reshape(-1)
     if dx >= 0:
         flat[: len(flat) - dx] = cells[dx:]
@@ -91,7 +91,7 @@ def columns(x: Array, dx: int, width: int, valid: Array, wraps: bool) -> Array:
 
 
 def _far_columns(x: Array, dx: int, width: int, valid: Array, wraps: bool) -> Array:
-    """The same for several words a row: what goes out of a word comes into the next."""
+    """The same for rows of several words: bits that leave a word enter the next one."""
     if not -WORD < dx < WORD:
         return pack(shifted(unpack(x, width), width, dx, wraps))
     rest = _BY[width % WORD]

@@ -1,4 +1,4 @@
-"""Compile generated C++ and load what came of it: one shared library for each source, compiler and set of flags."""
+"""Compiles generated C++ and loads the result: one shared library per source, compiler and set of flags."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ TIMEOUT = 600
 
 @dataclass(frozen=True)
 class Building:
-    """How much the compiler optimises (`-O0` to `-O3`), and the folder for libraries: None is the user's cache."""
+    """The optimization level (`-O0` to `-O3`) and the folder for libraries; None is the user's cache."""
 
     level: str = "-O2"
     folder: Path | None = None
 
     def place(self) -> Path:
-        """The folder. Raises NoCompiler if there is none that is private to the user."""
+        """The folder. Raises NoCompiler if no folder is private to the user."""
         try:
             return self.folder or cache_folder("native")
         except OSError as error:
@@ -50,7 +50,7 @@ _building: ContextVar[Building] = ContextVar("building", default=FOR_USERS)
 
 @contextmanager
 def building(how: Building) -> Iterator[None]:
-    """Build so inside the block: a test of thousands of rulesets wants neither -O2 nor the user's cache."""
+    """Use other settings inside the block: tests of thousands of rulesets need neither -O2 nor the user's cache."""
     token = _building.set(how)
     try:
         yield
@@ -59,22 +59,22 @@ def building(how: Building) -> Iterator[None]:
 
 
 def current() -> Building:
-    """What `building` says."""
+    """The settings in effect."""
     return _building.get()
 
 
 def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
-    """A hash of everything that a library depends on."""
+    """A hash of everything on which a library depends."""
     program = shutil.which(compiler.command[0]) or ""
     parts = (source, os.path.realpath(program), *compiler.command, compiler.version, *flags, processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
 def build(source: str, ruleset: str = "") -> Path:
-    """The path of the library for a source, compiled unless it lies in the cache.
+    """The path of the library for a source, compiled unless it is in the cache.
 
-    Safe with other processes and threads doing the same: one of them compiles, and the library appears whole or not at
-    all. A library that is damaged is compiled anew.
+    Safe with other processes and threads doing the same: one of them compiles, and the library is added atomically. A
+    damaged library is compiled again.
 
     Args:
         ruleset: a name for `powderdsl cache list`.
@@ -126,15 +126,15 @@ def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
     """Exit code and messages of a command that never outlives this process.
 
     Args:
-        scratch: a folder for its temporary files, which goes when this process ends in between.
+        scratch: a folder for its temporary files, removed if this process ends early.
 
     Raises:
         NoCompiler: it cannot be started, or takes longer than TIMEOUT.
     """
-    # In a program frozen into one file, sys.executable is that program: there nothing guards.
+    # In a program frozen into one file, sys.executable is that program, so there is no guard.
     frozen = getattr(sys, "frozen", False) or not sys.executable
     guard = [] if frozen else [sys.executable, "-I", "-S", compiler_guard.__file__]
-    # Nothing is ever written: the guard waits until the last process that has our end is gone.
+    # Nothing is written: the guard waits until the last process that holds our end is gone.
     theirs, ours = os.pipe()
     process: subprocess.Popen[bytes] | None = None
     try:
@@ -167,7 +167,7 @@ def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a guard that still runs, and all that it has started; reap it."""
+    """End a guard that still runs with all that it started, and reap it."""
     if process.poll() is None:
         with suppress(OSError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -180,11 +180,11 @@ def _end_all() -> None:
         running = dict(_running)
     for process, scratch in running.items():
         _end(process)
-        shutil.rmtree(scratch, ignore_errors=True)  # the thread that waits for it is no longer run
+        shutil.rmtree(scratch, ignore_errors=True)  # the thread that waits for it does not run any more
 
 
 def _forget() -> None:
-    """In a fork: what the parent runs is none of our business."""
+    """In a forked child: forget the processes of the parent."""
     global _lock
     _lock = threading.Lock()
     _running.clear()
@@ -195,11 +195,11 @@ if hasattr(os, "register_at_fork"):
 
 
 def open_library(source: str, ruleset: str = "") -> tuple[Path, ctypes.CDLL]:
-    """The library of a source, built if need be. Raises NoCompiler."""
+    """The library of a source, built if necessary. Raises NoCompiler."""
     path = build(source, ruleset)
     try:
         return path, load_library(path)
-    except OSError:  # another process has just thrown it away; or it cannot be loaded at all
+    except OSError:  # another process has just removed it, or it cannot be loaded at all
         path = build(source, ruleset)
     try:
         return path, load_library(path)
@@ -209,7 +209,7 @@ def open_library(source: str, ruleset: str = "") -> tuple[Path, ctypes.CDLL]:
 
 @lru_cache(maxsize=64)
 def load_library(path: Path) -> ctypes.CDLL:
-    """The library, loaded once a process, its functions declared."""
+    """The library, loaded once per process, with its functions declared."""
     library = ctypes.CDLL(str(path))
     pointer, integer, long = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
     signatures = {
@@ -234,6 +234,6 @@ def load_library(path: Path) -> ctypes.CDLL:
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
-    if hasattr(library, "pd_profile"):  # only where it was built with clocks
+    if hasattr(library, "pd_profile"):  # only in libraries built with clocks
         library.pd_profile.restype, library.pd_profile.argtypes = None, [pointer]
     return library

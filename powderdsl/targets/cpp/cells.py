@@ -1,4 +1,4 @@
-"""Loops over cells as C++: for each world row by row, sixteen floats at a time; rows where nothing happens are skipped."""
+"""Loops over cells as C++: world by world, row by row, sixteen floats at a time. Rows outside the region are skipped."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _INFIX = {"add": "+", "sub": "-", "mul": "*"}
 
 
 def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, active: int) -> tuple[str, int]:
-    """One loop over lanes, which are worlds, and how many lists of active rows are taken then.
+    """The text of one loop over lanes (worlds), and the number of lists of active rows used so far.
 
-    Lanes that are strips read each other: a loop that reads other rows of an earlier one follows it block by block, see
-    EACH_BLOCK in fields.hpp.
+    Lanes that are strips of one world read each other: a loop that reads other rows of an earlier loop follows it block
+    by block, see EACH_BLOCK in fields.hpp.
     """
     over = {out.var.name: out.into for loop in sweeps.loops for out in loop.outs if out.into is not None}
     before, rows, after = [], [], []
@@ -60,14 +60,14 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, active
 
 
 def _first(name: str, over: dict[str, str]) -> str:
-    """Whose place a field has taken in the end."""
+    """The field at the end of a chain of replacements."""
     while name in over:
         name = over[name]
     return name
 
 
 def _keeps(loop: Compute) -> bool:
-    """Whether what is computed stays as it was outside the region."""
+    """Whether values outside the region are the old ones."""
     return any(out.otherwise is not None and out.otherwise.op == "load" for out in loop.outs)
 
 
@@ -79,7 +79,7 @@ def _parts(region: Node) -> list[Node]:
 
 
 def _asked(loop: Compute) -> Iterator[tuple[str, str]]:
-    """Questions about fields and planes that are all to be answered with yes if nothing happens, by their names."""
+    """Tests of fields and planes, with their names; if all are true, the loop does nothing."""
     assert loop.region is not None
     for part in _parts(loop.region):
         if part.op == "live":
@@ -138,7 +138,7 @@ class _Loop:
         ends = [f"{out.var.name}->still = !some{out.var.name};" for out in self.floats]
         return " ".join([*ends, *(f"close_plane(c, {out.var.name});" for out in self.flags)])
 
-    # Values chunk by chunk
+    # Values, chunk by chunk
 
     def swept(self) -> str:
         """The body of a loop over rows."""
@@ -180,7 +180,7 @@ class _Loop:
         ])  # fmt: skip
 
     def skipped(self) -> str:
-        """Rows outside the region."""
+        """The text that skips a row outside the region."""
         region = self.loop.region
         if region is None:
             return ""
@@ -218,7 +218,7 @@ class _Loop:
         self.fields.add(name)
         return f"{name}->live[{f'c.line(l{name}, y + {dy})' if dy else f'l{name} * height + y'}]"
 
-    # Choices laid over each other
+    # Chains of choices
 
     def chains(self) -> list[list[Node]]:
         chains = []
@@ -234,7 +234,7 @@ class _Loop:
         return [str(choice.args[0].attr) for choice in reversed(self.chains()[0])]
 
     def laid(self) -> Iterator[str]:
-        """Loops over the active rows of each choice, a few rows at a time: these stay in the nearest cache."""
+        """Loops over the active rows of each choice, a few rows at a time, which stay in the first-level cache."""
         chains, masks, first = self.chains(), self.masks(), self.first
         names = [out.var.name for out in self.loop.outs]
         count = len(masks)
@@ -289,7 +289,7 @@ class _Chunks(CellValues):
         self.fields: set[str] = set()
         self.choices = [node for node in ordered(out.value for out in outs) if node.op == "select"]
         self.led: dict[str, tuple[list[str], dict[int, str], list[str]]] = {}
-        """What is computed only where a comparison holds somewhere in the chunk, by its name."""
+        """Lines that run only where a comparison holds somewhere in the chunk, by the comparison's name."""
 
     def temporary(self, text: str, type: str = "F", prefix: str = "v") -> str:
         self.count += 1
@@ -298,7 +298,7 @@ class _Chunks(CellValues):
         return name
 
     def of(self, root: Node) -> str:
-        """The name of a value: floats, or sixteen bits."""
+        """The name of a value: sixteen floats or sixteen bits."""
         stack = [(root, False)]
         while stack:
             node, ready = stack.pop()
@@ -324,7 +324,7 @@ class _Chunks(CellValues):
         return self.rows.setdefault(f"real_row{kind}(c, {field}, l{field}, {at})", f"r{len(self.rows)}")
 
     def word(self, node: Node) -> str:
-        """The word of a flag's plane, read once a row and word."""
+        """The word of a flag's plane, read once per row and word."""
         if node.op == "param":
             return f"c.param_bits[{self.layout.param_planes[param_key(node)]}][l]"
         return self.words.setdefault(str(node.attr), f"m{len(self.words)}")
@@ -382,7 +382,7 @@ class _Chunks(CellValues):
         return name
 
     def under(self, node: Node) -> None:
-        """A comparison, computed only where the one that leads it holds in the chunk."""
+        """A comparison, computed only where its leader holds somewhere in the chunk."""
         leader, comparison = node.args
         first = self.of(leader)
         self.count += 1
@@ -397,12 +397,12 @@ class _Chunks(CellValues):
         self.known[id(node)] = name
 
     def close(self) -> None:
-        """Write what depends on comparisons."""
+        """Append the lines that depend on comparisons."""
         for first, (lines, _, ends) in self.led.items():
             self.lines.append(f"if ({first}) {{ {' '.join([*lines, *ends])} }}")
 
     def choice(self, node: Node) -> None:
-        """Choices laid over each other. Where no cell of the chunk is chosen, nothing of a choice is computed."""
+        """A chain of choices. A choice is computed only if it chooses some cell of the chunk."""
         chains = self.alike(node)
         masks = [choice.args[0] for choice in chains[0]]
         names = []
@@ -416,7 +416,7 @@ class _Chunks(CellValues):
             bits = f"b{self.count}"
             outer, before = self.lines, self.known
             running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
-            self.lines, self.known = [], before | running  # only here: the names' values change
+            self.lines, self.known = [], before | running  # valid only here, since the variables change
             chosen = [self.of(one[level].args[1]) for one in chains]
             blends = [
                 f"{name} = blend({bits}, {value}, {name});" for name, value in zip(names, chosen, strict=True)
@@ -430,7 +430,7 @@ class _Chunks(CellValues):
 
 
 def quotient(value: str, divisor: float) -> str:
-    """A division by a constant. By a product, if the divisor's fraction is not all ones (Markstein 1990, theorem 8)."""
+    """A division by a constant; a product, unless the divisor's fraction is all ones (Markstein 1990, theorem 8)."""
     short = np.float32(divisor)
     if short.view(np.uint32) & 0x7FFFFF == 0x7FFFFF or not 2.0**-60 < abs(divisor) < 2.0**60:
         return f"{value} / splatf({literal(divisor)})"

@@ -1,4 +1,4 @@
-"""A program as compiled C++ and what its callers must know: enough to run it again without lowering anything."""
+"""A program as compiled C++ with its layout: enough to run it again without lowering anything."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from powderdsl.targets.layout import Layout
 
 @dataclass(frozen=True)
 class NativeCode:
-    """A library, where its slots and parameters lie, the pieces of each state tensor, the passes."""
+    """A library, its layout, the pieces of each state tensor, and the names of the passes."""
 
     library: Path
     layout: Layout
@@ -33,7 +33,7 @@ def compile_program(program: Program, planes: Program, *, clocks: bool = False) 
     Args:
         program: the numeric program, whose slots are the state's.
         planes: the same program from `ir.bits.lower_bits`.
-        clocks: count the time of each pass.
+        clocks: measure the time of each pass.
 
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.
@@ -44,7 +44,7 @@ def compile_program(program: Program, planes: Program, *, clocks: bool = False) 
 
 
 def recall(key: str) -> NativeCode | None:
-    """The code that was remembered under a key, if its library is still there. Raises NoCompiler without a cache."""
+    """The code stored under a key, if its library still exists. Raises NoCompiler if there is no cache folder."""
     folder = current().place()
     kept = cache.read_object(folder / f"{key}.json")
     try:
@@ -53,11 +53,11 @@ def recall(key: str) -> NativeCode | None:
         library = cache.find(folder, kept["library"])
         return None if library is None else _decode(kept, library)
     except (KeyError, TypeError, ValueError, AttributeError):
-        return None  # damaged: it will be written anew
+        return None  # damaged: it will be written again
 
 
 def remember(key: str, code: NativeCode) -> None:
-    """Keep what a program needs besides its library. A cache that cannot be written only costs time."""
+    """Store the rest of a compiled program under a key. A cache that cannot be written only costs time."""
     try:
         kept = _encode(code)
         cache.write_json(current().place() / f"{key}.json", {**kept, "sha256": _digest(kept)})
@@ -66,12 +66,12 @@ def remember(key: str, code: NativeCode) -> None:
 
 
 def _digest(kept: dict[str, Any]) -> str:
-    """A hash that tells whether a file is as it was written: where its numbers point, native code reads and writes."""
+    """A hash that detects damage: native code reads and writes where these numbers point."""
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
 
 def _encode(code: NativeCode) -> dict[str, Any]:
-    """As JSON. Tables are lists of pairs: their keys are tuples, thresholds in them lists."""
+    """The code as JSON. Tables become lists of pairs, since their keys are tuples; thresholds become lists."""
     layout = {f.name: getattr(code.layout, f.name) for f in fields(Layout)}
     tables = {k: list(v.items()) if isinstance(v, dict) else v for k, v in layout.items()}
     tables["param_planes"] = [

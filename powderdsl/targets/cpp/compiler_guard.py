@@ -1,4 +1,4 @@
-"""Runs a command, and ends it and all that it has started when stdin closes: then nobody waits for it any more.
+"""Runs a command, and ends it with everything that it started when stdin closes, since then nobody waits for it.
 
 A process that is killed cannot end its compiler, but the kernel closes its pipes. Runs as a script, in a session of its
 own, where Ctrl-C does not reach it: `python compiler_guard.py COMMAND …`. The exit code is the command's.
@@ -16,7 +16,7 @@ import threading
 def guard(command: list[str]) -> int:
     """Run a command until it ends; the exit code, 127 if it cannot be run."""
     if os.getpgrp() != os.getpid():
-        os.setsid()  # whoever shares our group would be ended too
+        os.setsid()  # otherwise every process of our group would be ended too
     try:
         child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     except OSError as error:
@@ -36,4 +36,4 @@ if __name__ == "__main__":
     code = guard(sys.argv[1:])
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(code)  # the other thread still reads
+    os._exit(code)  # the other thread is still reading

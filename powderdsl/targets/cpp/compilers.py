@@ -1,4 +1,4 @@
-"""C++ compilers: which one there is, and the flags that it takes."""
+"""C++ compilers: which one is available, and its flags."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
-CURE = "install g++ or clang++, or `pip install ziglang`"
+INSTALL = "install g++ or clang++, or `pip install ziglang`"
 """What to do where there is no compiler."""
 
 
@@ -22,7 +22,7 @@ class NoCompiler(Exception):
 
 @dataclass(frozen=True)
 class Compiler:
-    """A command that compiles C++, and what identifies it. `family` is ``gcc``, ``clang`` or ``zig``."""
+    """A command that compiles C++, and its identity. `family` is ``gcc``, ``clang`` or ``zig``."""
 
     command: tuple[str, ...]
     family: str
@@ -34,14 +34,14 @@ def find_compiler() -> Compiler:
     """The compiler of `$CXX`; without that the first of g++, c++, clang++ and the `ziglang` package that works.
 
     Raises:
-        NoCompiler: there is none. `$CXX` is not passed over: whoever sets it wants that one.
+        NoCompiler: none works. If `$CXX` is set, no other compiler is tried.
     """
     return _find(os.environ.get("CXX", ""), os.environ.get("PATH", ""))
 
 
 @lru_cache(maxsize=8)
 def _find(cxx: str, path: str) -> Compiler:
-    """As above, for these values of the environment: what was found is remembered, what was not is sought again."""
+    """As above, for these values of the environment. Only successes are cached."""
     try:
         candidates = [tuple(shlex.split(cxx))] if cxx.strip() else _usual()
     except ValueError as error:
@@ -109,10 +109,10 @@ def flags_for(compiler: Compiler, level: str, machine: str = "", features: str =
     if on_x86 and "avx512f" in features:
         flags.append("-mprefer-vector-width=512")
     if compiler.family == "gcc":
-        # Functions are long: these two took most of the time and gained nothing.
+        # On such long functions these two take most of the time and gain nothing.
         flags += ["-fno-gcse", "-fno-tree-pre"]
     else:
-        flags.append("-fno-slp-vectorize")  # code is written in vectors already: a tenth faster without
+        flags.append("-fno-slp-vectorize")  # the code is vectorized already: a tenth faster without
     if compiler.family == "zig":
         flags.append("-fno-sanitize=undefined")  # which zig adds at -O0
     return (*flags, "-shared", "-fPIC", "-pthread", "-fvisibility=hidden", "-w")
@@ -120,7 +120,7 @@ def flags_for(compiler: Compiler, level: str, machine: str = "", features: str =
 
 @lru_cache(maxsize=1)
 def processor() -> str:
-    """What code for this very processor hangs on: the machine and its instruction sets."""
+    """What code for this processor depends on: the machine and its instruction sets."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())

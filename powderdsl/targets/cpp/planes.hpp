@@ -1,4 +1,4 @@
-// Work on planes: columns and rows of neighbours, draws, movements. Comes after runtime.hpp.
+// Work on planes: columns and rows of neighbors, draws, movements. Comes after runtime.hpp.
 
 // Columns: the value at the column dx to the right, wrapping or with nothing beyond the edge.
 OUTLINE V columns_far(const Context& c, const V* row, int w, int dx) {  // farther than the last word of a row is wide

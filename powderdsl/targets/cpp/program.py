@@ -1,4 +1,4 @@
-"""The native backend behind the common signature: worlds stay packed between calls, arrays are made when asked for."""
+"""The native backend: worlds stay packed between calls; tensors are made when they are read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from powderdsl.targets.job import Job
 
 
 class PackedState(Mapping[str, Tensor]):
-    """A batch's state in native memory. Slots are unpacked into tensors one by one, when they are first read."""
+    """A batch's state in native memory. Slots are unpacked into tensors one by one, on first access."""
 
     def __init__(
         self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
@@ -28,7 +28,7 @@ class PackedState(Mapping[str, Tensor]):
 
     @property
     def handle(self) -> int:
-        """The batch in native memory. Raises RuntimeError once it has been taken."""
+        """The batch in native memory. Raises RuntimeError after `take`."""
         if self._handle is None:
             raise RuntimeError(
                 "these worlds were stepped with `reuse`: only those that came of it can be used"
@@ -36,7 +36,7 @@ class PackedState(Mapping[str, Tensor]):
         return self._handle
 
     def take(self) -> int:
-        """The batch, for another to own; this state must not be used afterwards."""
+        """The batch, for a new owner. This state must not be used afterwards."""
         handle, self._handle = self.handle, None
         self._free.detach()
         self._tensors.clear()
@@ -49,7 +49,7 @@ class PackedState(Mapping[str, Tensor]):
         return self._tensors[name]
 
     def has(self, name: str) -> bool:
-        """Whether a slot's tensor is there already."""
+        """Whether a slot's tensor has been made."""
         return name in self._tensors
 
     def write(self, name: str, out: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ class NativeProgram:
     """A program as compiled C++.
 
     Args:
-        with_clocks: the same code that counts the time of each pass, made when `profile` asks for it.
+        with_clocks: makes the same code with a clock for each pass; called by `profile`.
     """
 
     def __init__(self, code: NativeCode, threads: int, with_clocks: Callable[[], NativeCode]):
@@ -139,7 +139,7 @@ class NativeProgram:
         self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later. Given draws and chosen passes are for other backends."""
+        """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         assert not job.draws
         assert job.passes is None
         seed, index, start = (part.contiguous() for part in job.clock)
@@ -172,7 +172,7 @@ class NativeProgram:
             self._with_clocks = NativeProgram(self._clocks(), 1, self._clocks)
         seconds = (ctypes.c_double * len(self._passes))()
         library = self._with_clocks.library
-        library.pd_profile(seconds)  # what earlier runs have left
+        library.pd_profile(seconds)  # discard what earlier runs left
         self._with_clocks.run(job)
         library.pd_profile(seconds)
         return dict(zip(self._passes, seconds, strict=True))
@@ -211,11 +211,11 @@ class NativeProgram:
         return handle, like
 
     def planes_of(self, name: str) -> tuple[int, int, bool]:
-        """First plane of a state tensor, number of planes, and whether the last is a sign."""
+        """The first plane of a state tensor, the number of planes, and whether the last one is a sign."""
         (piece,) = self.pieces[name]
         return self.layout.planes[piece.planes[0]], len(piece.planes), piece.signed
 
 
 def address(tensor: Tensor) -> ctypes.c_void_p:
-    """Where a tensor's data begin, for C."""
+    """The address of a tensor's data, for C."""
     return ctypes.c_void_p(tensor.data_ptr())

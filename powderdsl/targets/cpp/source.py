@@ -1,4 +1,4 @@
-"""IR on planes -> C++ for a whole program: moments guarded by their masks, planes in loops, reals in row sweeps."""
+"""A program on bit planes → one C++ source file: the library, the tables and a function per pass."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
 GENERATOR_VERSION = 6
-"""Part of every cache key: raise it when generated code changes meaning."""
+"""Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "fields")
-"""What stands before the generated passes, in this order: *.hpp."""
+"""Headers that come before the generated passes, in this order."""
 DRIVER = ("driver", "views")
-"""What stands behind them."""
+"""Headers that come after them."""
 
 
 @collection_paused()
 def native_source(program: Program) -> tuple[str, Layout]:
-    """The whole translation unit, and its layout."""
+    """The source file and its layout."""
     layout = layout_of(program)
     schedules = [plan(pass_, CPP) for pass_ in program.passes]
     passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
@@ -91,7 +91,7 @@ def _element_planes(layout: Layout) -> int:
 
 
 def look(layout: Layout, asked: int) -> str:
-    """The function that finds which of the ids asked for are there. A word is known by its low and high bits."""
+    """The function that finds which of the ids in `asked` are present, from products of their low and high bits."""
     count = _element_planes(layout)
     ids = [code for code in range(1 << count) if asked >> code & 1]
     if not ids:

@@ -31,7 +31,7 @@ def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
     )
     for slot, var in schedule.finds:
         place = printer.slot(slot, var)
-        if slot in changed:  # nobody else holds it while the pass runs, so it can be written over
+        if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
             lines.append(f"{kind(var)}* {var.name} = {place}; {place} = nullptr;")
         else:
             lines.append(f"{kind(var)}* {var.name} = keep({place});")
@@ -62,7 +62,7 @@ class _Printer:
     def __init__(self, layout: Layout):
         self.layout = layout
         self.active = 0
-        """Lists of active rows that are taken."""
+        """The number of lists of active rows used so far."""
 
     def slot(self, name: str, var: Var) -> str:
         if var.type == REAL:
@@ -70,7 +70,7 @@ class _Printer:
         return f"c.slot[{self.layout.planes[name]}]"
 
     def block(self, body: Sequence[Statement], declared: frozenset[str]) -> Iterator[str]:
-        """`declared`: variables that a guard around the block has declared."""
+        """The text of a block. `declared`: variables that a guard around the block has declared."""
         for statement in body:
             match statement:
                 case Compute((out,), _, "words") if is_whole(out.value):
@@ -93,7 +93,7 @@ class _Printer:
                     raise AssertionError("no such statement in C++")
 
     def leave(self, schedule: Schedule) -> Iterator[str]:
-        """What the pass leaves in slots; everything is taken before anything is put."""
+        """The new values of slots; all are read before any is stored."""
         left = []
         for number, (slot, node) in enumerate(schedule.leaves):
             value = node.attr if node.op == "load" else "c.everything" if node.attr else "c.nothing"
@@ -173,7 +173,7 @@ class _Printer:
 
 
 def _held(value: Node) -> str:
-    """The variable that holds a plane, or a plane of the context."""
+    """The variable that holds a plane, or a constant plane of the context."""
     return str(value.attr) if value.op == "load" else "c.everything" if value.attr else "c.nothing"
 
 
@@ -184,7 +184,7 @@ def _kept(value: Node) -> str:
 
 
 def _leaves(old: Node, rest: Node, movers: str) -> str | None:
-    """What movers leave behind, as planes.hpp calls it; None if it is not as simple."""
+    """What movers leave behind, by its name in planes.hpp; None if it has none there."""
     if rest is old:
         return "SAME"
     if rest.op not in ("and", "or") or old not in rest.args:
@@ -196,7 +196,7 @@ def _leaves(old: Node, rest: Node, movers: str) -> str | None:
 
 
 def whole(value: Node, layout: Layout) -> str:
-    """An operation on whole planes that sees at once when there is nothing to do, see `empty.is_whole`."""
+    """An operation on whole planes that tests for empty ones itself, see `empty.is_whole`."""
     args = value.args
     match value.op:
         case "load" | "const":
@@ -220,15 +220,15 @@ class _Words(WordValues):
         super().__init__()
         self.layout = layout
         self.edges: dict[tuple[str, str], int] = {}
-        """How many rows away planes are read, by the call that makes these ready and the plane."""
+        """The largest distance in rows at which a plane is read, by the function that prepares such rows and the plane."""
         self.clear: dict[int, bool] = {}
 
     def ready(self) -> str:
-        """Statements before the loop: rows of other strips that it reads."""
+        """Statements before the loop that prepare the rows of other strips."""
         return " ".join(f"{call}(c, {plane}, {rows});" for (call, plane), rows in self.edges.items())
 
     def lazy(self, node: Node) -> str:
-        """Both; the second only where the first holds in the word."""
+        """A conjunction whose second part is computed only where the first holds somewhere in the word."""
         self.count += 1
         name = f"g{self.count}"
         first = self.known[id(node.args[0])]
@@ -243,12 +243,12 @@ class _Words(WordValues):
         return name
 
     def clean(self, node: Node) -> str:
-        """The value with nothing beyond the grid's width."""
+        """The value with zeros beyond the grid's width."""
         name = self.of(node)
         return name if self.is_clean(node) else self.name(f"{name} & valid")
 
     def is_clean(self, node: Node) -> bool:
-        """Whether bits beyond the width are surely zero."""
+        """Whether bits beyond the width are known to be zero."""
         if id(node) not in self.clear:
             match node.op:
                 case (
@@ -284,7 +284,7 @@ class _Words(WordValues):
         if node.op == "and":
             for value, draw in (node.args, node.args[::-1]):
                 if draw.op in ("chance", "below_param", "below_planes") and draw.args[-1:] == (value,):
-                    return self.known[id(draw)]  # it holds only where it is asked for
+                    return self.known[id(draw)]  # it holds only where it is drawn
         args = [self.known[id(arg)] for arg in node.args] if node.op != "shift" else []
         if node.op in _LOGIC:
             return f"{args[0]} {_LOGIC[node.op]} {args[1]}"

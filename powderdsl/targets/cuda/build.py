@@ -1,7 +1,7 @@
-"""NVRTC and the CUDA driver through ctypes: kernels compiled on the user's machine, kept in the cache, launched on a stream.
+"""NVRTC and the CUDA driver through ctypes: compile kernels, cache them, launch them on a stream.
 
-NVRTC is the one that torch brings along, so no toolkit has to be installed. torch itself is not imported here: it has
-made its context current before anything of this is called.
+NVRTC comes with torch, so no toolkit has to be installed. torch is not imported here; callers have made its context
+current.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from powderdsl.targets import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource
 
 OPTIONS = ("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true", "--ftz=false", "-w")
-"""No contraction and no flushing: every operation is rounded by itself, so that all backends agree bit for bit."""
+"""No contraction and no flushing: every operation is rounded separately, so that all backends agree bit for bit."""
 
 ENTRY = b"powderdsl_steps"
 _SHARED_LIMIT, _MAJOR, _MINOR = 97, 75, 76
 _DYNAMIC_SHARED = 8
-"""Numbers of attributes in the driver's interface."""
+"""Attribute numbers of the driver's interface."""
 
 
 class NoCuda(Exception):
@@ -35,7 +35,7 @@ class NoCuda(Exception):
 
 
 class Worlds(ctypes.Structure):
-    """The kernel's argument, as `driver.cuh` has it."""
+    """The kernel's argument, as declared in `driver.cuh`."""
 
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("planes", "reals", "scratch", "seed", "index", "step", "flags", "numbers")),
@@ -68,7 +68,7 @@ def nvrtc(version: str) -> ctypes.CDLL:
     for name in names:
         try:
             for beside in glob.glob(str(Path(name).parent / "libnvrtc-builtins.so.*")) if "/" in name else ():
-                ctypes.CDLL(beside)  # NVRTC opens it by name, and does not look beside itself
+                ctypes.CDLL(beside)  # NVRTC opens it by name, without looking in its own folder
             return ctypes.CDLL(name)
         except OSError:
             continue
@@ -76,7 +76,7 @@ def nvrtc(version: str) -> ctypes.CDLL:
 
 
 def check(code: int, what: str) -> None:
-    """Raises NoCuda unless a call of the driver went well."""
+    """Raise NoCuda unless a call of the driver succeeded."""
     if code:
         text = ctypes.c_char_p()
         driver().cuGetErrorString(code, ctypes.byref(text))
@@ -98,14 +98,14 @@ def shared_limit(device: int) -> int:
 
 
 def architecture(device: int) -> str:
-    """``sm_90`` and the like. Raises NoCuda."""
+    """The architecture of a device, such as ``sm_90``. Raises NoCuda."""
     return f"sm_{device_attribute(device, _MAJOR)}{device_attribute(device, _MINOR)}"
 
 
 def machine_code(source: KernelSource, architecture: str, version: str) -> bytes:
-    """A kernel's machine code, from the cache or compiled now.
+    """A kernel's machine code, from the cache or newly compiled.
 
-    Safe with other processes doing the same: a file appears under its name whole, or not at all.
+    Safe with other processes doing the same: files are added atomically.
 
     Raises:
         NoCuda: NVRTC is missing or failed, or there is no folder for the cache.
@@ -141,7 +141,7 @@ def machine_code(source: KernelSource, architecture: str, version: str) -> bytes
 
 
 def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> bytes:
-    """Machine code of a source by NVRTC. Raises NoCuda with the first lines of what it says."""
+    """Machine code of a source by NVRTC. Raises NoCuda with the first lines of its messages."""
     program, size = ctypes.c_void_p(), ctypes.c_size_t()
     created = compiler.nvrtcCreateProgram(
         ctypes.byref(program), text.encode(), b"powderdsl.cu", 0, None, None
@@ -165,11 +165,11 @@ def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> by
 
 
 Start = Callable[[Worlds, int, int], None]
-"""Puts a kernel on a stream: its argument, blocks, and the stream's address."""
+"""Launches a kernel: its argument, the number of blocks, the address of the stream."""
 
 
 def load_kernel(code: bytes, source: KernelSource) -> Start:
-    """A kernel from machine code, in the context that is current. It stays loaded. Raises NoCuda."""
+    """A kernel from machine code, loaded permanently into the current context. Raises NoCuda."""
     cuda = driver()
     module, function = ctypes.c_void_p(), ctypes.c_void_p()
     check(cuda.cuModuleLoadData(ctypes.byref(module), code), "a kernel could not be loaded")

@@ -1,4 +1,4 @@
-"""The cuda backend behind the common signature: packed worlds on the device, one launch for all steps of a call."""
+"""The cuda backend: packed worlds on the device, one launch for all steps of a call."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from powderdsl.targets.torch.mixed import packed_program
 
 @dataclass(frozen=True)
 class Arguments:
-    """What a kernel is launched with; tensors are contiguous and on its device."""
+    """The arguments of a kernel; tensors are contiguous and on its device."""
 
     planes: Tensor
     """int32 [B, slots, H, ⌈W/32⌉], changed in place."""
@@ -45,17 +45,17 @@ Launch = Callable[[Arguments], None]
 """Runs a kernel on the current stream."""
 
 Compile = Callable[[KernelSource], Launch]
-"""Makes a kernel of its source, for one device."""
+"""Makes a kernel from its source, for one device."""
 
 
 def compiler_for(device: torch.device) -> Compile:
-    """Makes kernels for a CUDA device. What it returns raises CompileError (PD701) if that fails."""
+    """A function that makes kernels for a CUDA device. It raises CompileError (PD701) if that fails."""
 
     def compile(source: KernelSource) -> Launch:
         version = torch.version.cuda or ""
         try:
             with torch.cuda.device(device):
-                torch.empty(1, device=device)  # the context is there from now on
+                torch.empty(1, device=device)  # creates the context
                 architecture = build.architecture(torch.cuda.current_device())
                 code = build.machine_code(source, architecture, version)
                 start = build.load_kernel(code, source)
@@ -79,10 +79,10 @@ def worlds_of(arguments: Arguments) -> build.Worlds:
 
 
 def cuda_program(program: Program, device: torch.device) -> Runnable:
-    """A program for a CUDA device; passes that planes cannot carry run on cells.
+    """A program for a CUDA device; passes that bit planes cannot represent run on cells.
 
     Raises:
-        CompileError: PD701 if there is no such device, driver or NVRTC.
+        CompileError: PD701 if the device, the driver or NVRTC is missing.
     """
     problem = "its kernels run on a CUDA device" if device.type != "cuda" else ""
     try:
@@ -101,7 +101,7 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
 
 
 def refusal(problem: str) -> CompileError:
-    """What a user reads where the backend cannot be had."""
+    """The error for users without this backend."""
     reporter = Reporter()
     helps = ["run on the device `cuda`, or on the backend `torch`, or on `native` on the CPU"]
     reporter.error(
@@ -111,7 +111,7 @@ def refusal(problem: str) -> CompileError:
 
 
 class DeviceState(Mapping[str, Tensor]):
-    """A batch's state in packed tensors. Slots are unpacked one by one, when they are first read."""
+    """A batch's state in packed tensors. Slots are unpacked one by one, on first access."""
 
     def __init__(
         self,
@@ -136,7 +136,7 @@ class DeviceState(Mapping[str, Tensor]):
 
 
 class CudaProgram:
-    """A program as kernels, one a size of grid.
+    """A program as kernels, one per size of grid.
 
     Args:
         program: the numeric program, whose slots are the state's.
@@ -158,7 +158,7 @@ class CudaProgram:
         return self._kernels[height, width]
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later. Given draws and chosen passes are for other backends."""
+        """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         assert not job.draws
         assert job.passes is None
         with torch.no_grad():

@@ -115,7 +115,7 @@ DEVICE u32 columns_below(int count, int w) {  // columns 0 .. count - 1 of word 
   count -= 32 * w;
   return count <= 0 ? 0 : count >= 32 ? ~0u : (1u << count) - 1;
 }
-DEVICE u32 inside_word(int y, int w, int dy, int dx) {  // cells whose neighbour lies inside the grid
+DEVICE u32 inside_word(int y, int w, int dy, int dx) {  // cells whose neighbor lies inside the grid
   if (y + dy < 0 || y + dy >= HEIGHT) return 0;
   return columns_below(dx > 0 ? WIDTH - dx : WIDTH, w) & (dx < 0 ? ~columns_below(-dx, w) : ~0u);
 }

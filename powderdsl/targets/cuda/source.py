@@ -1,4 +1,4 @@
-"""IR on planes -> CUDA C++ for a whole program and one size of grid: one kernel that runs many steps on the chip."""
+"""A program on bit planes → CUDA C++ for one size of grid: one kernel that runs many steps on the chip."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from powderdsl.targets.cuda.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
 GENERATOR_VERSION = 2
-"""Part of every cache key: raise it when generated code changes meaning."""
+"""Part of every cache key; increase it when generated code changes meaning."""
 
 WARP = 32
 MAX_THREADS = 1024
 SMALL = 64
-"""Words of a block up to which worlds share one: fewer would leave most of its threads idle."""
+"""The number of words up to which several worlds share a block; one small world would leave most threads idle."""
 
 HELD = 4
-"""Rounds of a loop over words up to which a thread holds back what it writes in registers."""
+"""The number of rounds of a loop over words up to which a thread keeps its results in registers before storing."""
 
 
 RESERVED = 1024
-"""Bytes of shared memory that the system takes of each block."""
+"""Bytes of shared memory that the system reserves in each block."""
 
 REGISTERS, ENOUGH = 65_536, 128
-"""Registers of a multiprocessor, and how many a thread should have."""
+"""Registers of a multiprocessor, and the number that a thread should have."""
 
 
 @dataclass(frozen=True)
 class KernelSource:
-    """A translation unit, and what launching it takes."""
+    """A translation unit and the numbers needed to launch it."""
 
     name: str
-    """Of the rules."""
+    """The name of the rules."""
     text: str
     layout: Layout
     group: int
-    """Worlds a block."""
+    """Worlds per block."""
     threads: int
     shared: int
-    """Bytes of shared memory a block."""
+    """Bytes of shared memory per block."""
     scratch: int
-    """Bytes of global memory a block: what did not fit."""
+    """Bytes of global memory per block, for buffers that did not fit into shared memory."""
 
 
 @collection_paused()
@@ -54,7 +54,8 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     """The kernel of a program on planes for one size of grid.
 
     Args:
-        shared_limit: bytes of shared memory that a block may have. Fields leave it first, then planes.
+        shared_limit: bytes of shared memory that a block may have. If they do not suffice, fields go to global memory
+            first, then planes.
     """
     layout = layout_of(program)
     row_words = -(-width // WARP)
@@ -134,7 +135,7 @@ def _tables(program: Program, layout: Layout, width: int, row_words: int) -> lis
 
 
 def _resets(program: Program, layout: Layout) -> str:
-    """What slots that reset each step hold at its start."""
+    """Statements that reset slots at the start of a step."""
     planes, reals = [], []
     for slot in program.slots:
         if slot.resets and slot.name in layout.planes:

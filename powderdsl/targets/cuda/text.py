@@ -96,7 +96,7 @@ class _Printer:
         yield from ("LANES { CELL;", *cells.lines, *stores, "}", f"ONCE {{ {' '.join(ends)} }}", "}")
 
     def need(self, loop: Compute, quiet: list[str]) -> str:
-        """What says whether a word has work: the region, and fields that hold what is now zero."""
+        """The expression for whether a word has work: the region, and fields whose old values must be cleared."""
         if loop.region is None:
             return "return true;"
         region = _Words(self)
@@ -121,7 +121,7 @@ class _Words(WordValues):
         self.rows: dict[int, str] = {}
 
     def lazy(self, node: Node) -> str:
-        """Both; the second only where the first holds in the word."""
+        """A conjunction whose second part is computed only where the first holds somewhere in the word."""
         self.count += 1
         name = f"t{self.count}"
         self.lines.append(f"u32 {name} = {self.known[id(node.args[0])]} & valid;")
@@ -314,7 +314,7 @@ class _Cells(CellValues):
         return name
 
     def choice(self, node: Node) -> None:
-        """Choices laid over each other. Where no cell of the word is chosen, nothing of a choice is computed."""
+        """A chain of choices. A choice is computed only if it chooses some cell of the word."""
         chains = self.alike(node)
         masks = [choice.args[0] for choice in chains[0]]
         names = []
@@ -324,7 +324,7 @@ class _Cells(CellValues):
             self.lines.append(f"float {names[-1]} = {base};")
         for level in reversed(range(len(masks))):
             running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
-            known = self.known | running  # only here: the names' values change
+            known = self.known | running  # valid only here, since the variables change
             mask = self.mask(masks[level])
             lines: list[str] = []
             blends: list[str] = []

@@ -1,1 +1,1 @@
-"""One element a cell, on torch tensors: the target to read."""
+"""The readable target: one element per cell, on torch tensors."""

@@ -1,4 +1,4 @@
-"""Programs in several forms, one after the other within each step: packed where planes can carry a pass, else on torch tensors."""
+"""Programs of several parts that take turns within each step: bit planes where they can represent a pass, else torch."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.job import Job, Runnable
-from powderdsl.targets.laps import profile_of
+from powderdsl.targets.profiling import profile_of
 from powderdsl.targets.torch.program import TorchProgram
 
 MakePacked = Callable[[Program, Program], Runnable]
-"""Makes a part of a program on numbers and the same on planes."""
+"""Makes a runnable part from a program on numbers and the same program on bit planes."""
 
 
 class MixedProgram:
-    """Parts that take turns. The state goes from one to the next whole, unpacked and packed again on the way."""
+    """Parts that take turns. The whole state is unpacked and packed again between them."""
 
     def __init__(self, parts: Sequence[Runnable]):
         self.parts = tuple(parts)
@@ -35,7 +35,7 @@ class MixedProgram:
         return state
 
     def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps`; what packing and unpacking between the parts costs is left out."""
+        """Seconds by pass over `job.steps`; packing and unpacking between the parts is not counted."""
         seed, index, start = job.clock
         state = job.state
         seconds: dict[str, float] = {}
@@ -50,12 +50,12 @@ class MixedProgram:
 
 @collection_paused()
 def packed_program(program: Program, device: torch.device, make: MakePacked) -> Runnable:
-    """A program on planes by `make`, except for the passes that planes cannot carry."""
+    """A program on bit planes by `make`, except for passes that they cannot represent."""
     return mixed_program(segments(program), device, make)
 
 
 def mixed_program(found: Sequence[Segment], device: torch.device, make: MakePacked) -> Runnable:
-    """The program of some segments; that of a single one as it is."""
+    """The program of some segments. A single segment needs no wrapper."""
     parts = [
         TorchProgram(one.program, device) if one.planes is None else make(one.program, one.planes)
         for one in found

@@ -1,7 +1,6 @@
-"""The readable torch backend: one tensor element a cell; masks, rolls and shifted sums. Handles every IR operation.
+"""The readable torch backend: one tensor element per cell, with masks, rolls and shifted sums. It has every IR operation.
 
-Each pass becomes a generated, straight-line Python function; names in it come from node numbers only, never from
-rule files. Flags are bool, integers int32, floats float32, all [B, H, W] or broadcastable to it.
+Each pass becomes a generated straight-line Python function. Its names come from node numbers, never from rule files. Flags are bool, integers int32, floats float32, all [B, H, W] or broadcastable to it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from powderdsl.system.random import base_keys
 from powderdsl.targets import random
 from powderdsl.targets.codec import limits, pieces
 from powderdsl.targets.job import Job
-from powderdsl.targets.laps import Laps, unwatched
+from powderdsl.targets.profiling import PassClock, no_clock
 from powderdsl.targets.torch.source import load_source, pass_source
 
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
@@ -28,7 +27,7 @@ _DTYPES = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
 
 @dataclass
 class Kernels:
-    """What generated code calls, for one grid size and batch: neighbours, draws, coordinates, parameters."""
+    """The functions that generated code calls, for one grid size and batch: neighbors, draws, coordinates, parameters."""
 
     shape: tuple[int, int, int]
     device: torch.device
@@ -55,16 +54,16 @@ class Kernels:
         return x if x.shape == self.shape else x.expand(self.shape)
 
     def roll(self, x: Tensor, dy: int, dx: int) -> Tensor:
-        """The value at the neighbour (dy, dx); the grid wraps."""
+        """The value at the neighbor (dy, dx); the grid wraps."""
         return torch.roll(self.full(x), (-dy, -dx), (-2, -1))
 
     def reach(self, x: Tensor, dy: int, dx: int) -> Tensor:
-        """The value at the neighbour (dy, dx), zero outside the grid."""
+        """The value at the neighbor (dy, dx), zero outside the grid."""
         rolled = self.roll(x, dy, dx)
         return torch.where(self.inside(dy, dx), rolled, torch.zeros((), dtype=x.dtype, device=self.device))
 
     def inside(self, dy: int, dx: int) -> Tensor:
-        """bool [H, W]: whether the neighbour lies inside the grid."""
+        """bool [H, W]: whether the neighbor lies inside the grid."""
         if (dy, dx) not in self._masks:
             _, height, width = self.shape
             y = torch.arange(height, device=self.device)[:, None] + dy
@@ -73,7 +72,7 @@ class Kernels:
         return self._masks[dy, dx]
 
     def count(self, x: Tensor, weights: tuple[tuple[int, int, int], ...], wraps: bool) -> Tensor:
-        """Weighted number of neighbours that hold: row sums first, each pattern of weights once."""
+        """The weighted number of neighbors that hold: sums of rows first, each pattern of weights once."""
         look = self.roll if wraps else self.reach
         cells = self.full(x).to(torch.int32)
         patterns: dict[int, list[tuple[int, int]]] = {}
@@ -126,7 +125,7 @@ class Kernels:
         return self.params[name][:, None, None].to(_DTYPES[kind])
 
     def limit(self, name: str, bits: int, strict: bool) -> Tensor:
-        """A parameter as a chance [B, 1, 1]: how many draws of so many bits lie below it, or up to it."""
+        """A parameter as a chance [B, 1, 1]: how many of the possible draws lie below it, or not above it."""
         return limits(self.params[name], Threshold(bits, strict))[:, None, None]
 
     @staticmethod
@@ -141,7 +140,7 @@ class Kernels:
 
     @staticmethod
     def quotient(a: Any, b: Any) -> Tensor:
-        """Whole division, rounded down; 0 where b is 0. One of them may be a constant."""
+        """Integer division, rounded down; 0 where b is 0. One of the two may be a constant."""
         if isinstance(b, int):
             return torch.div(a, b, rounding_mode="floor")  # no rule divides by the constant 0
         numerator = torch.full_like(b, a) if isinstance(a, int) else a
@@ -181,15 +180,15 @@ class TorchProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes; no host sync."""
-        return self._run(job, unwatched)
+        return self._run(job, no_clock)
 
     def profile(self, job: Job) -> Mapping[str, float]:
         """Seconds that each pass takes over `job.steps`."""
-        laps = Laps(self.device)
-        self._run(job, laps)
-        return laps.passes()
+        clock = PassClock(self.device)
+        self._run(job, clock)
+        return clock.passes()
 
-    def _run(self, job: Job, lap: Callable[[str], None]) -> Mapping[str, Tensor]:
+    def _run(self, job: Job, tick: Callable[[str], None]) -> Mapping[str, Tensor]:
         seed, index, start = job.clock
         batch, height, width = job.state["element"].shape
         kernels = Kernels(
@@ -205,11 +204,11 @@ class TorchProgram:
                         planes[name] = torch.full(
                             kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
                         )
-                lap("")
+                tick("")
                 for name, function in self._functions:
                     if job.passes is None or name in job.passes:
                         planes.update(function(kernels, planes))
-                        lap(name)
+                        tick(name)
         return self._pack(planes, job.state, kernels)
 
     def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:

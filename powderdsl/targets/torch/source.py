@@ -190,7 +190,7 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
 
 
 def with_deletions(lines: list[str], returned: str) -> list[str]:
-    """The lines with `del` after the last use of each plane: a large world needs few planes at once, not all."""
+    """The lines with `del` after the last use of each plane: so that a large world needs memory for few planes at once."""
     live = set(_PLANE.findall(returned))
     result: list[str] = []
     for line in reversed(lines):
@@ -207,12 +207,12 @@ _PLANE = re.compile(r"\b[ns][0-9]+\b")
 
 
 def comment(text: str) -> str:
-    """File names come from outside: nothing in them may end the comment."""
+    """A place as a comment. File names come from users: nothing in them may end the comment."""
     return "".join(char if char.isprintable() and ord(char) < 128 else "?" for char in text)
 
 
 def load_source(source: str, name: str, constants: Mapping[str, object]) -> Callable[..., Any]:
-    """The function of some generated source. It holds only names made up here, and constants passed beside it."""
+    """The function of generated source, which contains only names chosen here; constants are passed separately."""
     filename = f"<powderdsl {name} {crc32(source.encode()):x}>"
     linecache.cache[filename] = (len(source), None, source.splitlines(True), filename)
     namespace: dict[str, Any] = dict(constants)

@@ -1,4 +1,4 @@
-"""Time by name, for programs that say what each of their passes costs."""
+"""Measures the time that each pass takes, for programs that can report it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 from powderdsl.targets.job import Job
 
 
-class Laps:
-    """A clock that is called after each piece of work with its name. What comes before a pass goes under ``""``."""
+class PassClock:
+    """A clock that is called with a name after each piece of work. Work before the first pass has the name ``""``."""
 
     def __init__(self, device: torch.device):
         self._device = device
@@ -30,19 +30,19 @@ class Laps:
         return {name: seconds for name, seconds in self._seconds.items() if name}
 
     def _now(self) -> float:
-        # Work on a GPU is only handed in, so the time would be somebody else's.
+        # A GPU works asynchronously: without waiting, the time would count for a later pass.
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         return time.perf_counter()
 
 
-def unwatched(name: str) -> None:
-    """In place of `Laps` where nobody asks."""
+def no_clock(name: str) -> None:
+    """Replaces `PassClock` where time is not measured."""
 
 
 @runtime_checkable
 class Profiled(Protocol):
-    """A program that can say what its passes cost."""
+    """A program that can report the time of its passes."""
 
     def profile(self, job: Job) -> Mapping[str, float]:
         """Seconds by pass over `job.steps`."""
@@ -50,5 +50,5 @@ class Profiled(Protocol):
 
 
 def profile_of(program: object, job: Job) -> Mapping[str, float]:
-    """Seconds by pass over `job.steps`; nothing from a program that cannot say."""
+    """Seconds by pass over `job.steps`; empty if a program cannot report them."""
     return program.profile(job) if isinstance(program, Profiled) else {}
