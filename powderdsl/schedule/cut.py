@@ -308,6 +308,9 @@ class Cutter:
                 found[id(top)] = top
             elif top.op == "led":
                 stack.extend(top.args)
+            elif top.op == "select" and of_floats(top.args[0]) and not self.have(top.args[0]):
+                found[id(top.args[0])] = top.args[0]  # choices read stored flags
+                stack.extend(top.args[1:])
             elif top.type != REAL and top is not node and not is_comparison(top):
                 if top.op != "param":
                     found[id(top)] = top

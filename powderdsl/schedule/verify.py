@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from powderdsl.ir.ops import FLAG, OPS
+from powderdsl.ir.ops import FLAG, OPS, Node
 from powderdsl.ir.verify import InvalidIR
 from powderdsl.schedule.types import (
     ANSWER,
@@ -72,6 +72,7 @@ class _Checker:
                     live = (before & end) | kept
                     continue
                 case Compute(outs):
+                    _demand(_is_region(statement.region), "a region is made of stored flags and live fields")
                     for out in outs:
                         _demand(out.var.type == out.value.type, f"{out.var.name} gets a {out.value.type}")
                         if out.into is not None:
@@ -104,6 +105,12 @@ class _Checker:
                 _demand(node.op in OPS or node.op in SCHEDULE_OPS, f"unknown operation {node.op}")
                 _demand(node.op != "input", "a value reads a slot")
                 _demand(node.type.name in _KINDS, f"a value is a {node.type}")
+
+
+def _is_region(node: Node | None) -> bool:
+    if node is not None and node.op == "or":
+        return all(map(_is_region, node.args))
+    return node is None or node.op in ("load", "live", "const")
 
 
 SCHEDULE_OPS = frozenset({
