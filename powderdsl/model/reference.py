@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from powderdsl.model.state import SNAP, Slot, slots
+from powderdsl.model.state import SNAP, Slot, scratch_slots, slots
 from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Offset, Pass, Ruleset, Swap, Transform
 
 Array = np.ndarray[Any, Any]
@@ -421,10 +421,7 @@ Seen = Callable[[Pass, Moment, Context, State], None]
 
 def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | None = None) -> State:
     """The state after one pass."""
-    scratch = {
-        f.name: Slot(f.name, f.kind, f.default, False, True, None, "", 2 if f.kind.name == "vec2" else 1)
-        for f in pass_.scratch
-    }
+    scratch = scratch_slots(pass_)
     shape = at.shape
     for name, slot in scratch.items():
         at.state = {**at.state, name: _fresh(slot, shape)}
@@ -440,9 +437,29 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | N
 
 def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
     batch, height, width = shape
-    dtype = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}.get(slot.kind.name, np.int64)
+    dtype = _WIDE.get(slot.kind.name, np.int64)
     whole = (batch, 2, height, width) if slot.planes == 2 else shape
     return _default(slot, np.empty(whole, dtype)).copy()
+
+
+_WIDE = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
+_PARAMS = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
+
+
+def widened(ruleset: Ruleset, state: Mapping[str, Array]) -> State:
+    """The slots of a state in the dtypes that steps compute in."""
+    kinds = {slot.name: slot.kind.name for slot in slots(ruleset)}
+    return {name: value.astype(_WIDE.get(kinds[name], np.int64)) for name, value in state.items()}
+
+
+def parameters(ruleset: Ruleset, batch: int, given: Mapping[str, Any]) -> dict[str, Array]:
+    """All parameters as arrays [B]: numbers or arrays [B] that are given, and the defaults of the others."""
+    return {
+        param.name: np.broadcast_to(
+            np.asarray(given.get(param.name, float(param.default)), np.float64), (batch,)
+        ).astype(_PARAMS[param.kind.name])
+        for param in ruleset.params
+    }
 
 
 def step(
@@ -468,10 +485,7 @@ def step(
         seen: called after each substep; it changes nothing and keeps copies of contexts, which continue changing.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
-    wide = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
-    working: State = {
-        name: value.astype(wide.get(table[name].kind.name, np.int64)) for name, value in state.items()
-    }
+    working = widened(ruleset, state)
     shape = state["element"].shape
     for name, slot in table.items():
         if slot.resets:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from powderdsl.model.types import ELEMENT, Field, Kind, Property, Ruleset
+from powderdsl.model.types import ELEMENT, Field, Kind, Pass, Property, Ruleset
 
 SNAP = 2.0**-20
 """Real fields are kept to multiples of nothing, but what is smaller than this is zero: motion dies out, and no
@@ -86,3 +86,13 @@ def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
         )
     place = {name: number for number, name in enumerate(ruleset.order)}
     return tuple(sorted(found, key=lambda slot: place.get(slot.name, -1)))
+
+
+def scratch_slots(pass_: Pass) -> dict[str, Slot]:
+    """The slots of a pass's scratch fields by name. They live in the pass and are not stored."""
+    return {
+        item.name: Slot(
+            item.name, item.kind, item.default, False, True, None, "", 2 if item.kind.name == "vec2" else 1
+        )
+        for item in pass_.scratch
+    }

@@ -39,15 +39,8 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop:
     first = next(images)
     endless = {"loop": 0} if loop else {}
     with replacing(Path(path), follow=True) as temporary:
-        first.save(
-            temporary,
-            format="GIF",
-            save_all=True,
-            append_images=images,
-            duration=delay,
-            optimize=False,
-            **endless,
-        )
+        options = {"save_all": True, "append_images": images, "duration": delay, "optimize": False, **endless}
+        first.save(temporary, format="GIF", **options)
 
 
 def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:
@@ -69,28 +62,16 @@ def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
     first = _even(next(checked))
     size = f"{first.shape[1]}x{first.shape[0]}"
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-    command += ["-s", size, "-r", str(fps), "-i", "-", *_ENCODING]
+    command += ["-s", size, "-r", str(fps), "-i", "-", *_ENCODING.split()]
     with replacing(Path(path), follow=True) as temporary:
         _encode([*command, str(temporary)], chain([first], map(_even, checked)))
 
 
 _ENCODING = (
-    *(
-        "-an",
-        "-vcodec",
-        "libx264",
-        "-crf",
-        "18",
-        "-pix_fmt",
-        "yuv420p",
-        "-f",
-        "mp4",
-        "-movflags",
-        "+faststart",
-    ),
+    "-an -vcodec libx264 -crf 18 -pix_fmt yuv420p -f mp4 -movflags +faststart"
     # Without these words players guess how to turn the colors back, and get them slightly wrong.
-    *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709"),
-    *("-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"),
+    " -vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709"
+    " -color_primaries bt709 -color_trc bt709 -color_range tv"
 )
 
 

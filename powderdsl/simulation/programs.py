@@ -40,10 +40,8 @@ class ReferenceProgram:
         device = job.state["element"].device
         seed, index, start = (part.cpu().numpy() for part in job.clock)
         arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
-        numbers = {name: value.cpu().numpy() for name, value in job.params.items()}
-        kinds = {param.name: param.kind.name for param in self.ruleset.params}
-        dtypes = {"int": "int64", "flag": "bool", "real": "float32", "chance": "float64"}
-        numbers = {name: value.astype(dtypes[kinds[name]]) for name, value in numbers.items()}
+        given_params = {name: value.cpu().numpy() for name, value in job.params.items()}
+        numbers = reference.parameters(self.ruleset, len(seed), given_params)
         given = {
             name: (value.cpu().numpy() + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()
         }

@@ -1,12 +1,12 @@
 """Provenance: which rule last wrote the element of each cell in a step, on any backend and device.
 
-The rules are given one more field, which every rule that writes elements sets to its number where it does. That is all:
-backends know nothing of it, and a simulator that nobody asks for provenance is as it was.
+The rules get one more field, and every rule that writes an element sets the field to its number in that cell. Backends
+need no support for it, and ordinary simulators do not change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from powderdsl.model.types import Assign, Expr, Field, Move, Pass, Rule, Ruleset
 from powderdsl.simulation.simulator import Simulator, World, compile
 
 SLOT = "last writer"
-"""The field of the numbers. No rule file can have a name with a blank, so none is in the way."""
+"""The field of the numbers. Names in rule files have no blanks, so none is the same."""
 
 
 @dataclass(frozen=True)
@@ -78,31 +78,23 @@ class Provenance:
 
 
 class Recorder:
-    """Steps worlds of a simulator and keeps which rules wrote their elements. Compiles the rules once more."""
+    """Steps worlds of a simulator and records which rules wrote their elements. Compiles the rules once more."""
 
     def __init__(self, sim: Simulator):
         self.sim = sim
         self.rules = numbered_rules(sim.ruleset)
         self._marked = compile(marked(sim.ruleset), backend=sim.backend, device=str(sim.device))
 
-    def step(
-        self,
-        world: World,
-        steps: int = 1,
-        *,
-        random: Mapping[str, Any] | None = None,
-        passes: Sequence[str] | None = None,
-        params: Mapping[str, Any] | None = None,
-    ) -> Provenance:
-        """Like `Simulator.step`, which gives the same worlds and raises the same errors. Without steps nothing wrote."""
-        if world.sim.ruleset is not self.sim.ruleset and world.sim.ruleset != self.sim.ruleset:
-            raise ValueError(
-                f"this world belongs to {world.sim.ruleset.name}, not to {self.sim.ruleset.name}"
-            )
+    def step(self, world: World, steps: int = 1, **options: Any) -> Provenance:
+        """Like `Simulator.step`, which takes the same options, gives the same worlds and raises the same errors.
+
+        After 0 steps no rule has written.
+        """
+        self.sim.check(world)
         dtype = next(getattr(torch, slot.dtype) for slot in self._marked.slots if slot.name == SLOT)
         nothing = torch.zeros(world.shape, dtype=dtype, device=self.sim.device)
         start = replace(world, sim=self._marked, state={**world.state, SLOT: nothing})
-        end = self._marked.step(start, steps, random=random, passes=passes, params=params)
+        end = self._marked.step(start, steps, **options)
         state = dict(end.state)
         numbers = state.pop(SLOT).to(torch.int16)
         return Provenance(replace(end, sim=self.sim, state=state), numbers, self.rules)
@@ -111,10 +103,7 @@ class Recorder:
 def writers(world: World, steps: int = 1, **options: Any) -> Provenance:
     """The worlds some steps later, and which rules wrote their elements in the last of these steps.
 
-    It compiles the rules for this one call; whoever asks often keeps a `Recorder`.
-
-    Args:
-        options: as `Simulator.step` takes them.
+    This compiles the rules for one call; a `Recorder` compiles them once. `options` are those of `Simulator.step`.
     """
     return Recorder(world.sim).step(world, steps, **options)
 

@@ -337,15 +337,12 @@ class Simulator:
         Raises:
             KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
         """
-        if not isinstance(world, World):
-            raise TypeError(f"world must be a World, found {type(world).__name__}")
+        self.check(world)
         if isinstance(passes, str):
             raise TypeError(f"passes takes a list of names: [{passes!r}]")
         for name, given in (("random", random), ("params", params)):
             if given is not None and not isinstance(given, Mapping):
                 raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
-        if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
-            raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
         steps = _count(steps, "steps")
         unknown = [name for name in passes or () if name not in self.passes]
         if unknown:
@@ -356,6 +353,13 @@ class Simulator:
         job = Job(world.state, clock, steps, self.parameters(params or {}, len(world)), draws, chosen, reuse)
         state = self._program.run(job)
         return replace(world, sim=self, state=state, step=world.step + steps)
+
+    def check(self, world: Any) -> None:
+        """Raises TypeError for what is not a world, ValueError for a world of other rules."""
+        if not isinstance(world, World):
+            raise TypeError(f"world must be a World, found {type(world).__name__}")
+        if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
+            raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
 
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
         """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot say.

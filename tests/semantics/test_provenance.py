@@ -11,8 +11,7 @@ from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.provenance import SLOT, Provenance, Recorder, writers
 from powderdsl.simulation.simulator import compile
-from powderdsl.simulation.tracing.scenes import record_step
-from powderdsl.simulation.tracing.writes import writes_of
+from powderdsl.simulation.tracing.recorded import record_step, writes_of
 from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import compositions, seeded_ruleset

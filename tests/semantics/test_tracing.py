@@ -13,10 +13,9 @@ from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World, compile
 from powderdsl.simulation.tracing.data import trace_data
-from powderdsl.simulation.tracing.scenes import pick, record_step
+from powderdsl.simulation.tracing.recorded import pick, record_step, writes_of
 from powderdsl.simulation.tracing.text import trace_text
 from powderdsl.simulation.tracing.trace import Miss, Trace, trace
-from powderdsl.simulation.tracing.writes import writes_of
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import seeded_ruleset
@@ -139,7 +138,7 @@ def test_a_chance_that_failed_shows_the_draw_and_the_chance():
     assert read["lab.luck"] == 0
     clock = world_of(lab("do: rock -> bomb if coin < luck"), "o")
     step = record_step(clock)
-    assert read["draw(coin)"] == float(step.scenes[0].at.draws["coin"][0, 0, 0])
+    assert read["draw(coin)"] == float(step.substeps[0].at.draws["coin"][0, 0, 0])
     assert part.span is not None
     assert part.span.text == "coin < luck"
 
@@ -275,8 +274,8 @@ def explained(ruleset: Ruleset, shape: tuple[int, int, int], seed: int) -> int:
                 assert np.array_equal(held, pick(after[name].numpy(), cell)), (name, cell)
             for write in writes:
                 if write.rule is not None:
-                    assert write.scene is not None
+                    assert write.substep is not None
                     assert write.cell is not None
-                    assert write.scene.happened(write.rule.rule, write.cell)
+                    assert write.substep.happened(write.rule.rule, write.cell)
                     count += 1
     return count

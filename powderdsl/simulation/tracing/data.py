@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from powderdsl.diagnostics import Span
-from powderdsl.model.state import Slot
+from powderdsl.model.text import one_line
+from powderdsl.model.types import Ruleset
 from powderdsl.simulation.provenance import NumberedRule
-from powderdsl.simulation.tracing.parts import Part, Read, plain
-from powderdsl.simulation.tracing.trace import Cause, Miss, Trace
+from powderdsl.simulation.tracing.trace import Cause, Miss, Part, Trace, plain
 
 SCHEMA = 1
 
@@ -19,32 +19,32 @@ def trace_data(trace: Trace) -> dict[str, Any]:
         "schema": SCHEMA,
         "ruleset": trace.ruleset.name,
         "world": trace.world,
-        "cell": list(trace.cell),
+        "cell": trace.cell,
         "step": trace.step,
         "slots": {
             slot.name: {
-                "before": _value(trace, slot, trace.before[slot.name]),
-                "after": _value(trace, slot, trace.after[slot.name]),
+                "before": plain(trace.ruleset, slot.kind, trace.before[slot.name]),
+                "after": plain(trace.ruleset, slot.kind, trace.after[slot.name]),
                 "writer": _rule_data(trace.writer(slot.name)),
             }
             for slot in trace.slots
             if slot.name in trace.after
         },
-        "writes": [_cause_data(trace, one) for one in trace.causes],
+        "writes": [_cause_data(trace.ruleset, one) for one in trace.causes],
         "almost": [_miss_data(one) for one in trace.misses],
     }
 
 
-def _cause_data(trace: Trace, cause: Cause) -> dict[str, Any]:
+def _cause_data(ruleset: Ruleset, cause: Cause) -> dict[str, Any]:
     write = cause.write
     return {
         "slot": write.slot.name,
-        "before": _value(trace, write.slot, write.before),
-        "after": _value(trace, write.slot, write.after),
+        "before": plain(ruleset, write.slot.kind, write.before),
+        "after": plain(ruleset, write.slot.kind, write.after),
         "how": write.how,
         "rule": _rule_data(write.rule),
-        "cell": _cell(write.cell),
-        "source": _cell(write.source),
+        "cell": write.cell,
+        "source": write.source,
         "parts": [_part_data(part) for part in cause.parts],
     }
 
@@ -52,7 +52,7 @@ def _cause_data(trace: Trace, cause: Cause) -> dict[str, Any]:
 def _miss_data(miss: Miss) -> dict[str, Any]:
     return {
         "rule": _rule_data(miss.rule),
-        "cell": _cell(miss.cell),
+        "cell": miss.cell,
         "failed": [_part_data(part) for part in miss.failed],
         "held": [_part_data(part) for part in miss.parts if part.holds],
         "gave_way": miss.policy if not miss.failed else None,
@@ -68,15 +68,9 @@ def _rule_data(rule: NumberedRule | None) -> dict[str, Any] | None:
         "pass": rule.pass_name,
         "moment": rule.moment + 1,
         "label": rule.label,
-        "text": " ".join(rule.span.text.split()),
+        "text": one_line(rule.span),
         **_place(rule.span),
     }
-
-
-def _place(span: Span | None) -> dict[str, Any]:
-    if span is None:
-        return {"file": None, "line": None, "column": None}
-    return {"file": span.source.name, "line": span.line, "column": span.column}
 
 
 def _part_data(part: Part) -> dict[str, Any]:
@@ -85,23 +79,13 @@ def _part_data(part: Part) -> dict[str, Any]:
         "holds": part.holds,
         "let": part.of or None,
         **_place(part.span),
-        "reads": [_read_data(read) for read in part.reads],
+        "reads": [
+            {name: value for name, value in vars(read).items() if name != "shown"} for read in part.reads
+        ],
     }
 
 
-def _read_data(read: Read) -> dict[str, Any]:
-    return {
-        "text": read.text,
-        "value": read.value,
-        "cell": _cell(read.cell),
-        "element": read.element,
-        "counted": [list(cell) for cell in read.counted],
-    }
-
-
-def _cell(cell: tuple[int, int] | None) -> list[int] | None:
-    return None if cell is None else list(cell)
-
-
-def _value(trace: Trace, slot: Slot, value: Any) -> Any:
-    return plain(trace.ruleset, slot.kind, value)
+def _place(span: Span | None) -> dict[str, Any]:
+    if span is None:
+        return {"file": None, "line": None, "column": None}
+    return {"file": span.source.name, "line": span.line, "column": span.column}

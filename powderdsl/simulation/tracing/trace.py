@@ -4,23 +4,89 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
 from typing import Any
 
-from powderdsl.diagnostics import suggest
-from powderdsl.model.state import Slot, slot_name
-from powderdsl.model.types import Expr, Rule, Ruleset
+import numpy as np
+
+from powderdsl.diagnostics import Span, suggest
+from powderdsl.model import reference
+from powderdsl.model.expressions.operands import look
+from powderdsl.model.state import Slot, scratch_slots, slot_name
+from powderdsl.model.text import element_name, show_expr, show_offset, show_value
+from powderdsl.model.types import ELEMENT, FLAG, Expr, Kind, Offset, Rule, Ruleset
 from powderdsl.simulation.provenance import NumberedRule
 from powderdsl.simulation.simulator import World
-from powderdsl.simulation.tracing.parts import Part, answer, questions
-from powderdsl.simulation.tracing.scenes import (
+from powderdsl.simulation.tracing.recorded import (
     Cell,
     RecordedStep,
     RecordedSubstep,
+    Write,
+    anchors,
     pick,
     record_step,
-    scratch_slot,
+    value_at,
+    writes_of,
 )
-from powderdsl.simulation.tracing.writes import Write, anchors, writes_of
+
+HERE: Offset = (0, 0)
+_LEAVES = ("element", "property", "field", "let", "draw", "coordinate", "param", "inside", "count", "sum")
+
+
+@dataclass(frozen=True)
+class Read:
+    """One value that a condition read. `cell` is where it stands, None for parameters.
+
+    `value` is plain data, `shown` how a rule file would write it. `element` is what the cell is, where it matters.
+    `counted` are the cells that a count found.
+    """
+
+    text: str
+    value: Any
+    shown: str
+    cell: Cell | None
+    element: str | None
+    counted: tuple[Cell, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One of the conditions that must all hold for a rule to happen, in one cell.
+
+    `at` is the state that it reads; `of` names the `let` that it comes from.
+    """
+
+    expr: Expr
+    at: reference.Context
+    of: str
+    substep: RecordedSubstep
+    cell: Cell
+
+    @property
+    def text(self) -> str:
+        return show_expr(self.substep.ruleset, self.expr)
+
+    @property
+    def span(self) -> Span | None:
+        return self.expr.span
+
+    @cached_property
+    def holds(self) -> bool:
+        return bool(value_at(self.expr, self.at, self.cell))
+
+    @cached_property
+    def reads(self) -> tuple[Read, ...]:
+        """Everything that the condition read, each value once."""
+        found: dict[str, Read] = {}
+        for read in _reads(self.expr, self.at, self.cell, HERE, self.substep):
+            found.setdefault(read.text, read)
+        return tuple(found.values())
+
+    @property
+    def about_itself(self) -> bool:
+        """Whether it only asks which element the cell is: if not one of them, the rule is about other cells."""
+        return self.expr.op == "member" and self.expr.args[0].op == "element"
 
 
 @dataclass(frozen=True)
@@ -83,13 +149,13 @@ def trace(
     Args:
         world: the worlds before the first step. All but the last step run on its simulator.
         row, column: the cell, from 0.
-        step: which step, from 1: the world after it is what is explained.
+        step: which step, from 1: the world after it is explained.
         number: which world of the batch.
         of: names of slots: the element, fields, scratch fields such as ``pass.name``. All but scratch by default.
         every_rule: also the rules that missed by more than one part of their condition, or are about other elements.
 
     Raises:
-        IndexError: a cell or world that is not there. ValueError: step 0. KeyError: an unknown name.
+        IndexError: the world has no such cell, or the batch no such world. ValueError: step 0. KeyError: an unknown name.
     """
     count, height, width = world.shape
     if not 0 <= number < count:
@@ -104,7 +170,7 @@ def trace(
     cell = (row, column)
     names = {slot.name for slot in wanted}
     writes = [write for write in writes_of(recorded, cell) if write.slot.name in names]
-    lines = {(write.rule.span, write.scene.pass_.name) for write in writes if write.rule and write.scene}
+    lines = {(write.rule.span, write.substep.pass_.name) for write in writes if write.rule and write.substep}
     misses = _misses(recorded, cell, sorted(names), every_rule)
     if not every_rule:
         misses = [one for one in misses if (one.rule.span, one.rule.pass_name) not in lines]
@@ -116,17 +182,18 @@ def trace(
         tuple(wanted),
         {name: pick(array, cell) for name, array in recorded.begin.items() if name in names},
         {name: pick(array, cell) for name, array in recorded.end.items() if name in names},
-        tuple(Cause(write, _parts_of(write)) for write in writes),
+        tuple(_cause(write) for write in writes),
         tuple(misses),
     )
 
 
 def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
+    """The slots of some names, or all of the state. Raises KeyError."""
     known = {slot.name: slot for slot in world.sim.slots}
     if names is None:
         return list(known.values())
     for pass_ in world.sim.ruleset.passes:
-        known.update((item.name, scratch_slot(item.name, pass_)) for item in pass_.scratch)
+        known |= scratch_slots(pass_)
     found = []
     for name in dict.fromkeys(slot_name(world.sim.ruleset, name) for name in names):
         if name not in known:
@@ -137,49 +204,139 @@ def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
     return found
 
 
-def _condition(rule: Rule, scene: RecordedSubstep, cell: Cell) -> tuple[Part, ...]:
-    assert rule.mask is not None
-    return tuple(answer(question, cell, scene) for question in questions(rule.mask, scene))
-
-
-def _parts_of(write: Write) -> tuple[Part, ...]:
-    if write.rule is None or write.scene is None or write.cell is None:
-        return ()
-    return _condition(write.rule.rule, write.scene, write.cell)
+def _cause(write: Write) -> Cause:
+    if write.rule is None or write.substep is None or write.cell is None:
+        return Cause(write, ())
+    return Cause(write, _parts(write.rule.rule, write.substep, write.cell))
 
 
 def _misses(step: RecordedStep, cell: Cell, slots: Sequence[str], every_rule: bool) -> list[Miss]:
     """Rules that did not happen where they would have written the cell; those of one line once a place, unless all are asked."""
     found: dict[Any, Miss] = {}
-    for scene in step.scenes:
-        for rule in scene.rules:
+    for substep in step.substeps:
+        for rule in substep.rules:
             places = dict.fromkeys(
                 place
                 for slot in slots
-                if slot in scene.table
-                for place in anchors(rule.rule, cell, scene, slot)
+                if slot in substep.table
+                for place in anchors(rule.rule, cell, substep, slot)
             )
             for place in places:
-                if scene.happened(rule.rule, place) or not (every_rule or _nearly(rule.rule, scene, place)):
-                    continue
                 key = (rule.number if every_rule else (rule.span, rule.pass_name), place)
-                if key not in found:
-                    policy = scene.moment.policy
-                    found[key] = Miss(rule, place, _condition(rule.rule, scene, place), policy)
+                if key in found or substep.happened(rule.rule, place):
+                    continue
+                parts = _parts(rule.rule, substep, place)
+                if every_rule or _nearly(parts):
+                    found[key] = Miss(rule, place, parts, substep.moment.policy)
     return list(found.values())
 
 
-def _nearly(rule: Rule, scene: RecordedSubstep, cell: Cell) -> bool:
-    """Whether all parts of a condition but one hold, and the one is not which element the cell is; or all of them."""
-    mask: Expr | None = rule.mask
-    assert mask is not None
-    asked = list(questions(mask, scene))
-    failed = list(_first_two(question for question in asked if not question.holds(cell)))
+def _nearly(parts: Sequence[Part]) -> bool:
+    """Whether all parts but one hold, and the one does not ask which element the cell is; or all of them hold."""
+    failed = list(islice((part for part in parts if not part.holds), 2))
     if len(failed) == 1:
-        return len(asked) > 1 and not failed[0].about_itself
+        return len(parts) > 1 and not failed[0].about_itself
     return not failed
 
 
-def _first_two(items: Iterable[Any]) -> Iterator[Any]:
-    for item, _ in zip(items, range(2), strict=False):
-        yield item
+# Conditions
+
+
+def _parts(rule: Rule, substep: RecordedSubstep, cell: Cell) -> tuple[Part, ...]:
+    """A rule's condition in one cell, taken apart at its `and`s, also in flags fixed by `let`, as they were fixed."""
+    assert rule.mask is not None
+    return tuple(_apart(Part(rule.mask, substep.at, "", substep, cell)))
+
+
+def _apart(part: Part) -> Iterator[Part]:
+    expr, substep = part.expr, part.substep
+    if expr.op == "and":
+        for arg in expr.args:
+            yield from _apart(Part(arg, part.at, part.of, substep, part.cell))
+    elif expr.op == "let" and expr.kind == FLAG:
+        let, found = substep.lets[expr.value]
+        yield from _apart(Part(let.value, found, _written(expr.value), substep, part.cell))
+    elif not (expr.op == "const" and expr.value):
+        yield part
+
+
+def _written(name: str) -> str:
+    """A let's name as it is written: copies under loops are numbered."""
+    return name.partition("#")[0]
+
+
+def _reads(
+    expr: Expr, at: reference.Context, cell: Cell, offset: Offset, substep: RecordedSubstep
+) -> Iterator[Read]:
+    if expr.op == "look":
+        dy, dx = expr.value
+        yield from _reads(expr.args[0], at, cell, (offset[0] + dy, offset[1] + dx), substep)
+    elif expr.op not in _LEAVES:
+        for arg in expr.args:
+            yield from _reads(arg, at, cell, offset, substep)
+    else:
+        yield _leaf(expr, at, substep.near(cell, offset), offset, substep)
+        if expr.op == "let" and expr.value in substep.lets:
+            let, found = substep.lets[expr.value]
+            yield from _reads(let.value, found, cell, offset, substep)
+
+
+def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, substep: RecordedSubstep) -> Read:
+    ruleset = substep.ruleset
+    value = value_at(expr, at, place)
+    if expr.op == "element" and offset != HERE:
+        text = show_offset(offset)
+    else:
+        text = _written(show_expr(ruleset, look(expr, offset)))
+    element = None
+    if expr.op == "property" or (expr.op in ("field", "let") and offset != HERE):
+        element = element_name(ruleset, int(value_at(Expr("element", ELEMENT), at, place)))
+    return Read(
+        text,
+        plain(ruleset, expr.kind, value),
+        show_at_cell(ruleset, expr.kind, value),
+        None if expr.op in ("param", "coordinate") else place,
+        element,
+        tuple(_counted(expr, at, place, substep)) if expr.op == "count" else (),
+    )
+
+
+def _counted(expr: Expr, at: reference.Context, place: Cell, substep: RecordedSubstep) -> Iterator[Cell]:
+    """The neighbors that a count found: those with a weight where its argument holds."""
+    holds = reference.evaluate(expr.args[0], at)
+    kernel = expr.value
+    for dy, dx, weight in kernel.weights[: 1 << 10]:
+        there = substep.near(place, (dy, dx))
+        inside = there == (place[0] + dy, place[1] + dx)
+        if weight and (inside or kernel.wrap) and holds[(0, *there)]:
+            yield there
+
+
+def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
+    """A cell's value as plain data: elements by name, directions as rules name them, the rest as numbers."""
+    if kind.name == "element":
+        return element_name(ruleset, int(value))
+    if kind.name == "direction":
+        return show_at_cell(ruleset, kind, value)
+    if kind.name == "flag":
+        return bool(value)
+    numbers = np.asarray(value).tolist()
+    return [_finite(one) for one in numbers] if isinstance(numbers, list) else _finite(numbers)
+
+
+def _finite(number: float) -> float | str:
+    """JSON has no infinities; values within a pass may be infinite."""
+    return number if np.isfinite(number) else str(number)
+
+
+def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
+    """A cell's value as a rule file would write it; draws in per cent, as chances are."""
+    if kind.name in ("element", "flag", "direction"):
+        return show_value(ruleset, kind, int(value))
+    if kind.name == "chance":
+        return show_value(ruleset, kind, float(value))
+    if kind.name == "draw":
+        return f"{float(value) * 100:.6g}%"
+    if kind.name == "vec2":
+        return "({:.7g}, {:.7g})".format(*(float(part) for part in value))
+    return str(int(value)) if kind.name == "int" else f"{float(value):.7g}"

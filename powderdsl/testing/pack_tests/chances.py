@@ -125,15 +125,9 @@ def _copies(start: World, first: int, count: int, seed: int) -> World:
 def world_context(world: World) -> reference.Context:
     """What a condition reads of a world: its state as the oracle holds it, parameters, the clock."""
     ruleset = world.sim.ruleset
-    wide: dict[str, type] = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
-    state: reference.State = {
-        slot.name: to_numpy(world.state[slot.name]).astype(wide.get(slot.kind.name, np.int64))
-        for slot in slots(ruleset)
-    }
-    dtypes: dict[str, type] = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
-    params: dict[str, reference.Array] = {
-        param.name: np.full(len(world), float(param.default), dtypes[param.kind.name])
-        for param in ruleset.params
-    }
+    state = reference.widened(
+        ruleset, {slot.name: to_numpy(world.state[slot.name]) for slot in slots(ruleset)}
+    )
+    params = reference.parameters(ruleset, len(world), {})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
     return reference.Context(ruleset, state, params, {}, clock)

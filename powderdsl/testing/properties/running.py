@@ -107,21 +107,12 @@ def clock(sample: Sample, step: int) -> reference.Clock:
 
 def parameters(ruleset: Ruleset, sample: Sample) -> dict[str, Array]:
     """All parameters, [B] each."""
-    dtypes: dict[str, type] = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
-    return {
-        param.name: np.broadcast_to(
-            np.asarray(sample.params.get(param.name, float(param.default)), np.float64), (len(sample),)
-        ).astype(dtypes[param.kind.name])
-        for param in ruleset.params
-    }
+    return reference.parameters(ruleset, len(sample), sample.params)
 
 
 def context(ruleset: Ruleset, state: State, sample: Sample, step: int) -> reference.Context:
     """What a condition reads of worlds: their state, parameters, the clock."""
-    wide: dict[str, type] = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
-    working: State = {
-        slot.name: state[slot.name].astype(wide.get(slot.kind.name, np.int64)) for slot in slots(ruleset)
-    }
+    working = reference.widened(ruleset, {slot.name: state[slot.name] for slot in slots(ruleset)})
     return reference.Context(ruleset, working, parameters(ruleset, sample), {}, clock(sample, step))
 
 
