@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,10 +15,10 @@ from torch import Tensor
 
 from powderdsl.datasets.manifest import Manifest, Recipe, damaged, differences, many_damaged, read_manifest
 from powderdsl.datasets.recipes import check_count, recipe_of
-from powderdsl.datasets.shards import Shard, open_shard
+from powderdsl.datasets.shards import DTYPES, Shard, open_shard, row_shape
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.system.random import MASK, mix
+from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.writing import failure
 
 Array = NDArray[Any]
@@ -101,7 +101,8 @@ class Dataset:
         return cls(place, manifest, memory)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopened, (str(self.folder), self.memory)  # for workers, without what is mapped
+        # For workers, without what is mapped.
+        return partial(Dataset.open, memory=self.memory), (str(self.folder),)
 
     def __len__(self) -> int:
         """How many episodes there are."""
@@ -216,17 +217,10 @@ class Dataset:
 
     def _gather(self, windows: Array, ends: Array, length: int) -> list[Array]:
         """The arrays of `Batch` of windows, [B, length, …]."""
-        shape = self.recipe.shape
-        sizes = {"observation": shape, "next_observation": shape, "action": (5,)}
-        dtypes = {
-            "observation": np.uint8,
-            "next_observation": np.uint8,
-            "action": np.int16,
-            "reward": np.float32,
-        }
+        stored = {name: name.removeprefix("next_") for name in Batch._fields}
         out = {
-            name: np.empty((len(windows), length, *sizes.get(name, ())), dtypes.get(name, np.bool_))
-            for name in Batch._fields
+            name: np.empty((len(windows), length, *row_shape(self.recipe, of)), DTYPES[of])
+            for name, of in stored.items()
         }
         number = np.searchsorted(ends, windows, side="right")
         for one in np.unique(number).tolist():
@@ -237,12 +231,10 @@ class Dataset:
             place = np.searchsorted(np.cumsum(count), window, side="right")
             within = window - (np.cumsum(count) - count)[place]
             at = (shard.starts[place] + within)[:, None] + np.arange(length)
-            for name in Batch._fields:
-                if name in ("observation", "next_observation"):
-                    shown = at + place[:, None] + (name == "next_observation")
-                    out[name][rows] = shard.arrays["observation"][shown]
-                else:
-                    out[name][rows] = shard.arrays[name][at]
+            first = at + place[:, None]  # each episode before has one observation more than actions
+            for name, of in stored.items():
+                taken = first + (name != of) if of == "observation" else at
+                out[name][rows] = shard.arrays[of][taken]
         return list(out.values())
 
     @cached_property
@@ -267,9 +259,8 @@ class Dataset:
 
 def drawn(seed: int, number: int, count: int, below: int) -> Array:
     """Integers 0 … below − 1, hashes of `seed` and `number`: int64 [count]."""
-    key = torch.zeros(2, dtype=torch.int64) + torch.tensor([0x243F6A88, 0x85A308D3])
-    for part in (seed & MASK, seed >> 32, number & MASK, number >> 32):
-        key = mix((key + part) & MASK)
+    keys = base_keys(torch.tensor([seed]), torch.tensor([number]))
+    key = mix((keys[:, 0] + (number >> 32)) & MASK)
     halves = mix((key[:, None] + mix(torch.arange(1, count + 1))) & MASK)
     return np.asarray((((halves[0] << 31) | (halves[1] >> 1)) % below).numpy())
 
@@ -282,7 +273,3 @@ def _check_draw(batch: int, seed: int, start: int) -> None:
 
 def _tensor(rows: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(rows))
-
-
-def _reopened(folder: str, memory: int) -> Dataset:
-    return Dataset.open(folder, memory=memory)

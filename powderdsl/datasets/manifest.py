@@ -1,11 +1,11 @@
-"""What a dataset says of itself: how it came about, what its numbers mean, and which shards there are. No torch."""
+"""A dataset's manifest: how it was recorded, what its numbers mean, and which shards it has. No torch."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from math import prod
 from pathlib import Path
@@ -17,7 +17,7 @@ from powderdsl.system.writing import failure, replacing
 
 FORMAT = "powderdsl-dataset"
 VERSION = 2
-"""Version 1 had other fingerprints, which say nothing any more: they are read as unknown."""
+"""Version 1 had other fingerprints, which are read as unknown."""
 FILE = "dataset.json"
 MAX_BYTES = 1 << 24
 """Of a manifest's text."""
@@ -30,44 +30,117 @@ MAX_SHARDS = 1 << 16
 MAX_SIDE = 1 << 20
 
 
+# What a manifest may say
+
+
+@dataclass(frozen=True)
+class _Rule:
+    says: str
+    holds: Callable[[Any], bool]
+
+
+def _ruled(rule: _Rule) -> Any:
+    """A field whose value in a manifest obeys a rule."""
+    return field(metadata={"rule": rule})
+
+
+def _rules_of(kind: type) -> dict[str, _Rule]:
+    """The rules of a dataclass, by field."""
+    return {one.name: one.metadata["rule"] for one in fields(kind)}
+
+
+def _is_integer(value: Any, low: int, high: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and 1 <= len(value) <= 500
+
+
+def _integer(low: int, high: int) -> _Rule:
+    return _Rule(f"an integer from {low} to {high}", lambda value: _is_integer(value, low, high))
+
+
+def _list(says: str, holds: Callable[[Any], bool], low: int, high: int) -> _Rule:
+    """Lists of `low` to `high` values that hold."""
+    return _Rule(
+        says, lambda value: isinstance(value, list) and low <= len(value) <= high and all(map(holds, value))
+    )
+
+
+def _mapping(says: str, holds: Callable[[Any], bool], key: str = r".{1,500}") -> _Rule:
+    """Mappings to values that hold, from keys that match a regular expression."""
+    return _Rule(
+        says,
+        lambda value: (
+            isinstance(value, dict)
+            and len(value) <= 10_000
+            and all(re.fullmatch(key, name) and holds(one) for name, one in value.items())
+        ),
+    )
+
+
+def _one_of(*words: str) -> _Rule:
+    return _Rule(" or ".join(f"`{word}`" for word in words), lambda value: value in words)
+
+
+_TEXT = _Rule("a text", _is_text)
+_TEXTS = _list("a list of texts", _is_text, 1, 1000)
+_DIGEST = _Rule(
+    "64 hexadecimal digits",
+    lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9a-f]{64}", value)),
+)
+_ID = r"[0-9]|[1-9][0-9]|1[0-9]{2}|2[0-4][0-9]|25[0-5]"
+
+
 @dataclass(frozen=True)
 class Recipe:
-    """All that the arrays of a dataset follow from, and what is needed to read them.
+    """Everything that decides the arrays of a dataset, and what is needed to read them.
 
     Two datasets of equal recipes have equal shards, byte for byte. `palette` names ids, `choices` the values of an
     action's third number: elements by qualified name, ``blow``, ``nothing``.
     """
 
-    task: str
-    split: str
-    knobs: Mapping[str, int]
-    params: Mapping[str, float]
-    task_fingerprint: str
-    ruleset: str
-    ruleset_fingerprint: str
-    powderdsl: str
-    policy: str
-    seed: int
-    worlds: int
-    episodes: int
-    shard: int
+    task: str = _ruled(_TEXT)
+    split: str = _ruled(_TEXT)
+    knobs: Mapping[str, int] = _ruled(
+        _mapping("a mapping to integers", lambda one: _is_integer(one, -(1 << 31), 1 << 31))
+    )
+    params: Mapping[str, float] = _ruled(_mapping("a mapping to numbers", _is_number))
+    task_fingerprint: str = _ruled(_DIGEST)
+    ruleset: str = _ruled(_TEXT)
+    ruleset_fingerprint: str = _ruled(_DIGEST)
+    powderdsl: str = _ruled(_TEXT)
+    policy: str = _ruled(_TEXT)
+    seed: int = _ruled(_integer(0, (1 << 62) - 1))
+    worlds: int = _ruled(_integer(1, (1 << 62) - 1))
+    episodes: int = _ruled(_integer(1, MAX_EPISODES))
+    shard: int = _ruled(_integer(1, MAX_EPISODES))
     """Episodes of a shard; the last one may have fewer."""
-    compress: bool
-    observation: str
-    channels: tuple[str, ...]
-    shape: tuple[int, ...]
+    compress: bool = _ruled(_Rule("true or false", lambda value: isinstance(value, bool)))
+    observation: str = _ruled(_one_of("ids", "compact"))
+    channels: tuple[str, ...] = _ruled(_TEXTS)
+    shape: tuple[int, ...] = _ruled(
+        _list("three integers from 1", lambda one: _is_integer(one, 1, MAX_SIDE), 3, 3)
+    )
     """Of an observation: channels, rows, columns. Its numbers are bytes."""
-    palette: Mapping[str, str]
-    action_nvec: tuple[int, ...]
-    choices: tuple[str, ...]
-    actions: int
+    palette: Mapping[str, str] = _ruled(_mapping("names by id", _is_text, _ID))
+    action_nvec: tuple[int, ...] = _ruled(
+        _list("five integers from 1", lambda one: _is_integer(one, 1, (1 << 15) - 1), 5, 5)
+    )
+    choices: tuple[str, ...] = _ruled(_TEXTS)
+    actions: int = _ruled(_integer(1, 1_000_000))
     """Of an episode, at most."""
-    last_action: str
-    """What running out of actions is: it ``truncates`` or ``terminates``."""
+    last_action: str = _ruled(_one_of("truncates", "terminates"))
+    """How an episode ends when it runs out of actions."""
 
     @property
     def shards(self) -> int:
-        """How many shards there are when all is recorded."""
+        """How many shards a complete dataset has."""
         return -(-self.episodes // self.shard)
 
     def episodes_of(self, shard: int) -> range:
@@ -77,12 +150,12 @@ class Recipe:
 
 @dataclass(frozen=True)
 class ShardRow:
-    """What the manifest says of a shard's file. A file's name follows from its number, so none can lead elsewhere."""
+    """What the manifest says of a shard's file. The number decides the file's name, so none can lead elsewhere."""
 
-    number: int
-    sha256: str
-    bytes: int
-    transitions: int
+    number: int = _ruled(_integer(0, MAX_SHARDS - 1))
+    sha256: str = _ruled(_DIGEST)
+    bytes: int = _ruled(_integer(1, 2 * MAX_SHARD_BYTES))
+    transitions: int = _ruled(_integer(1, MAX_EPISODES))
 
     @property
     def file(self) -> str:
@@ -95,7 +168,7 @@ class Manifest:
     created: str
     """When recording began, ISO 8601."""
     shards: tuple[ShardRow, ...]
-    """Those that are there, ascending."""
+    """Those that have been recorded, ascending."""
 
     @property
     def transitions(self) -> int:
@@ -104,6 +177,9 @@ class Manifest:
 
 def shard_file(number: int) -> str:
     return f"shard-{number:06d}.npz"
+
+
+# Files
 
 
 def new_manifest(recipe: Recipe) -> Manifest:
@@ -140,13 +216,14 @@ def read_manifest(folder: Path) -> Manifest:
             f"{path} has the version {_short(data.get('version'))}", f"this powderdsl reads {VERSION}"
         )
     problems = [f"`{key}` must be {rule.says}" for key, rule in _TOP.items() if not rule.holds(data.get(key))]
-    recipe = data["recipe"] if isinstance(data.get("recipe"), dict) else {}
-    problems += [
-        f"`recipe.{key}` must be {rule.says}, found {_short(recipe.get(key))}"
-        for key, rule in _RECIPE.items()
-        if recipe and not rule.holds(recipe.get(key))
-    ]
-    problems += [f"`recipe.{_short(key)}` is unknown" for key in recipe if key not in _RECIPE]
+    recipe, rules = data.get("recipe"), _rules_of(Recipe)
+    if recipe and isinstance(recipe, dict):
+        problems += [
+            f"`recipe.{key}` must be {rule.says}, found {_short(recipe.get(key))}"
+            for key, rule in rules.items()
+            if not rule.holds(recipe.get(key))
+        ]
+        problems += [f"`recipe.{_short(key)}` is unknown" for key in recipe if key not in rules]
     if problems:
         raise many_damaged(path, problems)
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in recipe.items()}
@@ -199,102 +276,22 @@ def differences(old: Recipe, new: Recipe) -> list[str]:
     Rules that differ in their name alone are the same: names say what is loaded, which they once did not.
     """
     found = []
-    for field in fields(Recipe):
-        a, b = getattr(old, field.name), getattr(new, field.name)
-        if field.name in FINGERPRINTS and not (a and b):
+    for one in fields(Recipe):
+        a, b = getattr(old, one.name), getattr(new, one.name)
+        if one.name in FINGERPRINTS and not (a and b):
             continue
         if isinstance(a, Mapping):
             keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
-            found += [f"{field.name}.{key}: {_short(a.get(key))}, not {_short(b.get(key))}" for key in keys]
+            found += [f"{one.name}.{key}: {_short(a.get(key))}, not {_short(b.get(key))}" for key in keys]
         elif a != b:
-            found.append(f"{field.name}: {_short(a)}, not {_short(b)}")
+            found.append(f"{one.name}: {_short(a)}, not {_short(b)}")
     return [] if len(found) == 1 and old.ruleset != new.ruleset else found
 
-
-# What a manifest may say
-
-
-@dataclass(frozen=True)
-class _Rule:
-    says: str
-    holds: Callable[[Any], bool]
-
-
-def _whole(low: int, high: int) -> _Rule:
-    return _Rule(f"an integer from {low} to {high}", lambda value: _is_whole(value, low, high))
-
-
-def _is_whole(value: Any, low: int, high: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and 1 <= len(value) <= 500
-
-
-def _list_of(inner: Callable[[Any], bool], low: int, high: int) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and low <= len(value) <= high and all(map(inner, value))
-
-
-def _mapping_of(inner: Callable[[Any], bool], key: str = r".{1,500}") -> Callable[[Any], bool]:
-    return lambda value: (
-        isinstance(value, dict)
-        and len(value) <= 10_000
-        and all(re.fullmatch(key, name) and inner(one) for name, one in value.items())
-    )
-
-
-def _one_of(*words: str) -> _Rule:
-    return _Rule(" or ".join(f"`{word}`" for word in words), lambda value: value in words)
-
-
-_TEXT = _Rule("a text", _is_text)
-_DIGEST = _Rule(
-    "64 hexadecimal digits",
-    lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9a-f]{64}", value)),
-)
-_NUMBER = _Rule("a number", lambda value: isinstance(value, int | float) and not isinstance(value, bool))
 
 _TOP = {
     "recipe": _Rule("a mapping", lambda value: isinstance(value, dict) and bool(value)),
     "created": _TEXT,
     "shards": _Rule("a list", lambda value: isinstance(value, list) and len(value) <= MAX_SHARDS),
-}
-
-_RECIPE: dict[str, _Rule] = {
-    "task": _TEXT,
-    "split": _TEXT,
-    "knobs": _Rule("a mapping to integers", _mapping_of(lambda one: _is_whole(one, -(1 << 31), 1 << 31))),
-    "params": _Rule("a mapping to numbers", _mapping_of(_NUMBER.holds)),
-    "task_fingerprint": _DIGEST,
-    "ruleset": _TEXT,
-    "ruleset_fingerprint": _DIGEST,
-    "powderdsl": _TEXT,
-    "policy": _TEXT,
-    "seed": _whole(0, (1 << 62) - 1),
-    "worlds": _whole(1, (1 << 62) - 1),
-    "episodes": _whole(1, MAX_EPISODES),
-    "shard": _whole(1, MAX_EPISODES),
-    "compress": _Rule("true or false", lambda value: isinstance(value, bool)),
-    "observation": _one_of("ids", "compact"),
-    "channels": _Rule("a list of texts", _list_of(_is_text, 1, 1000)),
-    "shape": _Rule("three integers from 1", _list_of(lambda one: _is_whole(one, 1, MAX_SIDE), 3, 3)),
-    "palette": _Rule(
-        "names by id", _mapping_of(_is_text, key=r"[0-9]|[1-9][0-9]|1[0-9]{2}|2[0-4][0-9]|25[0-5]")
-    ),
-    "action_nvec": _Rule(
-        "five integers from 1", _list_of(lambda one: _is_whole(one, 1, (1 << 15) - 1), 5, 5)
-    ),
-    "choices": _Rule("a list of texts", _list_of(_is_text, 1, 1000)),
-    "actions": _whole(1, 1_000_000),
-    "last_action": _one_of("truncates", "terminates"),
-}
-
-_ROW = {
-    "number": _whole(0, MAX_SHARDS - 1),
-    "sha256": _DIGEST,
-    "bytes": _whole(1, 2 * MAX_SHARD_BYTES),
-    "transitions": _whole(1, MAX_EPISODES),
 }
 
 
@@ -320,10 +317,10 @@ def _misfits(recipe: Recipe) -> list[str]:
 def _rows(recipe: Recipe, data: list[Any], problems: list[str]) -> list[ShardRow]:
     """The rows of shards, ascending; what is wrong is added to `problems`."""
     rows: dict[int, ShardRow] = {}
+    rules = _rules_of(ShardRow)
     for place, one in enumerate(data):
-        wrong = not isinstance(one, dict) or one.keys() != _ROW.keys()
-        wrong = wrong or not all(rule.holds(one[key]) for key, rule in _ROW.items())
-        if wrong:
+        fits = isinstance(one, dict) and one.keys() == rules.keys()
+        if not fits or not all(rule.holds(one[key]) for key, rule in rules.items()):
             problems.append(f"`shards[{place}]` needs number, sha256, bytes, transitions, and nothing else")
             continue
         row = ShardRow(**one)

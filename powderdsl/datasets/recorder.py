@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from powderdsl.datasets.dataset import Dataset
 from powderdsl.datasets.manifest import (
@@ -26,15 +27,14 @@ from powderdsl.datasets.manifest import (
     write_manifest,
 )
 from powderdsl.datasets.recipes import KINDS, check_count, recipe_of
-from powderdsl.datasets.scripted import SCRIPTED
-from powderdsl.datasets.shards import is_whole, write_shard
-from powderdsl.envs.acting import Policy, action_keys
+from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
+from powderdsl.envs.acting import Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs.folder import held
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram
-from powderdsl.tasks.task import Task
+from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
 
 Array = NDArray[Any]
 Progress = Callable[[float, int], None]
@@ -42,6 +42,34 @@ Progress = Callable[[float, int], None]
 
 PLAYING_BYTES = 1 << 30
 """Of the episodes that are being played, at most."""
+
+
+def nothing_policy(program: TaskProgram) -> Policy:
+    """The same action again and again, as `still_action` has it. Raises ValueError where there is none."""
+    action = torch.tensor(still_action(program.task), device=program.simulator.device)
+    return lambda observed, keys: action.expand(len(observed), 5)
+
+
+def still_action(task: Task) -> tuple[int, int, int, int, int]:
+    """The action ``nothing``; where agents have no such one but can blow, still air into the first bin.
+
+    Raises:
+        ValueError: the task has neither.
+    """
+    choices = task.agent.choices
+    choice = next((one for one in (NO_CHANGE, BLOW) if one in choices), None)
+    if choice is None:
+        raise ValueError(
+            f"the policy `nothing`: the agent of {task.name} may neither `blow` nor do `nothing`"
+        )
+    return 0, 0, choices.index(choice), 1, 1
+
+
+SCRIPTED: dict[str, Callable[[TaskProgram], Policy]] = {
+    "random": lambda program: random_policy(program.action_nvec),
+    "nothing": nothing_policy,
+}
+"""Policies that need no training, by name."""
 
 
 def record(
@@ -102,8 +130,8 @@ def record(
     act = SCRIPTED[policy](env.program) if isinstance(policy, str) else policy
     place = Path(folder)
     with _held(place):
-        manifest = _begun(place, recipe)
-        _play(env, act, sight, place, manifest, envs, progress or (lambda done, total: None))
+        recording = _Recording(env, act, sight, place, _begun(place, recipe))
+        recording.play(envs, progress or (lambda done, total: None))
     return Dataset.open(place)
 
 
@@ -145,130 +173,108 @@ def _begun(folder: Path, recipe: Recipe) -> Manifest:
 # Playing
 
 
-@dataclass(frozen=True)
-class _Tape:
-    """The episodes that are being played, a row each: arrays [slots, T, …], `observation` [slots, T + 1, …]."""
+class _Recording:
+    """Plays the episodes of all missing shards, in order, and writes each shard when its last episode ends.
 
-    observation: Array
-    action: Array
-    reward: Array
-    terminated: Array
-    truncated: Array
-    success: Array
-
-    def cut(self, slot: int, length: int) -> dict[str, Array]:
-        """A finished episode, in memory of its own."""
-        rows = {name: value[slot, :length].copy() for name, value in vars(self).items()}
-        rows["observation"] = self.observation[slot, : length + 1].copy()
-        return rows
-
-
-def _tape(slots: int, recipe: Recipe) -> _Tape:
-    size = (slots, recipe.actions)
-    flags = [np.zeros(size, bool) for _ in range(3)]
-    observation = np.empty((slots, recipe.actions + 1, *recipe.shape), np.uint8)
-    return _Tape(observation, np.empty((*size, 5), np.int16), np.empty(size, np.float32), *flags)
-
-
-def _play(
-    one: TensorEnv,
-    policy: Policy,
-    sight: Observation,
-    folder: Path,
-    manifest: Manifest,
-    envs: int,
-    progress: Progress,
-) -> None:
-    """Play the episodes of all shards that are missing, in order; each shard is written when its last one ends.
-
-    A slot whose episode is over takes the next one, so that all slots are busy until the end.
+    `env` has a number of slots. A slot whose episode is over takes the next one, so that all are busy until the end.
     """
-    recipe = manifest.recipe
-    there = {row.number for row in manifest.shards}
-    missing = [number for number in range(recipe.shards) if number not in there]
-    left = sum(len(recipe.episodes_of(number)) for number in missing)
-    done = recipe.episodes - left
-    progress(done, recipe.episodes)
-    if not left:
-        return
-    most = max(1, min(envs, PLAYING_BYTES // episode_bytes(recipe)))
-    slots = -(-left // -(-left // most))  # so few that the last round has as many as the first
-    env = TensorEnv(
-        one.program,
-        slots,
-        observation=recipe.observation,
-        worlds=recipe.worlds,
-        autoreset_mode="disabled",
-        last_action=recipe.last_action,
-        max_episode_steps=recipe.actions,
-    )
-    numbers = (episode for number in missing for episode in recipe.episodes_of(number))
-    unfinished = {number: len(recipe.episodes_of(number)) for number in missing}
-    episode = np.array([next(numbers) for _ in range(slots)], np.int64)
-    playing, taken = np.ones(slots, bool), np.zeros(slots, np.int64)
-    tape, device = _tape(slots, recipe), env.device
-    finished: dict[int, dict[str, Array]] = {}
-    observed, _ = env.reset(seed=0, options={"worlds": _worlds(recipe, episode)})
-    every = np.arange(slots)
-    tape.observation[every, 0] = observed.cpu().numpy()
-    while playing.any():
-        keys = action_keys(
-            recipe.seed,
-            torch.from_numpy(episode.copy()).to(device),
-            torch.from_numpy(taken.copy()).to(device),
+
+    def __init__(self, one: TensorEnv, policy: Policy, sight: Observation, folder: Path, manifest: Manifest):
+        self.recipe, self.manifest, self.folder = manifest.recipe, manifest, folder
+        self.one, self.policy, self.sight = one, policy, sight
+        recorded = {row.number for row in manifest.shards}
+        shards = [number for number in range(self.recipe.shards) if number not in recorded]
+        self.unfinished = {number: len(self.recipe.episodes_of(number)) for number in shards}
+        self.numbers = (episode for number in shards for episode in self.recipe.episodes_of(number))
+        self.finished: dict[int, dict[str, Array]] = {}
+
+    def play(self, envs: int, progress: Progress) -> None:
+        """Play with at most `envs` slots until all shards are written."""
+        recipe, left = self.recipe, sum(self.unfinished.values())
+        done = recipe.episodes - left
+        progress(done, recipe.episodes)
+        if not left:
+            return
+        most = max(1, min(envs, PLAYING_BYTES // episode_bytes(recipe)))
+        slots = -(-left // -(-left // most))  # the fewest that need no more rounds
+        self.env = TensorEnv(
+            self.one.program,
+            slots,
+            observation=recipe.observation,
+            worlds=recipe.worlds,
+            autoreset_mode="disabled",
+            last_action=recipe.last_action,
+            max_episode_steps=recipe.actions,
         )
-        assert env.episodes is not None
-        shown = observed if sight.kind == recipe.observation else sight.of(env.episodes.world)
-        with torch.no_grad():
-            actions = torch.as_tensor(policy(shown, keys))
-        observed, reward, terminated, truncated, info = env.step(actions)
-        tape.action[every, taken] = actions.cpu().numpy()
-        given = {
-            "reward": reward,
-            "terminated": terminated,
-            "truncated": truncated,
-            "success": info["success"],
+        self.episode = np.array([next(self.numbers) for _ in range(slots)], np.int64)
+        self.playing, self.taken = np.ones(slots, bool), np.zeros(slots, np.int64)
+        self.tape = {
+            name: np.empty((slots, recipe.actions + 1, *row_shape(recipe, name)), dtype)
+            for name, dtype in DTYPES.items()
+            if name not in ("length", "world")
         }
-        for name, value in given.items():
-            getattr(tape, name)[every, taken] = value.cpu().numpy()
-        taken += 1
-        tape.observation[every, taken] = observed.cpu().numpy()
-        ended = (terminated | truncated).cpu().numpy()
-        done += int((ended & playing).sum())
-        progress(done + float(taken[playing & ~ended].sum()) / recipe.actions, recipe.episodes)
-        if not ended.any():
-            continue
-        for slot in np.flatnonzero(ended & playing).tolist():
-            number = int(episode[slot]) // recipe.shard
-            finished[int(episode[slot])] = tape.cut(slot, int(taken[slot]))
-            unfinished[number] -= 1
-            if not unfinished[number]:
-                manifest = _write(folder, manifest, number, finished)
-            following = next(numbers, None)
+        observed, _ = self.env.reset(seed=0, options={"worlds": _worlds(recipe, self.episode)})
+        self.tape["observation"][:, 0] = observed.cpu().numpy()
+        while self.playing.any():
+            observed, ended = self.act(observed)
+            done += int((ended & self.playing).sum())
+            under_way = self.taken[self.playing & ~ended].sum()
+            progress(done + float(under_way) / recipe.actions, recipe.episodes)
+            if ended.any():
+                observed = self.end(ended, observed)
+
+    def act(self, observed: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
+        """Take an action in every slot and keep what came of it: the next observations, and which episodes ended."""
+        env, tape, every = self.env, self.tape, np.arange(len(self.taken))
+        episode, taken = (torch.from_numpy(one.copy()).to(env.device) for one in (self.episode, self.taken))
+        assert env.episodes is not None
+        shown = observed if self.sight.kind == self.recipe.observation else self.sight.of(env.episodes.world)
+        with torch.no_grad():
+            actions = torch.as_tensor(self.policy(shown, action_keys(self.recipe.seed, episode, taken)))
+        observed, reward, terminated, truncated, info = env.step(actions)
+        given = {"action": actions, "reward": reward, "terminated": terminated, "truncated": truncated}
+        for name, value in {**given, "success": info["success"]}.items():
+            tape[name][every, self.taken] = value.cpu().numpy()
+        self.taken += 1
+        tape["observation"][every, self.taken] = observed.cpu().numpy()
+        return observed, (terminated | truncated).cpu().numpy()
+
+    def end(self, ended: NDArray[np.bool_], observed: Tensor) -> Tensor:
+        """Keep the episodes that ended and begin the next ones: the observations after that."""
+        for slot in np.flatnonzero(ended & self.playing).tolist():
+            episode, length = int(self.episode[slot]), int(self.taken[slot])
+            self.finished[episode] = {
+                name: rows[slot, : length + (name == "observation")].copy()
+                for name, rows in self.tape.items()
+            }
+            shard = episode // self.recipe.shard
+            self.unfinished[shard] -= 1
+            if not self.unfinished[shard]:
+                self.write(shard)
+            following = next(self.numbers, None)
             # A slot without a next episode plays its last one again, for nothing.
-            playing[slot] = following is not None
-            episode[slot] = episode[slot] if following is None else following
-        taken[ended] = 0
-        if playing.any():
-            options = {"worlds": _worlds(recipe, episode), "reset_mask": torch.from_numpy(ended.copy())}
-            observed, _ = env.reset(options=options)
-            tape.observation[ended, 0] = observed.cpu().numpy()[ended]
+            self.playing[slot] = following is not None
+            self.episode[slot] = episode if following is None else following
+        self.taken[ended] = 0
+        if self.playing.any():
+            worlds = _worlds(self.recipe, self.episode)
+            options = {"worlds": worlds, "reset_mask": torch.from_numpy(ended.copy())}
+            observed, _ = self.env.reset(options=options)
+            self.tape["observation"][ended, 0] = observed.cpu().numpy()[ended]
+        return observed
+
+    def write(self, number: int) -> None:
+        """Write a shard of finished episodes, which are dropped, and the manifest that has it."""
+        numbers = self.recipe.episodes_of(number)
+        episodes = [self.finished.pop(episode) for episode in numbers]
+        parts = {name: [one[name] for one in episodes] for name in episodes[0]}
+        parts["length"] = [np.array([len(one) for one in parts["action"]])]
+        parts["world"] = [_worlds(self.recipe, np.array(numbers, np.int64))]
+        row = write_shard(self.folder, number, parts, compress=self.recipe.compress)
+        rows = sorted((*self.manifest.shards, row), key=lambda one: one.number)
+        self.manifest = replace(self.manifest, shards=tuple(rows))
+        write_manifest(self.folder, self.manifest)
 
 
 def _worlds(recipe: Recipe, episode: Array) -> Array:
     return np.asarray((recipe.seed + episode) % recipe.worlds)
-
-
-def _write(folder: Path, manifest: Manifest, number: int, finished: dict[int, dict[str, Array]]) -> Manifest:
-    """Write a shard of finished episodes, which are dropped, and the manifest that has it."""
-    recipe = manifest.recipe
-    numbers = recipe.episodes_of(number)
-    episodes = [finished.pop(episode) for episode in numbers]
-    parts = {name: [one[name] for one in episodes] for name in episodes[0]}
-    parts["length"] = [np.array([len(one) for one in parts["action"]])]
-    parts["world"] = [_worlds(recipe, np.array(numbers, np.int64))]
-    row = write_shard(folder, number, parts, compress=recipe.compress)
-    rows = sorted((*manifest.shards, row), key=lambda one: one.number)
-    manifest = replace(manifest, shards=tuple(rows))
-    write_manifest(folder, manifest)
-    return manifest

@@ -39,17 +39,16 @@ LEVEL = 1
 """Of deflate. Higher levels take three to five times as long for a quarter less."""
 
 
+def row_shape(recipe: Recipe, name: str) -> tuple[int, ...]:
+    """The shape of a row of an array."""
+    return {"observation": recipe.shape, "action": (5,)}.get(name, ())
+
+
 def shapes(recipe: Recipe, number: int, transitions: int) -> dict[str, tuple[int, ...]]:
-    """What shapes the arrays of a shard have."""
+    """The shapes of a shard's arrays."""
     episodes = len(recipe.episodes_of(number))
-    flat = dict.fromkeys(("reward", "terminated", "truncated", "success"), (transitions,))
-    return {
-        "observation": (transitions + episodes, *recipe.shape),
-        "action": (transitions, 5),
-        **flat,
-        "length": (episodes,),
-        "world": (episodes,),
-    }
+    rows = {"observation": transitions + episodes, "length": episodes, "world": episodes}
+    return {name: (rows.get(name, transitions), *row_shape(recipe, name)) for name in DTYPES}
 
 
 def write_shard(
@@ -129,20 +128,18 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
         shard = _read(path, shapes(recipe, row.number, row.transitions))
         _check_episodes(shard.arrays, recipe)
     except _Wrong as error:
-        raise _bad_shard(path, str(error)) from None
+        reason = str(error)
     except OSError as error:
-        raise _bad_shard(path, error.strerror or str(error)) from None
+        reason = error.strerror or str(error)
     except Exception as error:  # a damaged archive raises whatever its codec likes
-        raise _bad_shard(path, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
-    return shard
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+    else:
+        return shard
+    raise damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it again")
 
 
 class _Wrong(Exception):
     """What is wrong with a shard."""
-
-
-def _bad_shard(path: Path, reason: str) -> Exception:
-    return damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it again")
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]]) -> Shard:

@@ -183,7 +183,7 @@ def _checked(
     if found is not None and policy == "nothing":
         with mistakes.collected():
             _require_gymnasium()
-            from powderdsl.datasets.scripted import still_action
+            from powderdsl.datasets.recorder import still_action
 
             still_action(found)
     return None if mistakes.report() else found
