@@ -217,7 +217,8 @@ def read_manifest(folder: Path) -> Manifest:
         )
     problems = [f"`{key}` must be {rule.says}" for key, rule in _TOP.items() if not rule.holds(data.get(key))]
     recipe, rules = data.get("recipe"), _rules_of(Recipe)
-    if recipe and isinstance(recipe, dict):
+    recipe = recipe if isinstance(recipe, dict) else {}
+    if recipe:
         problems += [
             f"`recipe.{key}` must be {rule.says}, found {_short(recipe.get(key))}"
             for key, rule in rules.items()
