@@ -12,7 +12,6 @@ from torch import Tensor
 from powderdsl.compiler import load
 from powderdsl.diagnostics import suggest
 from powderdsl.model.composition.palette import Palette
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.system.settings import check_bounds, setting
@@ -20,7 +19,7 @@ from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.worldmodel.rulesets import MAX_RULESETS, RulesetSource, VariedWorlds, Variety
-from powderdsl.worldmodel.watched import Watched, watched
+from powderdsl.worldmodel.watched import SplitWorlds, Watched, watched
 
 TEST_SEEDS = 1 << 32
 """The first seed of worlds that models are tested on. Training takes seeds below it."""
@@ -83,9 +82,8 @@ class Worlds(Protocol):
     rules: Ruleset
     """Has all elements that worlds hold."""
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Rows and columns."""
+    size: tuple[int, int]
+    """Rows and columns."""
 
     def start(self, seeds: Tensor) -> Any:
         """The worlds of seeds, int64 [B], as something that `HasIds`."""
@@ -94,31 +92,12 @@ class Worlds(Protocol):
         """The worlds some steps later; `world` stays as it was."""
 
 
-class TaskWorlds:
+class TaskWorlds(SplitWorlds):
     """The worlds of a task's split under some rules. Made by `task_worlds`."""
 
     def __init__(self, program: TaskProgram, found: Watched):
-        self.program, self.found = program, found
-        self.rules: Ruleset = program.simulator.ruleset
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.program.task.size
-
-    @property
-    def device(self) -> torch.device:
-        """Where worlds are run."""
-        return self.program.simulator.device
-
-    @property
-    def fingerprint(self) -> str:
-        """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
-        return fingerprint(self.program.task.splits)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the variants: seed s gives variant s mod their number."""
-        return self.found.names
+        super().__init__(found, program.simulator.device)
+        self.program = program
 
     def start(self, seeds: Tensor) -> World:
         """The worlds of seeds, int64 [B]."""
@@ -152,31 +131,17 @@ def task_worlds(
     task = load_task(config.task, knobs=config.knobs, params=config.params if own else None, palette=palette)
     check_split(task, config.split)
     rules = task.ruleset if own else load(config.rules, params=config.params, palette=palette)
-    _check_packs(config.only, rules)
+    for pack in config.only:
+        if pack not in rules.packs:
+            helps = tuple(suggest(pack, rules.packs, "packs"))
+            raise failure("PD304", f"the rules {rules.name} have no pack `{pack}`", helps=helps)
+    machine: dict[str, Any] = {"backend": backend, "device": device, "threads": threads}
     if config.rulesets:
         source = RulesetSource(config.rules or task.rules, config.variety, config.params, palette)
-        return VariedWorlds(
-            task,
-            config.split,
-            source,
-            config.rulesets,
-            first=config.first_ruleset,
-            only=config.only,
-            backend=backend,
-            device=device,
-            threads=threads,
-        )
+        first, only = config.first_ruleset, config.only
+        return VariedWorlds(task, config.split, source, config.rulesets, first=first, only=only, **machine)
     found = watched(task, config.split, rules, config.only, partly=partly)
-    program = compile_task(found.task, split=config.split, backend=backend, device=device, threads=threads)
-    return TaskWorlds(program, found)
-
-
-def _check_packs(packs: tuple[str, ...], rules: Ruleset) -> None:
-    """Raises CompileError (PD304) for packs that the rules do not have."""
-    for pack in packs:
-        if pack not in rules.packs:
-            helps = suggest(pack, rules.packs, "packs")
-            raise failure("PD304", f"the rules {rules.name} have no pack `{pack}`", helps=tuple(helps))
+    return TaskWorlds(compile_task(found.task, split=config.split, **machine), found)
 
 
 def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[Pairs]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import torch
@@ -15,15 +16,14 @@ from powderdsl.compiler import read, set_params, starting_backend
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
 from powderdsl.model.composition.palette import Palette
-from powderdsl.model.declarations import PackDecl
-from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.declarations import ElementDecl, PackDecl
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.task import Task
-from powderdsl.worldmodel.watched import Watched, watched
+from powderdsl.worldmodel.watched import SplitWorlds, watched
 
 TRIES = 8
 """How often a swap or a selection of packs is drawn again where the rules would contradict themselves."""
@@ -162,20 +162,8 @@ class RulesetSource:
         """For each property, two elements that say different things about it."""
         found = []
         for prop in self.variety.swaps:
-            written = {
-                element.name.text: syntax
-                for pack in self.packs
-                if pack.name.text not in left_out
-                for element in pack.elements
-                for name, syntax in element.values
-                if name.text == prop
-            }
-            pairs = [
-                (one, other)
-                for number, one in enumerate(written)
-                for other in list(written)[number + 1 :]
-                if written[one] != written[other]
-            ]
+            written = _written((pack for pack in self.packs if pack.name.text not in left_out), prop)
+            pairs = [pair for pair in combinations(written, 2) if written[pair[0]] != written[pair[1]]]
             if pairs:
                 found.append((prop, *pairs[int(next(draws) * len(pairs))]))
         return tuple(found)
@@ -195,25 +183,28 @@ class RulesetSource:
 
 
 @dataclass(frozen=True)
-class MixedWorld:
-    """Worlds of several rulesets: parts by structure, and where their worlds stand in the batch."""
+class MixedPart:
+    """Worlds of one structure: where they stand in the batch, and their chances, float64 [worlds] by parameter."""
 
-    parts: Mapping[tuple[Any, ...], World]
-    places: Mapping[tuple[Any, ...], Tensor]
-    params: Mapping[tuple[Any, ...], Mapping[str, Tensor]]
+    world: World
+    places: Tensor
+    params: Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class MixedWorld:
+    """A batch of worlds of several rulesets."""
+
+    parts: tuple[MixedPart, ...]
 
     @property
     def ids(self) -> Tensor:
         """Element ids, uint8 [B, H, W]."""
-        first = next(iter(self.parts.values())).ids
-        many = sum(len(place) for place in self.places.values())
-        found = torch.empty((many, *first.shape[1:]), dtype=first.dtype, device=first.device)
-        for key, world in self.parts.items():
-            found[self.places[key]] = world.ids
-        return found
+        order = torch.cat([part.places for part in self.parts]).argsort()
+        return torch.cat([part.world.ids for part in self.parts])[order]
 
 
-class VariedWorlds:
+class VariedWorlds(SplitWorlds):
     """The worlds of a task's split, each under a ruleset of its own: world s under ruleset `first` + s mod `count`.
 
     Rulesets of one structure are compiled once and run together; their chances are parameters of each world.
@@ -240,36 +231,15 @@ class VariedWorlds:
         device: str = "cpu",
         threads: int = 1,
     ):
-        self.source, self.split, self.only = source, split, only
+        super().__init__(watched(task, split, source.base, only), torch.device(device))
+        self.source, self.split, self.only, self._task = source, split, only, task
         self.drawn = [source.draw(first + number) for number in range(count)]
-        self.rules = source.base
-        self._task = task
         self._machine: dict[str, Any] = {
             "backend": starting_backend(device) if backend == "auto" else backend,
             "device": device,
             "threads": threads,
         }
-        self.found: Watched = watched(task, split, source.base, only)
         self._programs: dict[tuple[Any, ...], TaskProgram] = {}
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self._task.size
-
-    @property
-    def device(self) -> torch.device:
-        """Where worlds are run."""
-        return torch.device(self._machine["device"])
-
-    @property
-    def fingerprint(self) -> str:
-        """A name for how these worlds start, as `TaskWorlds.fingerprint`."""
-        return fingerprint(self.found.task.splits)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the variants: seed s gives variant s mod their number."""
-        return self.found.names
 
     def start(self, seeds: Tensor) -> MixedWorld:
         """The worlds of seeds, int64 [B]."""
@@ -277,26 +247,25 @@ class VariedWorlds:
         chosen = [self.drawn[seed % len(self.drawn)] for seed in seeds.tolist()]
         for number, one in enumerate(chosen):
             groups.setdefault(one.structure, []).append(number)
-        parts, places, params = {}, {}, {}
-        for key, members in groups.items():
-            place = torch.tensor(members, device=seeds.device)
-            program = self._program(chosen[members[0]])
-            parts[key] = program.start(seeds[place]).world
-            places[key] = place
+        parts = []
+        for members in groups.values():
+            places = torch.tensor(members, device=seeds.device)
+            world = self._program(chosen[members[0]]).start(seeds[places]).world
             values = [dict(chosen[member].params) for member in members]
-            params[key] = {
+            params = {
                 name: torch.tensor([one[name] for one in values], dtype=torch.float64, device=seeds.device)
                 for name in values[0]
             }
-        return MixedWorld(parts, places, params)
+            parts.append(MixedPart(world, places, params))
+        return MixedWorld(tuple(parts))
 
     def later(self, world: MixedWorld, steps: int) -> MixedWorld:
         """The worlds some steps later."""
-        parts = {
-            key: self._programs[key].simulator.step(part, steps, params=world.params[key])
-            for key, part in world.parts.items()
-        }
-        return replace(world, parts=parts)
+        later = [
+            replace(part, world=part.world.sim.step(part.world, steps, params=part.params))
+            for part in world.parts
+        ]
+        return MixedWorld(tuple(later))
 
     def _program(self, drawn: Drawn) -> TaskProgram:
         if drawn.structure not in self._programs:
@@ -315,29 +284,27 @@ def _draws(number: int) -> Iterator[float]:
         count += 1
 
 
-def _exchanged(packs: Sequence[PackDecl], prop: str, one: str, other: str) -> list[PackDecl]:
-    """Packs in which two elements have exchanged what they say about a property."""
-    said = {
+def _written(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
+    """What elements say about a property, as syntax by name."""
+    return {
         element.name.text: syntax
         for pack in packs
         for element in pack.elements
         for name, syntax in element.values
         if name.text == prop
     }
-    partner = {one: other, other: one}
-    found = []
-    for pack in packs:
-        elements = tuple(
-            replace(
-                element,
-                values=tuple(
-                    (name, said[partner[element.name.text]])
-                    if name.text == prop and element.name.text in partner
-                    else (name, syntax)
-                    for name, syntax in element.values
-                ),
-            )
-            for element in pack.elements
+
+
+def _exchanged(packs: Sequence[PackDecl], prop: str, one: str, other: str) -> list[PackDecl]:
+    """Packs in which two elements have exchanged what they say about a property."""
+    written = _written(packs, prop)
+    new = {one: written[other], other: written[one]}
+
+    def exchanged(element: ElementDecl) -> ElementDecl:
+        values = tuple(
+            (name, new.get(element.name.text, syntax) if name.text == prop else syntax)
+            for name, syntax in element.values
         )
-        found.append(replace(pack, elements=elements))
-    return found
+        return replace(element, values=values)
+
+    return [replace(pack, elements=tuple(map(exchanged, pack.elements))) for pack in packs]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import reduce
+from operator import add
+from typing import Any, TypedDict, Unpack
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from powderdsl.worldmodel.pairs import Pairs, TaskWorlds, pairs_of, task_worlds, unseen_seeds
+from powderdsl.worldmodel.pairs import DataConfig, Pairs, TaskWorlds, pairs_of, task_worlds, unseen_seeds
 from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, VariedWorlds
 from powderdsl.worldmodel.training import HERE, Machine, Network, Trained, check_palette, load_rules_of
 
@@ -35,6 +37,11 @@ class Score:
     @property
     def cells(self) -> int:
         return int(self.confusion.sum())
+
+    def plain(self) -> dict[str, float | int | None]:
+        """For JSON."""
+        names = ("loss", "accuracy", "changed_accuracy", "cells", "changed")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def loss(self) -> float:
@@ -75,10 +82,9 @@ def _score(predict: Network, starts: Tensor, ends: Tensor, slots: int) -> Score:
     truth = ends.long()
     loss = F.cross_entropy(logits, truth, reduction="none").double().sum()
     predicted = logits.argmax(1)
-    confusion = torch.bincount((truth * slots + predicted).flatten(), minlength=slots * slots)
     changed = starts != ends
     right = (predicted == truth) & changed
-    return Score(float(loss), confusion.view(slots, slots).cpu(), int(changed.sum()), int(right.sum()))
+    return Score(float(loss), _counts(truth, predicted, slots), int(changed.sum()), int(right.sum()))
 
 
 class Table:
@@ -98,9 +104,14 @@ def outcomes(pairs: Iterable[Pairs], slots: int) -> Tensor:
     """How many cells went from each element to each: int64 [slots, slots]."""
     counts = torch.zeros(slots, slots, dtype=torch.int64)
     for starts, ends in pairs:
-        both = (starts.long() * slots + ends.long()).flatten()
-        counts += torch.bincount(both, minlength=slots * slots).view(slots, slots).cpu()
+        counts += _counts(starts.long(), ends.long(), slots)
     return counts
+
+
+def _counts(rows: Tensor, columns: Tensor, slots: int) -> Tensor:
+    """How often each pair of numbers below `slots` occurs: int64 [slots, slots]."""
+    both = (rows * slots + columns).flatten()
+    return torch.bincount(both, minlength=slots * slots).view(slots, slots).cpu()
 
 
 def still(counts: Tensor, ids: Sequence[int]) -> Table:
@@ -146,7 +157,7 @@ class Tested:
     def plain(self) -> dict[str, Any]:
         """For JSON."""
         names = [MODEL, STILL, FREQUENT]
-        whole = {name: _sum([one[name] for one in self.scores.values()]) for name in names}
+        whole = {name: reduce(add, [one[name] for one in self.scores.values()]) for name in names}
         return {
             "rules": self.rules,
             "task": self.task,
@@ -154,33 +165,33 @@ class Tested:
             "only": list(self.only),
             "worlds_each": self.worlds,
             "iterations": self.step,
-            "mean": {name: {**_numbers(whole[name]), "loss": self.mean(name)} for name in names},
-            "tests": {
-                test: {name: _numbers(one[name]) for name in names} for test, one in self.scores.items()
-            },
+            "mean": {name: {**whole[name].plain(), "loss": self.mean(name)} for name in names},
+            "tests": {test: {name: one[name].plain() for name in names} for test, one in self.scores.items()},
             "elements": elements_of(whole[MODEL], self.palette),
             "left_out": {name: list(lacking) for name, lacking in self.missing.items()},
         }
 
 
+class TestedOn(TypedDict, total=False):
+    """What a network is tested on: see `evaluate`."""
+
+    task: str | None
+    split: str
+    rules: str | None
+    only: tuple[str, ...] | None
+    knobs: Mapping[str, int] | None
+    rulesets: int
+
+
 def evaluate(
-    trained: Trained,
-    *,
-    task: str | None = None,
-    split: str = "designed",
-    rules: str | None = None,
-    only: tuple[str, ...] | None = None,
-    knobs: Mapping[str, int] | None = None,
-    worlds: int | None = None,
-    rulesets: int = 0,
-    machine: Machine = HERE,
+    trained: Trained, *, worlds: int | None = None, machine: Machine = HERE, **tested_on: Unpack[TestedOn]
 ) -> Tested:
     """Test a network beside both baselines, on worlds that no training takes.
 
     Args:
-        task, rules: those of the training data unless others are given.
-        only, knobs: likewise; knobs are only those of the training data where the task is.
         worlds: worlds of a split, or random futures of each of its stands; 32 and 4 unless said otherwise.
+        split: ``designed`` unless another is given.
+        task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
         rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
             which training takes. 0: the rules as they are.
 
@@ -188,17 +199,8 @@ def evaluate(
         CompileError: as `task_worlds`; PD623 if the rules have elements that the network has no slots for.
     """
     fit = _counted(trained, machine)
-    found = unseen_worlds(
-        trained,
-        task=task,
-        split=split,
-        rules=rules,
-        only=only,
-        knobs=knobs,
-        rulesets=rulesets,
-        machine=machine,
-    )
-    data = trained.config.data
+    data = _data_of(trained, **tested_on)
+    found = _worlds_of(trained, data, machine)
     slots, names = len(trained.palette), found.names
     ids = [element.id for element in found.rules.elements]
     predictors: dict[str, Network] = {
@@ -208,41 +210,44 @@ def evaluate(
     }
     many = worlds or (4 if len(names) > 1 else 32)
     scores = {}
-    for number, name in enumerate(names):
-        seeds = unseen_seeds(many, len(names)).view(len(names), many)[number]
+    for name, seeds in zip(names, unseen_seeds(many, len(names)).view(len(names), many), strict=True):
         pairs = list(pairs_of(found, seeds.to(machine.device), data.steps, data.pairs))
         scores[name] = {who: score(predict, pairs, slots) for who, predict in predictors.items()}
-    missing = {name: lacking for name, lacking, _ in found.found.missing}
     return Tested(
-        found.rules.name,
-        task or data.task,
-        split,
-        data.only if only is None else only,
-        many,
-        scores,
-        missing,
-        trained.palette,
-        trained.checkpoint.step,
+        rules=found.rules.name,
+        task=data.task,
+        split=data.split,
+        only=data.only,
+        worlds=many,
+        scores=scores,
+        missing={name: lacking for name, lacking, _ in found.found.missing},
+        palette=trained.palette,
+        step=trained.checkpoint.step,
     )
 
 
 def unseen_worlds(
+    trained: Trained, *, machine: Machine = HERE, **tested_on: Unpack[TestedOn]
+) -> TaskWorlds | VariedWorlds:
+    """The worlds that `evaluate` tests on, which has the same arguments and errors.
+
+    Worlds that the rules cannot have are left out, as long as others remain.
+    """
+    return _worlds_of(trained, _data_of(trained, **tested_on), machine)
+
+
+def _data_of(
     trained: Trained,
-    *,
     task: str | None = None,
     split: str = "designed",
     rules: str | None = None,
     only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
     rulesets: int = 0,
-    machine: Machine = HERE,
-) -> TaskWorlds | VariedWorlds:
-    """The worlds that `evaluate` tests on, which says what the arguments are and what is raised.
-
-    Worlds that the rules cannot have are left out, as long as others remain.
-    """
+) -> DataConfig:
+    """The training data's configuration with what is given in its place."""
     data = trained.config.data
-    tested_on = replace(
+    return replace(
         data,
         task=task or data.task,
         split=split,
@@ -253,27 +258,17 @@ def unseen_worlds(
         rulesets=rulesets,
         first_ruleset=UNSEEN_RULESETS,
     )
-    check_palette(trained.run.path, trained.palette, load_rules_of(tested_on, trained.palette))
-    return task_worlds(
-        tested_on,
-        device=machine.device,
-        threads=machine.threads,
-        backend=machine.backend,
-        partly=True,
-        palette=trained.palette,
-    )
+
+
+def _worlds_of(trained: Trained, data: DataConfig, machine: Machine) -> TaskWorlds | VariedWorlds:
+    check_palette(trained.run.path, trained.palette, load_rules_of(data, trained.palette))
+    return task_worlds(data, **machine.simulation, partly=True, palette=trained.palette)
 
 
 def _counted(trained: Trained, machine: Machine) -> Tensor:
     """Outcomes of some of the run's training worlds."""
     data = trained.config.data
-    found = task_worlds(
-        data,
-        device=machine.device,
-        threads=machine.threads,
-        backend=machine.backend,
-        palette=trained.palette,
-    )
+    found = task_worlds(data, **machine.simulation, palette=trained.palette)
     seeds = torch.arange(min(FIT_WORLDS, data.states), device=machine.device)
     return outcomes(pairs_of(found, seeds, data.steps, data.pairs), len(trained.palette))
 
@@ -292,20 +287,3 @@ def elements_of(found: Score, palette: tuple[str | None, ...]) -> dict[str, dict
                 "precision": right / predicted if predicted else None,
             }
     return table
-
-
-def _numbers(one: Score) -> dict[str, float | int | None]:
-    return {
-        "loss": one.loss,
-        "accuracy": one.accuracy,
-        "changed_accuracy": one.changed_accuracy,
-        "cells": one.cells,
-        "changed": one.changed,
-    }
-
-
-def _sum(scores: list[Score]) -> Score:
-    total = scores[0]
-    for one in scores[1:]:
-        total = total + one
-    return total

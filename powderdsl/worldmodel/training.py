@@ -96,6 +96,11 @@ class Machine:
     store: str = "auto"
     compiled: bool = False
 
+    @property
+    def simulation(self) -> dict[str, Any]:
+        """What `task_worlds` is given of it."""
+        return {"device": self.device, "threads": self.threads, "backend": self.backend}
+
 
 HERE = Machine()
 """One thread of this CPU."""
@@ -146,13 +151,7 @@ def train(
     """
     palette = _palette_for(config, Path(folder), worlds)
     if worlds is None:
-        found = task_worlds(
-            config.data,
-            device=machine.device,
-            threads=machine.threads,
-            backend=machine.backend,
-            palette=palette,
-        )
+        found = task_worlds(config.data, **machine.simulation, palette=palette)
         worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
     check_palette(Path(folder), palette, worlds.rules)
     plain = {

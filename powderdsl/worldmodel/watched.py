@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from powderdsl.diagnostics import CompileError, Reporter, Span
+from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.task import NO_CHANGE, Drawing, Generator, Goal, Group, Split, Stamp, Task
 
@@ -23,10 +26,24 @@ class Watched:
     task: Task
     missing: tuple[tuple[str, tuple[str, ...], Span | None], ...]
 
+
+class SplitWorlds:
+    """What is known of the worlds of a task's split under some rules before any of them starts."""
+
+    def __init__(self, found: Watched, device: torch.device):
+        self.found = found
+        self.rules: Ruleset = found.task.ruleset
+        self.size = found.task.size
+        """Rows and columns."""
+        self.names = tuple(variant.name for variant in found.task.splits[0].variants)
+        """The names of the variants: seed s gives variant s mod their number."""
+        self.device = device
+        """Where worlds are run."""
+
     @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the split's variants."""
-        return tuple(variant.name for variant in self.task.splits[0].variants)
+    def fingerprint(self) -> str:
+        """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
+        return fingerprint(self.found.task.splits)
 
 
 def watched(

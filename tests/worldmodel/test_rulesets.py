@@ -106,7 +106,7 @@ def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[n
         world = worlds.start(torch.tensor([seed]))
         assert torch.equal(world.ids[0], start.ids[place])
         # The same start under this ruleset alone, with its chances as defaults.
-        part = next(iter(world.parts.values()))
+        part = world.parts[0].world
         own = alone.world(part.ids, part.seed, index=part.index)
         assert torch.equal(alone.step(own, 16).ids[0], end.ids[place])
 
