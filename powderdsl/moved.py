@@ -12,6 +12,8 @@ MOVED = {
     # old name below powderdsl: new one. What lies in a package has moved along.
     "bench": "experiments.bench",
     "draw": "simulation.draw",
+    "envs.single": "envs.gym",
+    "envs.vector": "envs.gym",
     "ledgers": "analysis.ledger",
     "media": "simulation.media",
     "observe": "simulation.observe",

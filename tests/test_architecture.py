@@ -288,7 +288,7 @@ def test_every_module_keeps(rule: Callable[[str, str], Iterable[str]], sources: 
         (layer_faults, "syntax.parse", "def late():\n    from powderdsl.model import x", "syntax.parse:2"),
         (layer_faults, "model.read", "if TYPE_CHECKING:\n    import powderdsl.ir", "model.read:2"),
         (layer_faults, "model.read", "import_module('powderdsl.ir')", "model.read:1"),
-        (layer_faults, "envs.vector", "import powderdsl.rl.policies", "may not import"),
+        (layer_faults, "envs.gym", "import powderdsl.rl.policies", "may not import"),
         (layer_faults, "simulation.leftover", "import powderdsl.model", "may not import"),
         (layer_faults, "model.read", "from powderdsl import load", "imports from powderdsl itself"),
         (layer_faults, "model.read", "import powderdsl", "imports from powderdsl itself"),

@@ -1,37 +1,45 @@
 """Tasks as environments for reinforcement learning. Importing this registers the shipped ones with Gymnasium.
 
 `TensorEnv` takes and gives tensors; `PowderVectorEnv` and `PowderEnv` are its faces for Gymnasium, and
-`powderdsl.envs.sb3.PowderVecEnv` for Stable-Baselines3.
+`powderdsl.envs.sb3.PowderVecEnv` for Stable-Baselines3. Registering needs no torch: names are imported when first used.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.envs.register import register_tasks
+import gymnasium
+
+from powderdsl.tasks.shipped import shipped_tasks
 
 if TYPE_CHECKING:
     from powderdsl.envs.goal_env import GoalEnv
-    from powderdsl.envs.single import PowderEnv
+    from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
     from powderdsl.envs.tensor_env import TensorEnv
-    from powderdsl.envs.vector import PowderVectorEnv
 
 __all__ = ["GoalEnv", "PowderEnv", "PowderVectorEnv", "TensorEnv"]
 
-_HOMES = {
-    "GoalEnv": "goal_env",
-    "PowderEnv": "single",
-    "PowderVectorEnv": "vector",
-    "TensorEnv": "tensor_env",
-}
+_HOMES = {"GoalEnv": "goal_env", "PowderEnv": "gym", "PowderVectorEnv": "gym", "TensorEnv": "tensor_env"}
 
-register_tasks()
+
+def env_id(task: str) -> str:
+    """The id of a shipped task: ``some-task`` becomes ``powderdsl/SomeTask-v0``."""
+    return f"powderdsl/{''.join(part.capitalize() for part in task.split('-'))}-v0"
+
+
+for _task in shipped_tasks():
+    if env_id(_task) not in gymnasium.registry:
+        # Episodes end by themselves: no limit is set on them.
+        gymnasium.register(
+            env_id(_task),
+            entry_point="powderdsl.envs.gym:PowderEnv",
+            vector_entry_point="powderdsl.envs.gym:PowderVectorEnv",
+            kwargs={"task": _task},
+        )
 
 
 def __getattr__(name: str) -> Any:
-    """Public names are imported when first used: registering needs no torch."""
     if name not in _HOMES:
         raise AttributeError(f"module 'powderdsl.envs' has no attribute {name!r}")
-    from importlib import import_module
-
     return getattr(import_module(f"powderdsl.envs.{_HOMES[name]}"), name)

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from powderdsl.envs.single import PowderEnv
+from powderdsl.envs.gym import PowderEnv
 
 Array = NDArray[Any]
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from powderdsl.envs.frames import check_render_mode, frames
+from powderdsl.envs.gym import array, check_render_mode, frames
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.envs.vector import array
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 

@@ -22,6 +22,9 @@ Info = dict[str, Any]
 """Of tensors [B]; where a key says something of some worlds only, ``_key``, bool [B], says of which."""
 
 OPTIONS = ("params", "worlds", "reset_mask")
+ROWS = ("base", "episode", "returned", "ended")
+"""Attributes, with `_` before them, that `TensorEnv.state` saves: a number for each slot."""
+
 LAST_ACTIONS = ("auto", "truncates", "terminates")
 
 
@@ -104,7 +107,7 @@ class TensorEnv:
         self.params: dict[str, Tensor] = {}
         """Parameters that `reset` has set: float64 [B] each."""
         self._base: Tensor | None = None
-        self._episode = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
+        self._episode = torch.full((num_envs,), -1, dtype=torch.int64, device=self.device)
         self._returned = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
         self._ended = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
 
@@ -140,26 +143,20 @@ class TensorEnv:
         base, seeded = self._bases(seed)
         params = self._new_params(given.get("params"), mask)
         episode = torch.where(mask, torch.where(seeded, 0, self._episode + 1), self._episode)
-        if self._base is None:
-            episode = torch.zeros_like(episode)
-        base = torch.where(mask, base, base if self._base is None else self._base)
+        if self._base is not None:
+            base = torch.where(mask, base, self._base)
         worlds = world_seeds(base, episode, self.worlds)
         if "worlds" in given:
             worlds = self._numbers(given["worlds"], "worlds")
         if self.episodes is None:
             self.episodes = self.program.start(worlds)
         else:
-            places = mask.nonzero()[:, 0]
-            self.episodes = self.program.put(
-                self.episodes, places, self.program.start(worlds[places]), reuse=True
-            )
+            self.episodes = self.program.restart(self.episodes, mask, worlds, reuse=True)
         self._base, self._episode, self.params = base, episode, params
         self._returned = self._returned.masked_fill(mask, 0)
         self._ended = self._ended & ~mask
-        return self.observation.of(self.episodes.world), {
-            "world": self.episodes.seed.clone(),
-            "_world": mask.clone(),
-        }
+        info = {"world": self.episodes.seed.clone(), "_world": mask.clone()}
+        return self.observation.of(self.episodes.world), info
 
     def _bases(self, seed: Any) -> tuple[Tensor, Tensor]:
         """The seed of each slot, and whether it is a new one."""
@@ -169,7 +166,7 @@ class TensorEnv:
             old = torch.arange(first, first + self.num_envs, device=self.device)
         if seed is None:
             return old, torch.zeros_like(self._ended)
-        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+        if _is_integer(seed):
             seeds: list[int | None] = [int(seed) + i for i in range(self.num_envs)]
         elif isinstance(seed, Sequence) and not isinstance(seed, str):
             seeds = list(seed)
@@ -178,7 +175,7 @@ class TensorEnv:
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
         for one in seeds:
-            if one is not None and (isinstance(one, bool) or not isinstance(one, int | np.integer)):
+            if one is not None and not _is_integer(one):
                 raise TypeError(f"a seed is an integer, found {one!r}")
             if one is not None and not 0 <= one < 1 << 62:
                 raise ValueError(f"a seed lies in 0..2⁶²−1, found {one}")
@@ -231,14 +228,8 @@ class TensorEnv:
         """
         if self.episodes is None or self._base is None:
             raise ResetNeeded("reset the environment before saving it")
-        rows = {
-            "base": self._base,
-            "episode": self._episode,
-            "returned": self._returned,
-            "ended": self._ended,
-        }
         return {
-            **{name: value.to("cpu", copy=True) for name, value in rows.items()},
+            **{name: getattr(self, f"_{name}").to("cpu", copy=True) for name in ROWS},
             "params": {name: value.to("cpu", copy=True) for name, value in self.params.items()},
             "episodes": self.program.saved(self.episodes),
         }
@@ -255,12 +246,11 @@ class TensorEnv:
         if len(state["base"]) != self.num_envs:
             raise ValueError(f"{len(state['base'])} worlds were saved: {self.num_envs} are needed")
         episodes = self.program.loaded(state["episodes"])
-        base, episode, returned, ended = (
-            state[name].to(self.device, copy=True) for name in ("base", "episode", "returned", "ended")
-        )
+        rows = {name: state[name].to(self.device, copy=True) for name in ROWS}
         params = {name: value.to(self.device, copy=True) for name, value in state["params"].items()}
-        self.episodes, self._base, self._episode = episodes, base, episode
-        self._returned, self._ended, self.params = returned, ended, params
+        self.episodes, self.params = episodes, params
+        for name, value in rows.items():
+            setattr(self, f"_{name}", value)
         return self.observation.of(episodes.world)
 
     # Stepping
@@ -287,8 +277,7 @@ class TensorEnv:
         if len(checked) != self.num_envs:
             raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
         waiting = self._ended
-        disabled = self.autoreset_mode is AutoresetMode.DISABLED
-        if disabled and bool(waiting.any()):
+        if self.autoreset_mode is AutoresetMode.DISABLED and bool(waiting.any()):
             slots = waiting.nonzero()[:, 0].tolist()
             raise ResetNeeded(f"the episodes of slots {slots[:8]} are over: reset them with a reset_mask")
         after, reward, success, _ = self.program.act(
@@ -304,56 +293,49 @@ class TensorEnv:
         self._returned = self._returned + reward
         ended = terminated | truncated
         info: Info = {"success": success, "_success": ~waiting}
-        over = ended.nonzero()[:, 0]
-        if len(over):
+        if bool(ended.any()):
             info["episode_return"] = (self._returned * ended).float()
             info["episode_length"] = after.acted * ended
             info["_episode_return"], info["_episode_length"] = ended.clone(), ended.clone()
-        self._ended = ended
+        observed = self.observation.of(after.world)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            observed = self._begin_same_step(over, ended, info)
+            self._begin(ended, observed, info)
         else:
-            if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-                self._begin(waiting.nonzero()[:, 0], waiting)
-            observed = self.observation.of(self.episodes.world)
+            self._ended = ended
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            self._begin(waiting, observed)
         info["world"], info["_world"] = self.episodes.seed.clone(), torch.ones_like(ended)
         return observed, reward, terminated, truncated, info
 
-    def _begin_same_step(self, over: Tensor, ended: Tensor, info: Info) -> Tensor:
-        """Begin what is over; the observations after that, the last ones and last infos in `info`."""
-        assert self.episodes is not None
-        observed = self.observation.of(self.episodes.world)
-        if not len(over):
-            return observed
-        last = {"world": self.episodes.seed.clone(), "success": info["success"].clone()}
-        last |= {name: info[name].clone() for name in ("episode_return", "episode_length")}
-        info["final_info"] = last | {f"_{name}": ended.clone() for name in last}
-        info["final_obs"], info["_final_obs"], info["_final_info"] = (
-            observed[over],
-            ended.clone(),
-            ended.clone(),
-        )
-        fresh = self._begin(over, ended)
-        assert fresh is not None
-        observed[over] = self.observation.of(fresh.world)
-        self._ended = torch.zeros_like(ended)
-        return observed
+    def _begin(self, mask: Tensor, observed: Tensor, info: Info | None = None) -> None:
+        """Begin the next episodes where `mask`, bool [B], is set: their first observations go into `observed`.
 
-    def _begin(self, places: Tensor, mask: Tensor) -> Episodes | None:
-        """The next episodes of some slots, numbers `places`: int64 [n], and the same as bool [B]."""
+        With `info` the last observations, and what has been said of their episodes, go there.
+        """
         assert self.episodes is not None
         assert self._base is not None
+        places = mask.nonzero()[:, 0]
         if not len(places):
-            return None
+            return
+        if info is not None:
+            last = {"world": self.episodes.seed.clone()}
+            last |= {name: info[name].clone() for name in ("success", "episode_return", "episode_length")}
+            info["final_info"] = last | {f"_{name}": mask.clone() for name in last}
+            info["final_obs"] = observed[places]
+            info["_final_obs"], info["_final_info"] = mask.clone(), mask.clone()
         self._episode = self._episode + mask
         self._returned = self._returned.masked_fill(mask, 0)
         fresh = self.program.start(world_seeds(self._base, self._episode, self.worlds)[places])
         self.episodes = self.program.put(self.episodes, places, fresh, reuse=True)
-        return fresh
+        observed[places] = self.observation.of(fresh.world)
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _check_count(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    if not _is_integer(value) or value < 1:
         raise ValueError(f"{name} must be an integer from 1, found {value!r}")
 
 

@@ -14,12 +14,11 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy
 from torch import Tensor
 
 from powderdsl.envs.acting import uniforms
-from powderdsl.envs.features import paper_policy
+from powderdsl.envs.features import paper_policy, small_policy
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run
 from powderdsl.model.composition.palette import MAX_ELEMENTS
 from powderdsl.rl.config import TrainConfig, from_json
-from powderdsl.rl.patch_network import small_policy
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task

@@ -19,11 +19,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from powderdsl.envs.features import Expand, paper_policy
 from powderdsl.envs.goal_env import GoalEnv
+from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.observations import KINDS
 from powderdsl.envs.sb3 import PowderVecEnv
-from powderdsl.envs.single import PowderEnv
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.envs.vector import PowderVectorEnv
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import TaskProgram, load_task

@@ -17,9 +17,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.envs.single import PowderEnv
+from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.tensor_env import TensorEnv, world_seeds
-from powderdsl.envs.vector import PowderVectorEnv
 from powderdsl.tasks.episodes import TaskProgram, compile_task, load_task
 from tests.states import same
 
@@ -328,7 +327,7 @@ def test_two_copies_agree_step_by_step(small: TaskProgram, make: Callable[..., A
 
 def test_every_shipped_task_is_registered_and_batched() -> None:
     import powderdsl.envs  # noqa: F401
-    from powderdsl.envs.register import env_id
+    from powderdsl.envs import env_id
     from powderdsl.tasks.shipped import shipped_tasks
 
     assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())

@@ -1,0 +1,176 @@
+"""`TensorEnv` as environments of Gymnasium's: NumPy in, NumPy out; many worlds in one batched simulation, or one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import MultiDiscrete
+from gymnasium.utils import EzPickle
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from powderdsl.envs.tensor_env import Info, TensorEnv
+from powderdsl.simulation.draw import scale
+from powderdsl.tasks.episodes import TaskProgram
+from powderdsl.tasks.task import Task
+
+Array = NDArray[Any]
+
+RENDER_MODES = ("rgb_array", "ansi")
+
+
+def check_render_mode(mode: str | None) -> str | None:
+    """A render mode that there is. Raises ValueError for another."""
+    if mode is not None and mode not in RENDER_MODES:
+        raise ValueError(f"render_mode is one of {', '.join(RENDER_MODES)}; found {mode!r}")
+    return mode
+
+
+def frames(env: TensorEnv, mode: str, factor: int) -> tuple[Any, ...]:
+    """Of each world uint8 [H·factor, W·factor, 3], or its rows as glyphs."""
+    if env.episodes is None:
+        raise ResetNeeded("reset the environment before rendering it")
+    world = env.episodes.world
+    if mode == "rgb_array":
+        return tuple(scale(world.rgb().cpu().numpy(), factor))
+    glyphs = {element.id: element.glyph for element in env.simulator.ruleset.elements}
+    return tuple(
+        "".join("".join(glyphs.get(number, "?") for number in row) + "\n" for row in rows)
+        for rows in world.ids.tolist()
+    )
+
+
+def array(tensor: Tensor) -> Array:
+    """A tensor as an array; from a device it is copied."""
+    found: Array = tensor.cpu().numpy()
+    return found
+
+
+def arrays(info: Info) -> dict[str, Any]:
+    """Infos in arrays."""
+    return {name: arrays(one) if isinstance(one, dict) else array(one) for name, one in info.items()}
+
+
+def objects(rows: Array, mask: Array) -> Array:
+    """Rows [n, …] as an array of objects [B]: None where `mask` is not set."""
+    found = np.full(len(mask), None, dtype=object)
+    for place, row in zip(np.flatnonzero(mask), rows, strict=True):
+        found[place] = row
+    return found
+
+
+class PowderVectorEnv(VectorEnv[Any, Any, Any]):
+    """Many worlds of a task, stepped together. Rewards are float32; arrays are never written to after they are returned.
+
+    Args:
+        task, num_envs, and all others: those of `TensorEnv`.
+        render_mode: ``rgb_array`` (uint8 pictures) or ``ansi`` (text), of each world.
+        render_scale: pixels along a cell's side.
+    """
+
+    def __init__(
+        self,
+        task: str | Path | Task | TaskProgram,
+        num_envs: int = 1,
+        *,
+        render_mode: str | None = None,
+        render_scale: int = 8,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        **how: Any,
+    ):
+        self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
+        self.tensors = TensorEnv(task, num_envs, autoreset_mode=autoreset_mode, **how)
+        """The same environment for tensors."""
+        self.num_envs = num_envs
+        self.autoreset_mode = self.tensors.autoreset_mode
+        self.metadata = {
+            "autoreset_mode": self.autoreset_mode,
+            "render_modes": list(RENDER_MODES),
+            "render_fps": 15,
+        }
+        self.single_observation_space = self.tensors.observation.space
+        self.single_action_space = MultiDiscrete(np.array(self.tensors.action_nvec))
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """What `TensorEnv.reset` does, in arrays."""
+        observed, info = self.tensors.reset(seed=seed, options=options)  # first: a bad seed changes nothing
+        if isinstance(seed, int):
+            super().reset(seed=seed)
+        return array(observed), arrays(info)
+
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """What `TensorEnv.step` does, in arrays. ``final_obs`` is an array of objects: None but where episodes ended."""
+        observed, reward, terminated, truncated, info = self.tensors.step(actions)
+        found = arrays(info)
+        if "final_obs" in info:
+            found["final_obs"] = objects(found["final_obs"], found["_final_obs"])
+        return array(observed), array(reward), array(terminated), array(truncated), found
+
+    def render(self) -> tuple[Any, ...] | None:
+        """A picture or text of each world, in the mode that was chosen."""
+        if self.render_mode is None:
+            return None
+        return frames(self.tensors, self.render_mode, self.render_scale)
+
+
+class PowderEnv(gymnasium.Env[Array, NDArray[np.int64]], EzPickle):
+    """One world. It plays what slot 0 of a `PowderVectorEnv` of the same seed plays.
+
+    Pickling keeps what it was made with, not the world in it.
+
+    Args:
+        task, and all others: those of `TensorEnv`, without `num_envs` and `autoreset_mode`.
+        render_mode: ``rgb_array`` (a uint8 picture) or ``ansi`` (text). render_scale: pixels along a cell's side.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 15}  # noqa: RUF012 as Gymnasium declares it
+
+    def __init__(
+        self,
+        task: str | Path | Task | TaskProgram,
+        *,
+        render_mode: str | None = None,
+        render_scale: int = 8,
+        **how: Any,
+    ):
+        EzPickle.__init__(self, task, render_mode=render_mode, render_scale=render_scale, **how)
+        self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
+        self.tensors = TensorEnv(task, 1, autoreset_mode="disabled", **how)
+        """The same environment for tensors."""
+        self.observation_space = self.tensors.observation.space
+        self.action_space = MultiDiscrete(np.array(self.tensors.action_nvec))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin an episode. Seeds and options are those of `TensorEnv.reset`; infos: ``world``."""
+        observed, info = self.tensors.reset(seed=seed, options=options)
+        super().reset(seed=seed)
+        return array(observed[0]), {"world": int(info["world"][0])}
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """One action: x, y, choice, vx, vy. Infos: ``success``, ``world``; with the last step ``episode_return`` and
+        ``episode_length``."""
+        batch = np.asarray(action)
+        if batch.shape != (5,):
+            raise ValueError(f"an action has the shape [5], found {list(batch.shape)}")
+        observed, reward, terminated, truncated, info = self.tensors.step(batch[None])
+        found = {name: one[0].item() for name, one in info.items() if not name.startswith("_")}
+        return array(observed[0]), float(reward[0]), bool(terminated[0]), bool(truncated[0]), found
+
+    def render(self) -> Any:
+        """A picture uint8 [H, W, 3], or text, in the mode that was chosen."""
+        return (
+            None if self.render_mode is None else frames(self.tensors, self.render_mode, self.render_scale)[0]
+        )
