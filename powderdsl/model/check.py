@@ -17,19 +17,17 @@ from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl, TypedDecl
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
-from powderdsl.model.expressions.constants import constant_of
-from powderdsl.model.expressions.operands import Broken, Poisoned, SetOf, Unresolved
-from powderdsl.model.expressions.property_words import not_a_value
-from powderdsl.model.expressions.scope import Scope
+from powderdsl.model.expressions.operands import Broken, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.symbols import (
     Symbols,
     base_symbols,
     check_param_names,
+    clamped,
     default_of,
     field_from,
+    not_a_value,
     number_value,
     read_kind,
-    settled,
 )
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.fields.values import add_field_values, unknown_element_key
@@ -214,7 +212,7 @@ def _params(symbols: Symbols, typer: Typer) -> None:
                     "",
                     "kinds: chance, LOW..HIGH, real(LOW..HIGH), flag",
                 )
-            value = constant_of(decl.default, kind, Scope(named.pack, {}), typer)
+            value = typer.constant(decl.default, kind, Scope(named.pack, {}))
         except Poisoned:
             continue
         symbols.params[qualified] = Param(qualified, kind, value, decl.about, decl.name.span)
@@ -231,7 +229,7 @@ def _params(symbols: Symbols, typer: Typer) -> None:
             continue
         try:
             symbols.params[key.text] = replace(
-                param, default=constant_of(syntax, param.kind, Scope("", {}), typer)
+                param, default=typer.constant(syntax, param.kind, Scope("", {}))
             )
         except Poisoned:
             continue
@@ -392,7 +390,7 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
                     "PD401", "a field cannot be a chance", decl.type.span, "", "use `real(0..1)`"
                 )
             default = (
-                constant_of(decl.default, kind, scope, typer)
+                typer.constant(decl.default, kind, scope)
                 if decl.default
                 else default_of(kind, symbols.first_id)
             )
@@ -408,7 +406,7 @@ def _fields(symbols: Symbols, typer: Typer) -> None:
                     )
         except Poisoned:
             continue
-        symbols.fields[name] = field_from(named, kind, settled(default, kind), of)
+        symbols.fields[name] = field_from(named, kind, clamped(default, kind), of)
 
 
 def _sets(typer: Typer) -> None:

@@ -10,19 +10,21 @@ from powderdsl.model.composition.names import Named
 from powderdsl.model.declarations import Block, PassDecl
 from powderdsl.model.expressions.operands import (
     FALSE,
+    IDENTITY,
     Absent,
     Broken,
+    Matrix,
     Number,
     Operand,
     Place,
     Poisoned,
+    Scope,
     SetOf,
     Unresolved,
     conjunction,
     constant,
+    turned,
 )
-from powderdsl.model.expressions.qualified import certain, of_pack
-from powderdsl.model.expressions.scope import IDENTITY, Matrix, Scope, turned
 from powderdsl.model.expressions.symbols import default_of, read_kind
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import (
@@ -388,8 +390,8 @@ class Elaborator:
         operand: Operand
         offset = (0, 0)
         if syntax.kind == "optional_attribute":
-            syntax = certain(self.typer, syntax, scope)
-        own = of_pack(self.typer, syntax, scope) if syntax.kind == "attribute" else None
+            syntax = self.typer.certain(syntax, scope)
+        own = self.typer.of_pack(syntax, scope) if syntax.kind == "attribute" else None
         if isinstance(own, Expr) and own.op == "look":
             operand, offset = own.args[0], own.value
         elif own is not None:

@@ -10,9 +10,7 @@ from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import TestDecl
-from powderdsl.model.expressions.constants import constant_of
-from powderdsl.model.expressions.operands import Poisoned, Unresolved
-from powderdsl.model.expressions.scope import Scope
+from powderdsl.model.expressions.operands import Poisoned, Scope, Unresolved
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.fields.grids import GridReader
 from powderdsl.model.types import CHANCE, Example, Expr, Kernel, Often, Property
@@ -128,7 +126,7 @@ def _example(decl: TestDecl, pack: str, composition: Composition, typer: Typer) 
 
 def _often(change: Syntax, chance: Syntax, scope: Scope, typer: Typer) -> Often:
     before, after = (typer.condition(part, scope) for part in change.children)
-    return Often(before, after, Fraction(constant_of(chance, CHANCE, scope, typer)), change.span)  # type: ignore[arg-type]
+    return Often(before, after, Fraction(typer.constant(chance, CHANCE, scope)), change.span)  # type: ignore[arg-type]
 
 
 def check_assigned(

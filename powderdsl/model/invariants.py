@@ -8,7 +8,7 @@ from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.composition.claim_scopes import names_left_out, with_optional, words_of
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import RulesetDecl
-from powderdsl.model.expressions.literals import read_bounds
+from powderdsl.model.expressions.coercer import read_bounds
 from powderdsl.model.expressions.operands import (
     ELEMENT_HERE,
     FALSE,
@@ -16,12 +16,12 @@ from powderdsl.model.expressions.operands import (
     Absent,
     Number,
     Poisoned,
+    Scope,
     SetOf,
     Unresolved,
     disjunction,
     member,
 )
-from powderdsl.model.expressions.scope import Scope
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.text import one_line
 from powderdsl.model.types import (

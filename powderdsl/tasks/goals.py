@@ -10,9 +10,8 @@ from functools import reduce
 from itertools import pairwise
 
 from powderdsl.diagnostics import Span, suggest
-from powderdsl.model.expressions.literals import read_number
-from powderdsl.model.expressions.operands import Number, Operand, Poisoned, SetOf, Unresolved
-from powderdsl.model.expressions.scope import Scope
+from powderdsl.model.expressions.coercer import read_number
+from powderdsl.model.expressions.operands import Number, Operand, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import FLAG, REAL, Expr
 from powderdsl.syntax.ast import Syntax

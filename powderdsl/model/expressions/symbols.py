@@ -1,16 +1,18 @@
-"""Every global name of a composition, resolved: what the checker looks words up in."""
+"""Every global name of a composition, resolved: what the checker looks words up in, and what it says of others."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from fractions import Fraction
 
-from powderdsl.diagnostics import Label, Reporter, suggest
-from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS, grid_kernel
+from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, FUNCTIONS, KERNELS, KIND_WORDS, grid_kernel
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import Named
 from powderdsl.model.declarations import TypedDecl
-from powderdsl.model.expressions.literals import read_bounds
-from powderdsl.model.expressions.operands import Coercer, Items, Operand, Place, SetOf
+from powderdsl.model.expressions.coercer import Coercer, read_bounds
+from powderdsl.model.expressions.operands import Items, Operand, Place, SetOf
 from powderdsl.model.state import SNAP
 from powderdsl.model.types import (
     CHANCE,
@@ -55,13 +57,8 @@ class Symbols:
         """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbor."""
         if after_dot:
             return [*self.properties, *self.fields, *self.streams, *DIRECTIONS]
-        return [
-            *self.constants,
-            *self.properties,
-            *self.fields,
-            *self.streams,
-            *(p.split(".")[1] for p in self.params),
-        ]
+        params = (name.split(".")[1] for name in self.params)
+        return [*self.constants, *self.properties, *self.fields, *self.streams, *params]
 
     def is_declared(self, name: str, pack: str) -> bool:
         """Whether some pack declares the name, even if its declaration is wrong."""
@@ -90,17 +87,11 @@ def base_symbols(composition: Composition) -> Symbols:
 
 
 _KINDS_ELSEWHERE = {
-    "int": "0..9",
-    "integer": "0..9",
-    "number": "0..9",
+    **dict.fromkeys(("int", "integer", "number"), "0..9"),
     "uint8": "0..255",
-    "float": "real(0..1)",
-    "float32": "real(0..1)",
-    "double": "real(0..1)",
-    "bool": "flag",
-    "boolean": "flag",
-    "vector": "vec2(-100..100)",
-    "vec": "vec2(-100..100)",
+    **dict.fromkeys(("float", "float32", "double"), "real(0..1)"),
+    **dict.fromkeys(("bool", "boolean"), "flag"),
+    **dict.fromkeys(("vector", "vec"), "vec2(-100..100)"),
     "probability": "chance",
 }
 """Kinds by the names that other languages give them, and how they are written here."""
@@ -108,34 +99,47 @@ _KINDS_ELSEWHERE = {
 
 def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
     """A kind as written: ``0..7``, ``flag``, ``element``, ``chance``, ``real(0..1)``, ``vec2(-10..10)``."""
+    word = syntax.text if syntax.kind in ("name", "call") else ""
+    plain = {"flag": FLAG, "element": ELEMENT, "direction": DIRECTION, "chance": CHANCE}.get(word)
+    if syntax.kind == "range":
+        return integer(*read_bounds(syntax, coercer))
+    if syntax.kind == "name" and plain is not None:
+        return plain
+    if syntax.kind == "call" and word in ("real", "vec2") and len(syntax.children) == 1:
+        return Kind(word, *read_bounds(syntax.children[0], coercer))
+    if syntax.kind == "name" and word in ("real", "vec2"):
+        fix = f"write `{word}(-100..100)`"
+        raise coercer.fail("PD401", f"`{word}` needs bounds", syntax.span, "no bounds", fix)
+    close = suggest(word, KIND_WORDS) if word else ()
     helps: tuple[str, ...] = (
         "kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",
     )
-    if syntax.kind == "range":
-        lo, hi = read_bounds(syntax, coercer)
-        return integer(lo, hi)
-    if syntax.kind == "name":
-        plain = {"flag": FLAG, "element": ELEMENT, "direction": DIRECTION, "chance": CHANCE}.get(syntax.text)
-        if plain is not None:
-            return plain
-        if syntax.text in ("real", "vec2"):
-            raise coercer.fail(
-                "PD401",
-                f"`{syntax.text}` needs bounds",
-                syntax.span,
-                "no bounds",
-                f"write `{syntax.text}(-100..100)`",
-            )
-    if syntax.kind == "call" and syntax.text in ("real", "vec2") and len(syntax.children) == 1:
-        lo, hi = read_bounds(syntax.children[0], coercer)
-        return Kind(syntax.text, lo, hi)
-    word = syntax.text if syntax.kind in ("name", "call") else ""
-    close = suggest(word, KIND_WORDS) if word else ()
     if word in _KINDS_ELSEWHERE:
         helps = (f"write `{_KINDS_ELSEWHERE[word]}`",)
     elif close and close[0].startswith("did"):
         helps = close
     raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", *helps)
+
+
+_FLAGS = {"on": "yes", "true": "yes", "y": "yes", "off": "no", "false": "no", "n": "no", "none": "no"}
+"""Words that people write for yes and no."""
+
+
+def not_a_value(prop: Property, syntax: Syntax, coercer: Coercer) -> None:
+    """Report a word as a property's value that names nothing."""
+    word = syntax.text.lower()
+    fix = "or a parameter of this pack"
+    match prop.kind.name:
+        case "flag":
+            meant = word if word in ("yes", "no") else _FLAGS.get(word)
+            form = "`yes` or `no`"
+            fix = f"write `{meant}`" if meant else f"write `yes`, `no`, {fix}"
+        case "chance":
+            form, fix = "a chance", f"write a chance such as `5%`, {fix}"
+        case _:
+            form = f"a number in {prop.kind}"
+            fix = f"write a number from {prop.kind.lo:g} to {prop.kind.hi:g}, {fix}"
+    coercer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", fix)
 
 
 def default_of(kind: Kind, first_id: int = 0) -> Value:
@@ -146,14 +150,18 @@ def default_of(kind: Kind, first_id: int = 0) -> Value:
     return first_id if kind.name == "element" else 0
 
 
-def settled(default: Value, kind: Kind) -> Value:
+def clamped(default: Value, kind: Kind) -> Value:
     """A field's default as steps leave it: floats within bounds, and zero where they are smaller than SNAP."""
     if kind.name not in ("real", "vec2"):
         return default
-    parts = default if isinstance(default, tuple) else (default,)
-    kept = [min(max(float(part), kind.lo), kind.hi) for part in parts]
-    row, *column = [part if abs(part) >= SNAP else 0.0 for part in kept]
-    return (row, column[0]) if column else row
+    if isinstance(default, tuple):
+        return clamped_number(default[0], kind), clamped_number(default[1], kind)
+    return clamped_number(default, kind)
+
+
+def clamped_number(value: float | Fraction, kind: Kind) -> float:
+    kept = min(max(float(value), kind.lo), kind.hi)
+    return kept if abs(kept) >= SNAP else 0.0
 
 
 def field_from(named: Named[TypedDecl], kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
@@ -169,14 +177,12 @@ def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
         name = composition.names.of(named.pack, named.decl.name.text)
         other = composition.definitions.get(name)
         if other is not None and composition.names.knows(named.pack, name):
-            reporter.error(
-                "PD308",
+            message, labels = (
                 f"the parameter `{name}` hides another `{name}`",
-                named.span,
-                "the same word",
-                secondary=[Label(other.span, "this one")],
-                helps=["rename the parameter"],
+                [Label(other.span, "this one")],
             )
+            helps = ["rename the parameter"]
+            reporter.error("PD308", message, named.span, "the same word", secondary=labels, helps=helps)
 
 
 def number_value(expr: Expr, kind: Kind) -> Value:
@@ -186,3 +192,71 @@ def number_value(expr: Expr, kind: Kind) -> Value:
         return (float(parts[0]), float(parts[1]))
     assert expr.op == "const"
     return expr.value
+
+
+# Unknown names
+
+ELSEWHERE = {
+    **dict.fromkeys(("up", "north", "top"), "write `above`"),
+    **dict.fromkeys(("down", "south", "bottom"), "write `below`"),
+    "west": "write `left`",
+    "east": "write `right`",
+    **dict.fromkeys(("self", "this"), "a rule speaks of its own cell already: leave it out, or write `here`"),
+    "true": "write `yes`",
+    "false": "write `no`",
+    **dict.fromkeys(("none", "nothing", "air"), "name the element that stands for nothing, such as `empty`"),
+    **dict.fromkeys(("neighbors", "neighbours"), "count them: `count(SET)`, `count(SET in ring)`"),
+    **dict.fromkeys(
+        ("random", "rand"), "say `with chance 5%` at the end of the rule, or compare a stream: `luck < 5%`"
+    ),
+    "probability": "say `with chance 5%` at the end of the rule",
+    **dict.fromkeys(("floor", "round", "int"), "`a div b` divides integers and rounds down"),
+    "ceil": "`a div b` divides integers and rounds down: `(a + b - 1) div b` rounds up",
+    "sqrt": "there are no roots; `length(VEC2)` is the length of a vector",
+    "pow": "powers are written out: `x * x`",
+    "distance": "`length(VEC2)` is the length of a vector",
+}
+"""Words of other languages, and what to write instead."""
+
+MAX_PLACES = 4
+"""Places of a name that are shown besides the first."""
+
+
+class UnknownNames:
+    """Names that were looked up and not found: each is reported once, with all its places."""
+
+    def __init__(self, symbols: Symbols, reporter: Reporter):
+        self.symbols = symbols
+        self.reporter = reporter
+        self._places: dict[tuple[str, bool], dict[Span, tuple[str, ...]]] = {}
+
+    def add(self, name: str, span: Span, known_here: Iterable[str], *, after_dot: bool) -> None:
+        """Remember a name at a place. `known_here` are local names that it could have been meant for."""
+        self._places.setdefault((name, after_dot), {})[span] = tuple(known_here)
+
+    def report(self) -> None:
+        """Report every name that came up, then forget them."""
+        for (name, after_dot), places in self._places.items():
+            first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
+            label = (
+                "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
+            )
+            more = [Label(span, "and here") for span in others[:MAX_PLACES]]
+            notes = [f"and in {len(others) - MAX_PLACES} more places"] if len(others) > MAX_PLACES else []
+            helps = self._fix(name, places[first], after_dot)
+            self.reporter.error(
+                "PD301", f"unknown name `{name}`", first, label, secondary=more, notes=notes, helps=helps
+            )
+        self._places.clear()
+
+    def _fix(self, name: str, known_here: tuple[str, ...], after_dot: bool) -> tuple[str, ...]:
+        elsewhere = [qualified for qualified in self.symbols.params if qualified.endswith(f".{name}")]
+        if elsewhere:
+            return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)
+        if not after_dot and name.lower() in ELSEWHERE:
+            return (ELSEWHERE[name.lower()],)
+        known = self.symbols.names(after_dot=after_dot)
+        close = suggest(name, known if after_dot else [*known, *known_here, *FUNCTIONS])
+        if close and close[0].startswith("did"):
+            return close
+        return (f"load the pack that defines it, or write `{name}?` if that may be absent",)

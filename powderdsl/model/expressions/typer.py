@@ -5,40 +5,49 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from itertools import product
+from itertools import pairwise, product
 from math import prod
 
 from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.builtins import COORDINATES, FUNCTIONS, KERNEL_SHAPES, KERNELS
-from powderdsl.model.expressions import arithmetic
-from powderdsl.model.expressions.calls import call
-from powderdsl.model.expressions.literals import read_bounds, read_number
-from powderdsl.model.expressions.membership import holds
+from powderdsl.model.expressions.coercer import Coercer, read_bounds, read_number
+from powderdsl.model.expressions.functions import call
 from powderdsl.model.expressions.operands import (
     FALSE,
+    IDENTITY,
     TRUE,
     Absent,
     Bounds,
     Broken,
-    Coercer,
     Items,
     Number,
     Operand,
     Place,
     Poisoned,
+    Scope,
     SetOf,
     Unresolved,
+    Value,
     conjunction,
     disjunction,
     look,
     negation,
+    turned,
 )
-from powderdsl.model.expressions.qualified import is_own_word, of_pack, optional_attribute
-from powderdsl.model.expressions.scope import IDENTITY, Scope, turned
-from powderdsl.model.expressions.symbols import Symbols
-from powderdsl.model.expressions.unknown import UnknownNames
+from powderdsl.model.expressions.operators import (
+    binary,
+    choose,
+    compare,
+    holds,
+    kind_name,
+    modulo,
+    negate,
+    quotient,
+)
+from powderdsl.model.expressions.symbols import Symbols, UnknownNames, number_value
 from powderdsl.model.logic.needless import report_repeated
-from powderdsl.model.types import CHANCE, DIRECTION, DRAW, ELEMENT, FLAG, Expr, Kernel
+from powderdsl.model.types import CHANCE, DRAW, FLAG, REAL, Expr, Kernel, Kind
+from powderdsl.model.types import Value as Constant
 from powderdsl.syntax.ast import Syntax
 
 MAX_ROUNDS = 4096
@@ -75,13 +84,18 @@ class Typer(Coercer):
         """What the syntax stands for. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
         self._work += 1
         if self._work > MAX_WORK + 1:
-            raise Poisoned  # that has been said, and is true of all that follows
+            raise Poisoned  # that has been reported, and is true of all that follows
         if self._work - self._rule_start > MAX_RULE_WORK or self._work > MAX_WORK:
             self._rule_start = self._work  # once for a rule is enough
+            what = "a rule that expands" if self._work <= MAX_WORK else "rules that expand"
+            span, label = self._rule_span or syntax.span, "written out, it has thousands of parts"
             raise self.fail(
-                "PD508", "a rule that expands to too much" if self._work <= MAX_WORK else "rules that expand to too much",
-                self._rule_span or syntax.span, "written out, it has thousands of parts",
-                "loop over fewer things, or name parts under `let:`")  # fmt: skip
+                "PD508",
+                f"{what} to too much",
+                span,
+                label,
+                "loop over fewer things, or name parts under `let:`",
+            )
         return HANDLERS[syntax.kind](self, syntax, scope)
 
     def start_rule(self, span: Span) -> None:
@@ -91,6 +105,20 @@ class Typer(Coercer):
 
     def condition(self, syntax: Syntax, scope: Scope) -> Expr:
         return self.flag(self.evaluate(syntax, scope), syntax.span)
+
+    def value_of(self, syntax: Syntax, scope: Scope) -> Value:
+        return self.value(self.evaluate(syntax, scope), syntax.span)
+
+    def constant(self, syntax: Syntax, kind: Kind, scope: Scope) -> Constant:
+        """The value of a constant expression. Raises Poisoned after reporting what is wrong with it."""
+        try:
+            value = self.of_kind(self.evaluate(syntax, scope), kind, syntax.span)
+        except Unresolved as missing:
+            raise self.fail("PD301", f"unknown name `{missing.name}`", syntax.span) from None
+        parts = value.args if value.op == "vector" else (value,)
+        if any(part.op != "const" for part in parts):
+            raise self.fail("PD405", "expected a constant", syntax.span, "depends on the world")
+        return number_value(value, kind)
 
     # Names
 
@@ -109,9 +137,7 @@ class Typer(Coercer):
         symbols = self.symbols
         self.used.add(name)
         if name in scope.locals:
-            if isinstance(scope.locals[name], Broken):
-                raise Poisoned
-            return self.turn(scope.locals[name], scope)
+            return self.turn(self._sound(scope.locals[name]), scope)
         param = symbols.params.get(f"{scope.pack}.{name}")
         if param is not None:  # a name that hides no other that its pack knows
             self.used.add(param.name)
@@ -121,19 +147,20 @@ class Typer(Coercer):
         if name in self.set_definitions and name not in symbols.constants:
             return self.resolve_set(name, span)
         if name in symbols.constants:
-            if isinstance(symbols.constants[name], Broken):
-                raise Poisoned
-            constant = symbols.constants[name]
-            if isinstance(constant, SetOf) and not constant.ids:
+            constant = self._sound(symbols.constants[name])
+            if constant == SetOf(()):
                 self.empty.add(name)
             return self.turn(constant, scope)
-        if name in symbols.properties:
-            return Expr("property", symbols.properties[name].kind, value=name, span=span)
-        if name in symbols.fields:
-            return Expr("field", symbols.fields[name].kind, value=name, span=span)
-        if name in symbols.streams:
-            return Expr("draw", DRAW, value=name, span=span)
-        return None
+        for op, table in (("property", symbols.properties), ("field", symbols.fields)):
+            if name in table:
+                return Expr(op, table[name].kind, value=name, span=span)
+        return Expr("draw", DRAW, value=name, span=span) if name in symbols.streams else None
+
+    @staticmethod
+    def _sound(operand: Operand) -> Operand:
+        if isinstance(operand, Broken):
+            raise Poisoned
+        return operand
 
     def hides(self, name: str, span: Span, scope: Scope) -> bool:
         """Whether a new local name would hide one that its pack knows. What strangers' packs define may be hidden."""
@@ -145,28 +172,23 @@ class Typer(Coercer):
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
-            path = " -> ".join(
-                f"`{other}`" for other in [*self.resolving[self.resolving.index(name) :], name]
-            )
-            raise self.fail(
-                "PD307", f"the set `{name}` is defined by itself", span, path, "list elements or tags"
-            )
+            path = " -> ".join(f"`{one}`" for one in [*self.resolving[self.resolving.index(name) :], name])
+            message = f"the set `{name}` is defined by itself"
+            raise self.fail("PD307", message, span, path, "list elements or tags")
         if len(self.resolving) >= MAX_SET_DEPTH:
             for waiting in self.resolving:
                 self.symbols.constants[waiting] = Broken()
             if self._sets_too_deep:
                 raise Poisoned
             self._sets_too_deep = True
-            raise self.fail(
-                "PD508", f"more than {MAX_SET_DEPTH} sets that depend on each other", span, "too many in a row",
-                "list elements or tags")  # fmt: skip
+            message = f"more than {MAX_SET_DEPTH} sets that depend on each other"
+            raise self.fail("PD508", message, span, "too many in a row", "list elements or tags")
         pack, syntax = self.set_definitions[name]
         self.resolving.append(name)
         try:
-            result = self.set_of(self.evaluate(syntax, Scope(pack, {})), syntax.span)
+            result = SetOf(self.set_of(self.evaluate(syntax, Scope(pack, {})), syntax.span).ids)
         finally:
             self.resolving.pop()
-        result = SetOf(result.ids)
         self.symbols.constants[name] = result
         return result
 
@@ -184,28 +206,20 @@ class Typer(Coercer):
                 return replace(operand, weights=tuple(weights))
         return operand
 
+    # Names as written
+
     def name(self, syntax: Syntax, scope: Scope) -> Operand:
-        if syntax.text in COORDINATES:
-            raise self.fail(
-                "PD406",
-                f"`{syntax.text}` stands without `mod`",
-                syntax.span,
-                "endless by itself",
-                f"write `{syntax.text} mod 2`: rules are the same everywhere and always, up to a pattern",
-            )
-        shape = syntax.text in KERNEL_SHAPES and syntax.text not in KERNELS
-        if shape and self.find(syntax.text, syntax.span, scope) is None:
-            label, fix = "its radius is missing", (f"write `{syntax.text}(3)`",)
-            raise self.fail("PD406", f"`{syntax.text}` needs a radius", syntax.span, label, *fix)
-        if syntax.text in FUNCTIONS:
-            raise self.fail(
-                "PD406",
-                f"`{syntax.text}` is a function",
-                syntax.span,
-                "its values are missing",
-                f"write `{FUNCTIONS[syntax.text].signature}`",
-            )
-        return self.lookup(syntax.text, syntax.span, scope)
+        word, span = syntax.text, syntax.span
+        if word in COORDINATES:
+            fix = f"write `{word} mod 2`: rules are the same everywhere and always, up to a pattern"
+            raise self.fail("PD406", f"`{word}` stands without `mod`", span, "endless by itself", fix)
+        if word in KERNEL_SHAPES and word not in KERNELS and self.find(word, span, scope) is None:
+            label, fix = "its radius is missing", f"write `{word}(3)`"
+            raise self.fail("PD406", f"`{word}` needs a radius", span, label, fix)
+        if word in FUNCTIONS:
+            fix = f"write `{FUNCTIONS[word].signature}`"
+            raise self.fail("PD406", f"`{word}` is a function", span, "its values are missing", fix)
+        return self.lookup(word, span, scope)
 
     def optional_name(self, syntax: Syntax, scope: Scope) -> Operand:
         found = self.find(syntax.text, syntax.span, scope)
@@ -215,32 +229,30 @@ class Typer(Coercer):
         return found
 
     def attribute(self, syntax: Syntax, scope: Scope) -> Operand:
-        base_syntax = syntax.children[0]
-        if base_syntax.kind == "name":
-            qualified = f"{base_syntax.text}.{syntax.text}"
-            if qualified in self.symbols.params and not is_own_word(self, base_syntax, scope):
-                self.used.add(qualified)
-                param = self.symbols.params[qualified]
-                return Expr("param", param.kind, value=qualified, span=syntax.span)
-        own = of_pack(self, syntax, scope)
+        """``place.name``, ``vector.row`` or ``pack.name``."""
+        (before,) = syntax.children
+        qualified = f"{before.text}.{syntax.text}"
+        if (
+            before.kind == "name"
+            and qualified in self.symbols.params
+            and not self._is_own_word(before, scope)
+        ):
+            self.used.add(qualified)
+            return Expr("param", self.symbols.params[qualified].kind, value=qualified, span=syntax.span)
+        own = self.of_pack(syntax, scope)
         if own is not None:
             return own
-        base = self.evaluate(base_syntax, scope)
+        base = self.evaluate(before, scope)
         word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
         if isinstance(base, Absent):
             raise Unresolved(base.name)
         if isinstance(base, Expr) and base.kind.name == "vec2":
             if syntax.text in ("row", "column"):
-                return arithmetic.part(base, syntax.text, syntax.span)
-            raise self.fail(
-                "PD301",
-                f"a vector has no `{syntax.text}`",
-                word,
-                "not a part of it",
-                "parts of a vector: `.row`, `.column`",
-            )
+                return Expr(f"{syntax.text}_part", REAL, (base,), span=syntax.span)
+            message, fix = f"a vector has no `{syntax.text}`", "parts of a vector: `.row`, `.column`"
+            raise self.fail("PD301", message, word, "not a part of it", fix)
         if not isinstance(base, Place):
-            raise self.wrong(base, "a neighbor before the dot", base_syntax.span, "such as `below.FIELD`")
+            raise self.wrong(base, "a neighbor before the dot", before.span, "such as `below.FIELD`")
         value = self.lookup(syntax.text, word, scope, after_dot=True)
         match value:
             case Place():
@@ -249,15 +261,58 @@ class Typer(Coercer):
             case Expr():
                 return look(value, self.offset(base.offset, syntax.span), syntax.span)
             case SetOf():
-                text = f"{base_syntax.span.text} is {syntax.text}"
-                raise self.fail(
-                    "PD401",
-                    f"`{syntax.text}` is not a field or property",
-                    word,
-                    f"this is {'an element' if value.name else 'a set of elements'}",
-                    f"write `{text}`",
-                )
+                message = f"`{syntax.text}` is not a field or property"
+                label = f"this is {'an element' if value.name else 'a set of elements'}"
+                raise self.fail("PD401", message, word, label, f"write `{before.span.text} is {syntax.text}`")
         raise self.wrong(value, "a field, property or neighbor after the dot", word)
+
+    def of_pack(self, syntax: Syntax, scope: Scope) -> Operand | None:
+        """``pack.name``, or ``below.pack.name``: what one pack defines, whatever others call theirs."""
+        (pack,) = syntax.children
+        if pack.kind not in ("name", "attribute"):
+            return None
+        name = self.symbols.composition.names.qualified(pack.text, syntax.text)
+        if name is None or self._is_own_word(pack, scope):
+            return None
+        found = self.find(name, syntax.span, Scope("", {}, scope.orientation))
+        if pack.kind == "name":
+            return found
+        if not isinstance(found, Expr):
+            return None
+        place = self.place(self.evaluate(pack.children[0], scope), pack.children[0].span)
+        return look(found, place.offset, syntax.span)
+
+    def _is_own_word(self, word: Syntax, scope: Scope) -> bool:
+        """Whether a word before a dot is a place, a vector or a name of its block, and not the name of a pack.
+
+        Elements, tags and numbers have nothing after a dot: `salt.salt` is the element of the pack `salt`.
+        """
+        found = self.find(word.text, word.span, Scope("", scope.locals, scope.orientation))
+        return word.text in scope.locals or isinstance(found, Place) or kind_name(found) == "vec2"
+
+    def optional_attribute(self, syntax: Syntax, scope: Scope) -> Operand:
+        """``pack.name?``, ``below.name?``: absent unless a loaded pack defines it."""
+        try:
+            return self.attribute(self.certain(syntax, scope), scope)
+        except Unresolved as missing:
+            self.absent.add(missing.name)
+            return Absent(missing.name)
+
+    def certain(self, syntax: Syntax, scope: Scope) -> Syntax:
+        """An attribute without its question mark. Raises Unresolved if nothing that is loaded has its name."""
+        (before,) = syntax.children
+        span, names = syntax.span, self.symbols.composition.names
+        plain = replace(syntax, kind="attribute", span=Span(span.source, span.start, span.end - 1))
+        qualified = f"{before.text}.{syntax.text}"
+        if qualified in self.symbols.params or names.qualified(before.text, syntax.text) is not None:
+            return plain
+        if before.kind in ("name", "attribute"):
+            found = self.find(before.text, before.span, scope)
+            if found is None or isinstance(found, SetOf):  # a pack that has an element of its name
+                raise Unresolved(qualified)
+        if self.find(syntax.text, syntax.span, scope) is None:
+            raise Unresolved(syntax.text)
+        return plain
 
     # Literals and lists
 
@@ -292,9 +347,8 @@ class Typer(Coercer):
             sets = [set(self.set_of(operand, syntax.span).ids) for operand in operands]
             ids = sets[0] | sets[1] if syntax.kind == "or_" else sets[0] & sets[1]
             return SetOf(tuple(sorted(ids)))
-        flags = [
-            self.flag(operand, child.span) for operand, child in zip(operands, syntax.children, strict=True)
-        ]
+        pairs = zip(operands, syntax.children, strict=True)
+        flags = [self.flag(operand, child.span) for operand, child in pairs]
         return (disjunction if syntax.kind == "or_" else conjunction)(flags, syntax.span)
 
     def not_(self, syntax: Syntax, scope: Scope) -> Operand:
@@ -304,36 +358,32 @@ class Typer(Coercer):
         operands = [self.evaluate(child, scope) for child in syntax.children]
         report_repeated(syntax.children, self.reporter)
         self._no_sets(operands, syntax)
-        headings = any(isinstance(operand, Expr) and operand.kind == DIRECTION for operand in operands)
-        values = [
-            self.direction(operand, child.span)
+        headings = any(kind_name(operand) == "direction" for operand in operands)
+        values: list[tuple[Value, Span]] = [
+            (self.direction(operand, child.span), child.span)
             if headings and isinstance(operand, Place)
-            else self.value(operand, child.span)
+            else (self.value(operand, child.span), child.span)
             for operand, child in zip(operands, syntax.children, strict=True)
         ]
-        parts = []
-        for i, operator in enumerate(syntax.text.split()):
-            span = syntax.children[i].span.to(syntax.children[i + 1].span)
-            places = (syntax.children[i].span, syntax.children[i + 1].span)
-            parts.append(arithmetic.compare(self, operator, values[i], values[i + 1], span, places))
+        parts = [
+            compare(self, sign, left, right, left[1].to(right[1]))
+            for sign, (left, right) in zip(syntax.text.split(), pairwise(values), strict=True)
+        ]
         return conjunction(parts, syntax.span)
 
     def _no_sets(self, operands: list[Operand], syntax: Syntax) -> None:
         """`below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`."""
-        places = any(
-            isinstance(operand, Place) or (isinstance(operand, Expr) and operand.kind == ELEMENT)
-            for operand in operands
-        )
+        if not any(isinstance(operand, Place) or kind_name(operand) == "element" for operand in operands):
+            return
         for operand, child in zip(operands, syntax.children, strict=True):
-            if places and isinstance(operand, (SetOf, Items)) and getattr(operand, "name", None) is None:
+            if isinstance(operand, Items) or (isinstance(operand, SetOf) and operand.name is None):
                 fix = "write `is` or `is not` instead of `==` or `!=`"
                 raise self.wrong(operand, "one element to compare with", child.span, fix)
 
     def is_(self, syntax: Syntax, scope: Scope) -> Operand:
-        positive = syntax.kind in ("is_", "in_")
         left, right = (self.evaluate(child, scope) for child in syntax.children)
         result = holds(self, left, right, syntax)
-        return result if positive else negation(result, syntax.span)
+        return result if syntax.kind in ("is_", "in_") else negation(result, syntax.span)
 
     def choose(self, syntax: Syntax, scope: Scope) -> Operand:
         yes, condition, no = syntax.children
@@ -342,7 +392,7 @@ class Typer(Coercer):
         if chosen in (TRUE, FALSE):
             return self.evaluate(yes if chosen == TRUE else no, scope)
         first, second = self.evaluate(yes, scope), self.evaluate(no, scope)
-        return arithmetic.choose(self, chosen, (first, yes.span), (second, no.span), syntax.span)
+        return choose(self, chosen, (first, yes.span), (second, no.span), syntax.span)
 
     def quantifier(self, syntax: Syntax, scope: Scope) -> Operand:
         body, binding = syntax.children
@@ -351,48 +401,31 @@ class Typer(Coercer):
 
     def bindings(self, bindings: tuple[Syntax, ...], scope: Scope) -> list[Scope]:
         """The scopes of a loop's rounds: the first variable turns slowest."""
-        domains: list[list[tuple[str, Operand]]] = []
+        domains: dict[str, list[Operand]] = {}
         for binding in bindings:
             variable, domain = binding.children
-            if self.hides(variable.text, variable.span, scope) or any(
-                d and d[0][0] == variable.text for d in domains
-            ):
-                raise self.fail(
-                    "PD308",
-                    f"`{variable.text}` already means something here",
-                    variable.span,
-                    "hides the other meaning",
-                    "choose another name",
-                )
+            if self.hides(variable.text, variable.span, scope) or variable.text in domains:
+                message, label = f"`{variable.text}` already means something here", "hides the other meaning"
+                raise self.fail("PD308", message, variable.span, label, "choose another name")
             self.used.add(variable.text)
-            straight = replace(
-                scope, orientation=IDENTITY
-            )  # a variable is turned where it is used, and only there
-            domains.append([(variable.text, value) for value in self.domain(domain, straight)])
-        rounds = prod(len(domain) for domain in domains)
+            # A variable is turned where it is used, and only there.
+            domains[variable.text] = self.domain(domain, replace(scope, orientation=IDENTITY))
+        rounds = prod(len(domain) for domain in domains.values())
         if rounds > MAX_ROUNDS:
-            place = bindings[0].span.to(bindings[-1].span)
-            raise self.fail(
-                "PD508",
-                f"a loop of {rounds:,} rounds",
-                place,
-                f"the limit is {MAX_ROUNDS:,}",
-                "loop over fewer things",
-            )
-        return [scope.bind(**dict(choice)) for choice in product(*domains)]
+            raise self._too_long(rounds, bindings[0].span.to(bindings[-1].span), f"{MAX_ROUNDS:,}")
+        return [scope.bind(**dict(zip(domains, one, strict=True))) for one in product(*domains.values())]
+
+    def _too_long(self, rounds: int, span: Span, limit: str) -> Poisoned:
+        label, fix = f"the limit is {limit}", "loop over fewer things"
+        return self.fail("PD508", f"a loop of {rounds:,} rounds", span, label, fix)
 
     def domain(self, syntax: Syntax, scope: Scope) -> list[Operand]:
         operand = self.evaluate(syntax, scope)
         match operand:
             case Bounds():
-                if operand.hi - operand.lo >= 64:
-                    raise self.fail(
-                        "PD508",
-                        f"a loop of {operand.hi - operand.lo + 1:,} rounds",
-                        syntax.span,
-                        "the limit is 64",
-                        "loop over fewer things",
-                    )
+                rounds = operand.hi - operand.lo + 1
+                if rounds > 64:
+                    raise self._too_long(rounds, syntax.span, "64")
                 return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():
                 composition = self.symbols.composition
@@ -403,59 +436,47 @@ class Typer(Coercer):
                 return list(operand.items)
             case Absent():
                 return []
-        raise self.wrong(
-            operand, "a range, a set or a list", syntax.span, "such as `0..4`, a tag, or `(left, right)`"
-        )
+        fix = "such as `0..4`, a tag, or `(left, right)`"
+        raise self.wrong(operand, "a range, a set or a list", syntax.span, fix)
 
     def binary(self, syntax: Syntax, scope: Scope) -> Operand:
-        left, right = (self.value(self.evaluate(child, scope), child.span) for child in syntax.children)
-        return arithmetic.binary(self, syntax.kind, left, right, syntax)
+        left, right = (self.value_of(child, scope) for child in syntax.children)
+        return binary(self, left, right, syntax)
 
     def negate(self, syntax: Syntax, scope: Scope) -> Operand:
-        value = self.value(self.evaluate(syntax.children[0], scope), syntax.children[0].span)
-        return arithmetic.negate(self, value, syntax.span)
+        return negate(self, self.value_of(syntax.children[0], scope), syntax.span)
 
     def chance_draw(self, stream: str, syntax: Syntax, scope: Scope) -> Expr:
         """`with chance P`: a draw of the rule's own stream below P."""
-        threshold = self.chance(self.evaluate(syntax, scope), syntax.span)
-        draw = Expr("draw", DRAW, value=stream, span=syntax.span)
+        span = syntax.span
+        threshold = self.chance(self.evaluate(syntax, scope), span)
+        draw = Expr("draw", DRAW, value=stream, span=span)
         if threshold.kind == CHANCE:
-            return arithmetic.compare(self, "<", draw, threshold, syntax.span)
-        return Expr("lt", FLAG, (Expr("to_real", threshold.kind, (draw,)), threshold), span=syntax.span)
+            return compare(self, "<", (draw, span), (threshold, span), span)
+        return Expr("lt", FLAG, (Expr("to_real", threshold.kind, (draw,)), threshold), span=span)
 
 
 HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "name": Typer.name,
     "optional_name": Typer.optional_name,
     "attribute": Typer.attribute,
-    "optional_attribute": optional_attribute,
-    "integer": Typer.number,
-    "decimal": Typer.number,
-    "percent": Typer.number,
-    "yes": Typer.truth,
-    "no": Typer.truth,
+    "optional_attribute": Typer.optional_attribute,
+    **dict.fromkeys(("integer", "decimal", "percent"), Typer.number),
+    **dict.fromkeys(("yes", "no"), Typer.truth),
     "range": Typer.range_,
     "tuple": Typer.tuple_,
     "any": Typer.any_,
     "any_but": Typer.any_but,
-    "or_": Typer.logic,
-    "and_": Typer.logic,
+    **dict.fromkeys(("or_", "and_"), Typer.logic),
     "not_": Typer.not_,
     "compare": Typer.compare,
-    "is_": Typer.is_,
-    "is_not": Typer.is_,
-    "in_": Typer.is_,
-    "not_in": Typer.is_,
+    **dict.fromkeys(("is_", "is_not", "in_", "not_in"), Typer.is_),
     "choose": Typer.choose,
-    "any_of": Typer.quantifier,
-    "all_of": Typer.quantifier,
+    **dict.fromkeys(("any_of", "all_of"), Typer.quantifier),
     "call": call,
-    "add": Typer.binary,
-    "subtract": Typer.binary,
-    "multiply": Typer.binary,
-    "divide": Typer.binary,
+    **dict.fromkeys(("add", "subtract", "multiply", "divide"), Typer.binary),
     "negate": Typer.negate,
-    "quotient": arithmetic.quotient,
-    "mod": arithmetic.modulo,
+    "quotient": quotient,
+    "mod": modulo,
 }
 """One handler for every kind of syntax node that can stand in an expression."""

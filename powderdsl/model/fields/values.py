@@ -8,10 +8,8 @@ from difflib import get_close_matches
 
 from powderdsl.diagnostics import Label, suggest
 from powderdsl.model.composition.contested import given_values
-from powderdsl.model.expressions.constants import constant_of
-from powderdsl.model.expressions.operands import Poisoned
-from powderdsl.model.expressions.scope import Scope
-from powderdsl.model.expressions.symbols import Symbols, settled
+from powderdsl.model.expressions.operands import Poisoned, Scope
+from powderdsl.model.expressions.symbols import Symbols, clamped
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import KEYS
 from powderdsl.model.types import Field
@@ -31,10 +29,10 @@ def add_field_values(symbols: Symbols, typer: Typer) -> None:
         if field is None or element not in ids or not _may_have(field, ids[element], element, key, typer):
             continue
         try:
-            value = constant_of(syntax, field.kind, Scope(pack, {}), typer)
+            value = typer.constant(syntax, field.kind, Scope(pack, {}))
         except Poisoned:
             continue
-        found.setdefault(name, {})[ids[element]] = settled(value, field.kind)
+        found.setdefault(name, {})[ids[element]] = clamped(value, field.kind)
     for name, values in found.items():
         field = symbols.fields[name]
         own = tuple((i, value) for i, value in sorted(values.items()) if value != field.default)

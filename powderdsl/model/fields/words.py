@@ -8,7 +8,7 @@ from fractions import Fraction
 
 from powderdsl.diagnostics import suggest
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
-from powderdsl.model.expressions.symbols import settled
+from powderdsl.model.expressions.symbols import clamped_number
 from powderdsl.model.types import Kind
 
 FORMS = {
@@ -107,9 +107,7 @@ def _number(word: str, kind: Kind) -> float | None:
         )
     if whole:
         return int(value)
-    found = settled(float(value), Kind("real", kind.lo, kind.hi))
-    assert isinstance(found, float)
-    return found
+    return float(clamped_number(value, kind))
 
 
 def direction_word(octant: int) -> str:

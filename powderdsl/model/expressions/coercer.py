@@ -1,0 +1,311 @@
+"""Operands turned into the kind that their place wants, and literals into exact numbers; or the report why not."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+
+from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.builtins import MAX_MAGNITUDE, MAX_OFFSET, OCTANTS
+from powderdsl.model.expressions.operands import (
+    ELEMENT_HERE,
+    FALSE,
+    Absent,
+    Bounds,
+    Broken,
+    Items,
+    Number,
+    Operand,
+    Place,
+    Poisoned,
+    SetOf,
+    Unresolved,
+    constant,
+    look,
+    member,
+)
+from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Expr, Kernel, Kind, Offset
+from powderdsl.syntax.ast import Syntax
+
+_KINDS = {
+    "int": "an integer",
+    "flag": "a condition",
+    "element": "an element",
+    "direction": "a direction",
+    "chance": "a chance",
+    "draw": "a random draw",
+    "real": "a float",
+    "vec2": "a vector",
+}
+_OPERANDS: dict[type, str] = {
+    Place: "a place",
+    Number: "a number",
+    Bounds: "a range",
+    Items: "a list",
+    Kernel: "a kernel",
+}
+
+
+def describe(operand: Operand) -> str:
+    """An operand's kind in words, for messages."""
+    match operand:
+        case Expr():
+            return _KINDS.get(operand.kind.name, "a number")
+        case SetOf():
+            return "an element" if operand.name else "a set of elements"
+        case Absent():
+            return f"`{operand.name}`, which is not loaded"
+    return _OPERANDS.get(type(operand), "something broken")
+
+
+class Coercer:
+    """Turns operands into the kind that their place wants, or reports why not."""
+
+    def __init__(self, reporter: Reporter):
+        self.reporter = reporter
+        self._misused: set[tuple[Span, str]] = set()
+
+    def fail(self, code: str, message: str, span: Span, label: str = "", *helps: str) -> Poisoned:
+        """Report an error; the exception to raise after it."""
+        self.reporter.error(code, message, span, label, helps=helps)
+        return Poisoned()
+
+    def wrong(self, operand: Operand, wanted: str, span: Span, *helps: str) -> Poisoned:
+        """Report an operand of the wrong kind; the exception to raise after it."""
+        if isinstance(operand, Broken):
+            return Poisoned()
+        secondary = []
+        if isinstance(operand, Expr) and operand.op == "let" and operand.span not in (None, span):
+            assert operand.span is not None
+            if (operand.span, wanted) in self._misused:
+                return Poisoned()  # one value of the wrong kind is one mistake, however often it is used
+            self._misused.add((operand.span, wanted))
+            secondary = [Label(operand.span, "its value, set here")]
+        found = describe(operand)
+        message, label = f"expected {wanted}, found {found}", f"this is {found}"
+        self.reporter.error("PD401", message, span, label, secondary=secondary, helps=helps)
+        return Poisoned()
+
+    def flag(self, operand: Operand, span: Span) -> Expr:
+        match operand:
+            case Expr() if operand.kind == FLAG:
+                return operand
+            case SetOf():
+                return member(ELEMENT_HERE, operand.ids, span)
+            case Items():
+                return self.flag(self.set_of(operand, span), span)
+            case Absent():
+                return FALSE
+        kind = operand.kind.name if isinstance(operand, Expr) else type(operand).__name__
+        fix = {
+            "int": "compare it: `… > 0`",
+            "draw": "compare it with a chance: `… < 5%`",
+            "Place": "name the element at that place: `… is ELEMENT`",
+        }.get(kind)
+        raise self.wrong(operand, "a condition", span, *([fix] if fix else []))
+
+    def set_of(self, operand: Operand, span: Span) -> SetOf:
+        match operand:
+            case SetOf():
+                return operand
+            case Absent():
+                return SetOf(())
+            case Items():
+                ids = {number for item in operand.items for number in self.set_of(item, span).ids}
+                return SetOf(tuple(sorted(ids)))
+        raise self.wrong(operand, "a set of elements", span)
+
+    def place(self, operand: Operand, span: Span) -> Place:
+        if isinstance(operand, Place):
+            return operand
+        if isinstance(operand, Absent):
+            raise Unresolved(operand.name)
+        raise self.wrong(operand, "a neighbor", span, "such as `below`, `above.left`, or `at(2, -1)`")
+
+    def element(self, operand: Operand, span: Span) -> Expr:
+        match operand:
+            case Expr() if operand.kind == ELEMENT:
+                return operand
+            case Place():
+                return look(ELEMENT_HERE, operand.offset, span)
+            case SetOf() if operand.name is not None:
+                return Expr("const", ELEMENT, value=operand.ids[0], span=span)
+            case SetOf():
+                raise self.wrong(operand, "one element", span, "name the element itself")
+            case Absent():
+                raise Unresolved(operand.name)
+        raise self.wrong(operand, "an element", span)
+
+    def value(self, operand: Operand, span: Span) -> Expr | Number:
+        """A runtime value or a number: what arithmetic and comparison work on."""
+        match operand:
+            case Expr() | Number():
+                return operand
+            case SetOf(_, None):
+                return self.flag(operand, span)
+            case SetOf() | Place() | Absent():
+                return self.element(operand, span)
+        raise self.wrong(operand, "a value", span)
+
+    def real(self, operand: Operand, span: Span) -> Expr:
+        """A float; draws that integers were added to are rounded after each operation."""
+        value = self.value(operand, span)
+        if isinstance(value, Number):
+            return Expr("const", REAL, value=float(value.value), span=span)
+        if value.kind.name == "real":
+            return value
+        if value.kind.name == "draw" and value.op in ("add", "sub"):
+            return Expr(value.op, REAL, tuple(self.real(arg, span) for arg in value.args), span=span)
+        if value.kind.name == "draw" and value.op == "look":
+            return look(self.real(value.args[0], span), value.value, span)
+        if value.kind.name in ("int", "chance", "draw", "flag"):
+            return Expr("to_real", REAL, (value,), span=span)
+        raise self.wrong(value, "a number", span)
+
+    def integer(self, operand: Operand, span: Span) -> Expr:
+        value = self.value(operand, span)
+        if isinstance(value, Number):
+            if value.value.denominator != 1:
+                label = f"{float(value.value):g} is not whole"
+                fix = "write an integer; a field may also be declared as `real(LOW..HIGH)`"
+                raise self.fail("PD401", "expected an integer", span, label, fix)
+            return constant(value, span)
+        if value.kind.name == "int":
+            return value
+        raise self.wrong(value, "an integer", span, *_integer_helps(value, span))
+
+    def chance(self, operand: Operand, span: Span) -> Expr:
+        """A probability: a constant within 0..1, or a property, parameter or field that is one."""
+        value = self.value(operand, span)
+        if isinstance(value, Number):
+            if not 0 <= value.value <= 1:
+                fix = "write a chance from `0%` to `100%`"
+                if 1 < value.value <= 100 and "%" not in span.text:
+                    fix = f"did you mean `{float(value.value):g}%`?"
+                message = f"a chance of {float(value.value * 100):g}%"
+                raise self.fail("PD403", message, span, "chances lie in 0%..100%", fix)
+            return Expr("const", CHANCE, value=value.value, span=span)
+        if value.kind.name in ("chance", "real"):
+            return value
+        if value.kind.name == "int":
+            return self.real(value, span)
+        raise self.wrong(value, "a chance", span, "such as `5%`, or a parameter")
+
+    def of_kind(self, operand: Operand, kind: Kind, span: Span) -> Expr:
+        """A value to store in something of `kind`. Constants out of range are reported."""
+        match kind.name:
+            case "flag" if isinstance(operand, Number) and operand.value in (0, 1):
+                return Expr("const", FLAG, value=int(operand.value), span=span)
+            case "flag":
+                return self.flag(operand, span)
+            case "element":
+                return self.element(operand, span)
+            case "direction":
+                return self.direction(operand, span)
+            case "chance":
+                return self.chance(operand, span)
+            case "vec2":
+                return self.vector(operand, span)
+            case "real":
+                value = self.real(operand, span)
+            case _:
+                value = self.integer(operand, span)
+        number = value.value if value.op == "const" else kind.lo
+        if isinstance(number, (int, float)) and not kind.lo <= number <= kind.hi:
+            label, fix = (
+                f"the range is {kind.lo:g}..{kind.hi:g}",
+                "write a number in this range, or widen it where it is declared",
+            )
+            raise self.fail("PD402", f"{number:g} lies outside {kind}", span, label, fix)
+        return value
+
+    def vector(self, operand: Operand, span: Span) -> Expr:
+        if isinstance(operand, Number) and operand.value == 0:
+            zero = Expr("const", REAL, value=0.0, span=span)
+            return Expr("vector", VEC2, (zero, zero), span=span)
+        value = self.value(operand, span)
+        if isinstance(value, Expr) and value.kind.name == "vec2":
+            return value
+        raise self.wrong(value, "a vector", span, "such as `vector(1, 0)`: rows down, columns right")
+
+    def direction(self, operand: Operand, span: Span) -> Expr:
+        if isinstance(operand, Place):
+            if operand.offset in OCTANTS:
+                return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
+            raise self.fail("PD401", "not a direction", span, "directions are the eight neighbors")
+        if isinstance(operand, Expr) and operand.kind == DIRECTION:
+            return operand
+        if isinstance(operand, Absent):
+            raise Unresolved(operand.name)
+        raise self.wrong(operand, "a direction", span, "such as `left`, or `octant(…)`")
+
+    def offset(self, offset: Offset, span: Span) -> Offset:
+        """An offset that rules can reach."""
+        if max(abs(offset[0]), abs(offset[1])) > MAX_OFFSET:
+            label = f"rules reach {MAX_OFFSET} cells a step"
+            raise self.fail("PD409", "a neighbor too far away", span, label)
+        return offset
+
+    def bounded(self, value: Expr, span: Span) -> Expr:
+        """An integer whose declared range is still reasonable."""
+        most = max(abs(value.kind.lo), abs(value.kind.hi))
+        if most > MAX_MAGNITUDE:
+            raise self.fail("PD402", f"numbers up to {most:,}", span, f"the limit is {MAX_MAGNITUDE:,}")
+        return value
+
+
+def _integer_helps(value: Expr, span: Span) -> tuple[str, ...]:
+    """What to write instead of a float where an integer is wanted."""
+    if value.kind.name != "real":
+        return ()
+    declared = "or declare what takes it as `real(LOW..HIGH)`"
+    whole = all(arg.op in ("to_real", "const") for arg in value.args)
+    if value.op == "div" and whole and span.text.count("/") == 1:
+        left, _, right = span.text.partition("/")
+        return (f"integer division rounds down: `{left.strip()} div {right.strip()}`", declared)
+    factor = next((arg.value for arg in value.args if arg.op == "const"), None)
+    if value.op == "mul" and whole and isinstance(factor, (int, float)) and span.text.count("*") == 1:
+        number = next(
+            part.strip() for part in span.text.split("*") if not re.fullmatch(r"[-\d.eE%\s]+", part)
+        )
+        ratio = Fraction(factor).limit_denominator(1000)
+        times = "" if ratio.numerator == 1 else f" * {ratio.numerator}"
+        return (f"integers stay whole: `{number}{times} div {ratio.denominator}`", declared)
+    return ("`a div b` divides integers and rounds down", declared)
+
+
+# Literals: no float is involved, `2%` is 1/50
+
+
+def read_number(syntax: Syntax, coercer: Coercer) -> Fraction:
+    """The exact value of an integer, decimal or percentage literal."""
+    text = syntax.text
+    if syntax.kind == "integer" and len(text) > 1 and text[0] == "0":
+        fix = f"write `{text.lstrip('0') or '0'}`"
+        raise coercer.fail("PD110", f"`{text}` starts with a zero", syntax.span, "not a plain number", fix)
+    limit = f"the limit is {MAX_MAGNITUDE:,}"
+    if "e" in text.lower() and abs(int(text.lower().split("e")[1])) > 12:
+        raise coercer.fail("PD402", f"`{text}` is too large or too small", syntax.span, limit)
+    value = Fraction(text.removesuffix("%"))
+    if syntax.kind == "percent":
+        value /= 100
+    if abs(value) > MAX_MAGNITUDE:
+        raise coercer.fail("PD402", f"`{text}` is too large", syntax.span, limit)
+    return value
+
+
+def read_bounds(syntax: Syntax, coercer: Coercer) -> tuple[int, int]:
+    """The bounds of `LOW..HIGH`, integer literals."""
+    if syntax.kind != "range":
+        raise coercer.fail("PD401", "expected a range", syntax.span, "such as `0..7`")
+    bounds = []
+    for end in syntax.children:
+        sign, literal = (-1, end.children[0]) if end.kind == "negate" else (1, end)
+        if literal.kind != "integer":
+            raise coercer.fail("PD405", "a range has integers at its ends", end.span, "not an integer")
+        bounds.append(sign * int(read_number(literal, coercer)))
+    lo, hi = bounds
+    if lo > hi:
+        label, fix = f"{lo} is above {hi}", f"write `{hi}..{lo}`"
+        raise coercer.fail("PD402", "a range that runs backwards", syntax.span, label, fix)
+    return lo, hi

@@ -1,0 +1,420 @@
+"""Arithmetic, comparisons and membership: kinds, ranges and exact constant folding.
+
+Integers carry their bounds; draws add up with integers only and compare exactly; everything else is
+float32, one rounding an operation, in the order written.
+"""
+
+from __future__ import annotations
+
+import operator
+from fractions import Fraction
+from math import ceil, floor
+from typing import TYPE_CHECKING
+
+from powderdsl.diagnostics import Span
+from powderdsl.model.builtins import COORDINATES
+from powderdsl.model.expressions.operands import (
+    FALSE,
+    TRUE,
+    Absent,
+    Bounds,
+    Items,
+    Number,
+    Operand,
+    Place,
+    Poisoned,
+    Scope,
+    SetOf,
+    Unresolved,
+    Value,
+    conjunction,
+    constant,
+    disjunction,
+    look,
+    member,
+    negation,
+)
+from powderdsl.model.operations import OPS
+from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Expr, Kind, integer
+from powderdsl.syntax.ast import Syntax
+
+if TYPE_CHECKING:
+    from powderdsl.model.expressions.typer import Typer
+
+Placed = tuple[Value, Span]
+"""A value and where it stands."""
+
+MAX_MODULUS = 64
+
+
+def kind_name(value: Operand | None) -> str:
+    """The name of a runtime value's kind; nothing for other operands."""
+    return value.kind.name if isinstance(value, Expr) else ""
+
+
+def is_integer(value: Value) -> bool:
+    """Whether a value is an integer, or a constant that is one."""
+    return value.value.denominator == 1 if isinstance(value, Number) else value.kind.name == "int"
+
+
+def on_integers(typer: Typer, op: str, values: tuple[Value, ...], span: Span) -> Expr:
+    """An operation on integers; its range follows from theirs."""
+    args = tuple(typer.integer(value, span) for value in values)
+    return Expr(op, _range(op, *(arg.kind for arg in args)), args, span=span)
+
+
+def _range(op: str, *kinds: Kind) -> Kind:
+    bounds = OPS[op].bounds
+    assert bounds is not None
+    return integer(*bounds(None, *((kind.lo, kind.hi) for kind in kinds)))
+
+
+def on_floats(typer: Typer, op: str, values: tuple[Value, ...], span: Span) -> Expr:
+    return Expr(op, REAL, tuple(typer.real(value, span) for value in values), span=span)
+
+
+# Comparisons
+
+_COMPARISONS = {"==": "eq", "<": "lt", "<=": "le"}
+_FLIP = {">": "<", ">=": "<="}
+_COMPARABLE = {
+    FLAG: ("a condition", "a condition holds or not: write it, or `not` and it"),
+    ELEMENT: ("an element", "ask for an element, or one of a set, with `is`"),
+    DIRECTION: ("a direction", "such as `left`, or `at(-1, 1)`"),
+}
+"""Kinds that are compared with their own kind only: in words, and what to write instead."""
+
+
+def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) -> Expr:
+    """A comparison as `eq`, `lt` or `le`, maybe negated."""
+    if sign == "!=":
+        return negation(compare(typer, "==", left, right, span), span)
+    if sign in _FLIP:
+        return compare(typer, _FLIP[sign], right, left, span)
+    (a, _), (b, _) = left, right
+    op = _COMPARISONS[sign]
+    if isinstance(a, Number) and isinstance(b, Number):
+        return TRUE if getattr(operator, op)(a.value, b.value) else FALSE
+    kinds = {kind_name(value) for value in (a, b)} - {""}
+    if "draw" in kinds:
+        return _compare_draw(typer, op, left, right, span)
+    if kinds & {"element", "direction", "flag", "vec2"}:
+        return _compare_discrete(typer, op, left, right, span)
+    if kinds == {"int"}:
+        return _compare_integers(typer, op, a, b, span)
+    return Expr(op, FLAG, (typer.real(a, span), typer.real(b, span)), span=span)
+
+
+def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
+    for (value, _), (other, place) in ((left, right), (right, left)):
+        if isinstance(value, Expr) and value.kind in _COMPARABLE:
+            words, fix = _COMPARABLE[value.kind]
+            if not isinstance(other, Expr) or other.kind != value.kind:
+                raise typer.wrong(other, f"{words} to compare with {words}", place, fix)
+            if op != "eq":
+                message = f"{words} is not more or less than another"
+                raise typer.fail("PD401", message, span, "has no order", "use `==` or `!=`")
+            return Expr(op, FLAG, (left[0], right[0]), span=span)  # type: ignore[arg-type]
+    fix = "compare `length(…)`, or `.row` and `.column`"
+    raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", fix)
+
+
+def _compare_integers(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
+    """Integers with integers; a bound such as 1.5 is rounded to the integer that means the same."""
+    if op == "eq" and not (is_integer(left) and is_integer(right)):
+        return FALSE
+    if isinstance(left, Number) and not is_integer(left):
+        left = Number(Fraction(floor(left.value) + (op == "le")))
+    elif isinstance(right, Number) and not is_integer(right):
+        right = Number(Fraction(ceil(right.value) - (op == "le")))
+    return Expr(op, FLAG, (typer.integer(left, span), typer.integer(right, span)), span=span)
+
+
+def _compare_draw(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
+    if op == "eq":
+        message, fix = "a draw never equals anything exactly", "compare with `<` or `>`"
+        raise typer.fail("PD401", message, span, "always false", fix)
+    first = kind_name(left[0]) == "draw"
+    (draw, _), (other, place) = (left, right) if first else (right, left)
+    assert isinstance(draw, Expr)
+    if kind_name(other) == "draw":
+        raise typer.fail("PD401", "two draws are not compared", span, "one side must be a number")
+    if isinstance(other, Number):
+        if not draw.kind.lo <= other.value <= draw.kind.hi:
+            if (draw.kind.lo, draw.kind.hi) == (0, 1):
+                shown = f"{float(other.value):g}"
+                fix = f"`{shown}%`" if 0 <= other.value <= 100 else "a chance such as `20%`"
+                message, label = f"a draw compared with {shown}", "draws lie between 0 and 1"
+                raise typer.fail("PD403", message, place, label, f"did you mean {fix}?")
+            return TRUE if (other.value > draw.kind.hi) == first else FALSE
+        kind = CHANCE if 0 <= other.value <= 1 else Kind("number")
+        _check_resolution(typer, draw, other.value, place)
+        other = Expr("const", kind, value=other.value, span=span)
+    if other.kind.name == "real":
+        draw = typer.real(draw, span)
+    elif other.kind.name not in ("chance", "number", "int"):
+        fix = "such as `5%`, a parameter or a property"
+        raise typer.wrong(other, "a chance to compare the draw with", place, fix)
+    # A draw lies strictly between two multiples of its resolution's half step: `<` and `<=` mean the same.
+    return Expr("lt", FLAG, (draw, other) if first else (other, draw), span=span)
+
+
+def _check_resolution(typer: Typer, draw: Expr, chance: Fraction, span: Span) -> None:
+    """Warn of a chance that is far from the nearest one that the stream can draw."""
+    if draw.op != "draw" or not 0 < chance < 1:
+        return
+    stream = typer.symbols.streams.get(str(draw.value))
+    steps = 1 << (stream.bits if stream else 32)
+    nearest = Fraction(max(0, ceil(chance * steps - Fraction(1, 2))), steps)
+    if abs(nearest - chance) > chance / 20:
+        message = f"a chance of {float(100 * chance):.3g}% is drawn as {float(100 * nearest):.3g}%"
+        label, fix = (
+            f"this stream draws in steps of 1/{steps}",
+            "declare the stream with `bits: 32`, or say `with chance`",
+        )
+        typer.reporter.report("PD404", message, span, label, helps=[fix])
+
+
+# `is` and `in`
+
+
+def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
+    """Whether `left` is, or lies in, `right`: what the two sides can be, and what it means."""
+    span = syntax.span
+    first, second = (child.span for child in syntax.children)
+    match left, right:
+        case Place(), Place():
+            return TRUE if left == right else FALSE
+        case Place(), Items() if all(isinstance(item, Place) for item in right.items):
+            return TRUE if left in right.items else FALSE
+        case Place(), Expr() if right.kind == FLAG:
+            return look(right, left.offset, span)
+        case Number(), Number():
+            return TRUE if left == right else FALSE
+        case SetOf(), SetOf() if left.name is not None:
+            return TRUE if left.ids[0] in right.ids else FALSE
+        case Expr(), Place():
+            return compare(typer, "==", (left, span), (typer.direction(right, second), span), span)
+        case _, Expr() if right.kind == DIRECTION:
+            return compare(typer, "==", (typer.direction(left, first), span), (right, span), span)
+        case _, Bounds():
+            value = (typer.value(left, first), span)
+            low, high = ((Number(Fraction(bound)), span) for bound in (right.lo, right.hi))
+            parts = [compare(typer, "<=", low, value, span), compare(typer, "<=", value, high, span)]
+            return conjunction(parts, span)
+        case _, Items() if any(_stands_alone(item) for item in right.items):
+            return disjunction([_equals(typer, left, item, syntax) for item in right.items], span)
+        case _, Number():
+            raise _not_a_set(typer, syntax)
+        case _, Absent():
+            return FALSE
+        case Absent(), _:
+            raise Unresolved(left.name)
+    ids = typer.set_of(right, second).ids
+    if isinstance(left, SetOf) and left.name is None:
+        raise typer.wrong(left, "a place or an element before `is`", first, "such as `below is …`")
+    return member(typer.element(left, first), ids, span)
+
+
+def _stands_alone(item: Operand) -> bool:
+    """Whether an item of a list is compared by itself: numbers and directions. The others join to a set of elements."""
+    return isinstance(item, (Number, Place)) or kind_name(item) == "direction"
+
+
+def _equals(typer: Typer, left: Operand, item: Operand, syntax: Syntax) -> Expr:
+    """Whether `left` is one item of a list: numbers are compared, places and elements named."""
+    if isinstance(item, Number) and not isinstance(left, Number):
+        value = typer.value(left, syntax.children[0].span)
+        return compare(typer, "==", (value, syntax.span), (item, syntax.span), syntax.span)
+    return holds(typer, left, item, syntax)
+
+
+def _not_a_set(typer: Typer, syntax: Syntax) -> Poisoned:
+    second = syntax.children[1]
+    message, fix = "`in` asks for a range or a set", "compare numbers with `==`"
+    if syntax.kind in ("is_", "is_not"):
+        message = "`is` asks for an element or a direction"
+    elif second.kind == "subtract":
+        fix = "a range is written `LOW..HIGH`"
+    return typer.fail("PD401", message, second.span, "this is a number", fix)
+
+
+# Arithmetic
+
+_BINARY = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div"}
+"""Kinds of syntax, and the operations that they are."""
+
+
+def binary(typer: Typer, left: Value, right: Value, syntax: Syntax) -> Value:
+    """`+ - * /` on numbers and vectors."""
+    op, span = _BINARY[syntax.kind], syntax.span
+    if isinstance(left, Number) and isinstance(right, Number):
+        _check_divisor(typer, op, right, syntax)
+        value = getattr(operator, "truediv" if op == "div" else op)(left.value, right.value)
+        if abs(value) > 10**6 or value.denominator > 10**18:
+            raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
+        return Number(value)
+    for value, child in zip((left, right), syntax.children, strict=True):
+        if kind_name(value) in ("flag", "element", "direction"):
+            raise typer.wrong(value, "a number", child.span)
+    _check_divisor(typer, op, right, syntax)
+    kinds = [kind_name(value) for value in (left, right)]
+    if "vec2" in kinds:
+        return _on_vectors(typer, op, left, right, span)
+    if op != "div" and is_integer(left) and is_integer(right):
+        return typer.bounded(on_integers(typer, op, (left, right), span), span)
+    # An integer added to a draw, or subtracted from it, shifts its range.
+    shifts = op == "add" or (op == "sub" and kinds[0] == "draw")
+    if shifts and sorted(kinds) in (["", "draw"], ["draw", "int"]):
+        a, b = (
+            value if isinstance(value, Expr) and value.kind.name == "draw" else typer.integer(value, span)
+            for value in (left, right)
+        )
+        bounds = _range(op, a.kind, b.kind)
+        return Expr(op, Kind("draw", bounds.lo, bounds.hi), (a, b), span=span)
+    return on_floats(typer, op, (left, right), span)
+
+
+def _check_divisor(typer: Typer, op: str, divisor: Value, syntax: Syntax) -> None:
+    zero = divisor.value == 0 if isinstance(divisor, Number) else divisor.op == "const" and divisor.value == 0
+    if op in ("div", "quotient") and zero:
+        raise typer.fail("PD402", "division by zero", syntax.children[1].span, "this is 0")
+
+
+def _on_vectors(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
+    first, second = (kind_name(value) == "vec2" for value in (left, right))
+    if op in ("add", "sub") and not (first and second):
+        message, fix = "a vector adds up with vectors only", "write `vector(rows, columns)`"
+        raise typer.fail("PD401", message, span, "one side is not a vector", fix)
+    if (op == "mul" and first and second) or (op == "div" and second):
+        message = "a vector is multiplied or divided by a number"
+        raise typer.fail("PD401", message, span, "the other way round, or two vectors")
+    a = left if first else typer.real(left, span)
+    b = right if second else typer.real(right, span)
+    return Expr(op, VEC2, (a, b), span=span)  # type: ignore[arg-type]
+
+
+def negate(typer: Typer, value: Value, span: Span) -> Value:
+    if isinstance(value, Number):
+        return Number(-value.value)
+    match value.kind.name:
+        case "int":
+            return on_integers(typer, "neg", (value,), span)
+        case "element" | "flag":
+            raise typer.wrong(value, "a number", span, "an item of a list has a blank after its `-`")
+        case "vec2":
+            return Expr("neg", VEC2, (value,), span=span)
+    return on_floats(typer, "neg", (value,), span)
+
+
+def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
+    """`a div b`: integers, rounded down; 0 where b is 0."""
+    values = [(typer.value_of(child, scope), child.span) for child in syntax.children]
+    for value, span in values:
+        if kind_name(value) == "real":
+            raise typer.wrong(value, "an integer", span, "`div` divides integers; for floats say `/`")
+    a, b = (typer.integer(*value) for value in values)
+    _check_divisor(typer, "quotient", b, syntax)
+    if a.op == b.op == "const":
+        return Number(Fraction(int(a.value) // int(b.value)))
+    return Expr("quotient", _quotient_range(a.kind, b.kind), (a, b), span=syntax.span)
+
+
+def _quotient_range(a: Kind, b: Kind) -> Kind:
+    """The range of a div b: for divisors of one sign, the extremes lie at the ends of both ranges."""
+    divisors = [d for d in (b.lo, min(b.hi, -1), max(b.lo, 1), b.hi) if d and b.lo <= d <= b.hi]
+    corners = [x // d for x in (a.lo, a.hi) for d in divisors]
+    if b.lo <= 0 <= b.hi:
+        corners.append(0)
+    return integer(min(corners), max(corners))
+
+
+def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
+    """`x mod n` for an integer constant n; coordinates (and their sums) may only appear here."""
+    left, right = syntax.children
+    modulus = _small_constant(typer, right, scope, MAX_MODULUS)
+    if modulus is None:
+        label = f"expected 1 to {MAX_MODULUS}"
+        raise typer.fail("PD405", "`mod` takes an integer constant", right.span, label)
+    value = _coordinate_sum(typer, left, modulus, scope)
+    if isinstance(value, Number):
+        if not is_integer(value):
+            raise typer.fail("PD401", "`mod` takes integers", left.span)
+        return Number(Fraction(int(value.value) % modulus))
+    return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
+
+
+def _small_constant(typer: Typer, syntax: Syntax, scope: Scope, most: int) -> int | None:
+    """An integer constant from 1 to `most`, if it is one."""
+    value = typer.value_of(syntax, scope)
+    if isinstance(value, Number) and is_integer(value) and 1 <= value.value <= most:
+        return int(value.value)
+    return None
+
+
+def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Value:
+    """Sums of coordinates, each reduced by the modulus, so that every part has a small declared range."""
+    if syntax.kind == "name" and syntax.text in COORDINATES:
+        return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
+    if syntax.kind in ("add", "subtract"):
+        left, right = (_coordinate_sum(typer, child, modulus, scope) for child in syntax.children)
+        return binary(typer, left, right, syntax)
+    if syntax.kind == "quotient" and _names_coordinate(syntax.children[0]):
+        return _coordinate_quotient(typer, syntax, modulus, scope)
+    value = typer.value_of(syntax, scope)
+    return value if isinstance(value, Number) else typer.integer(value, syntax.span)
+
+
+def _names_coordinate(syntax: Syntax) -> bool:
+    """Whether a sum has a coordinate among its terms."""
+    if syntax.kind in ("add", "subtract"):
+        return any(_names_coordinate(child) for child in syntax.children)
+    return syntax.kind == "name" and syntax.text in COORDINATES
+
+
+def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Expr:
+    """`row div n` under `mod m`: what `row mod (n · m)` says, divided by n."""
+    left, right = syntax.children
+    most = MAX_MODULUS // modulus
+    number = _small_constant(typer, right, scope, most)
+    if number is None:
+        label = f"expected 1 to {most}: times {modulus} it is at most {MAX_MODULUS}"
+        raise typer.fail("PD405", "a coordinate is divided by an integer constant", right.span, label)
+    inner = typer.integer(_coordinate_sum(typer, left, modulus * number, scope), left.span)
+    known = Expr("mod", integer(0, modulus * number - 1), (inner,), modulus * number, left.span)
+    by = constant(Number(Fraction(number)), right.span)
+    return Expr("quotient", integer(0, modulus - 1), (known, by), span=syntax.span)
+
+
+def choose(
+    typer: Typer, condition: Expr, yes: tuple[Operand, Span], no: tuple[Operand, Span], span: Span
+) -> Expr:
+    """`a if c else b`, both of one kind; integers join their ranges."""
+    a, b = typer.value(*yes), typer.value(*no)
+    kinds = {kind_name(value) or "number" for value in (a, b)}
+    if is_integer(a) and is_integer(b):
+        first, second = typer.integer(a, yes[1]), typer.integer(b, no[1])
+        kind = integer(min(first.kind.lo, second.kind.lo), max(first.kind.hi, second.kind.hi))
+    elif kinds <= {"chance", "number"} and all(
+        0 <= value.value <= 1 for value in (a, b) if isinstance(value, Number)
+    ):
+        kind, first, second = CHANCE, typer.chance(a, yes[1]), typer.chance(b, no[1])
+    elif kinds <= {"int", "number", "real", "chance", "draw"}:
+        kind, first, second = REAL, typer.real(a, yes[1]), typer.real(b, no[1])
+    else:  # a place is an element or a direction, whichever the other value is
+        kind = next(o for o in (yes[0], no[0], a, b) if isinstance(o, Expr)).kind
+        first, second = typer.of_kind(yes[0], kind, yes[1]), typer.of_kind(no[0], kind, no[1])
+    return Expr("choose", kind, (condition, first, second), span=span)
+
+
+def extreme(typer: Typer, op: str, values: list[Value], span: Span) -> Value:
+    """`min` or `max` of several numbers."""
+    result = values[0]
+    for value in values[1:]:
+        if isinstance(result, Number) and isinstance(value, Number):
+            result = Number((min if op == "min" else max)(result.value, value.value))
+        elif is_integer(result) and is_integer(value):
+            result = on_integers(typer, op, (result, value), span)
+        else:
+            result = on_floats(typer, op, (result, value), span)
+    return constant(result, span) if isinstance(result, Number) and is_integer(result) else result
