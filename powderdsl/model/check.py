@@ -32,12 +32,16 @@ from powderdsl.model.expressions.symbols import (
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.fields.values import add_field_values, unknown_element_key
 from powderdsl.model.invariants import check_invariants
-from powderdsl.model.logic.conflicts import check_logic, overridden_ids, produced_ids, without_dead_overrides
-from powderdsl.model.logic.lost_writes import report_lost_writes
-from powderdsl.model.logic.needless import report_needless, report_undrawn, silent_rules
+from powderdsl.model.logic.conflicts import check_logic
+from powderdsl.model.logic.needless import (
+    report_lost_writes,
+    report_needless,
+    report_undecided,
+    report_undrawn,
+    silent_rules,
+)
 from powderdsl.model.logic.satisfy import Facts
-from powderdsl.model.logic.undecided import report_undecided
-from powderdsl.model.logic.unused import report_unused
+from powderdsl.model.logic.unused import overridden_ids, produced_ids, report_unused, without_dead_overrides
 from powderdsl.model.ramps import element_ramps
 from powderdsl.model.types import (
     CHANCE,

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from powderdsl.analysis.reactions import facts_of
 from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
-from powderdsl.model.logic.budget import Budget
-from powderdsl.model.logic.satisfy import Facts, satisfiable
+from powderdsl.model.logic.satisfy import Budget, Facts, satisfiable
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule, Ruleset, Swap, Transform
 

@@ -22,8 +22,7 @@ from powderdsl.ir.ops import (
     component_of,
     integer,
 )
-from powderdsl.model.logic.budget import Budget
-from powderdsl.model.logic.satisfy import Facts, satisfiable
+from powderdsl.model.logic.satisfy import Budget, Facts, satisfiable
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Assign, Field, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
 

@@ -3,31 +3,54 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from math import lcm
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.added_conflicts import AddedPacks, may_settle, report_added
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
-from powderdsl.model.expressions.operands import ELEMENT_HERE, negation
-from powderdsl.model.expressions.operands import member as member_of
-from powderdsl.model.logic.apart import Glances
-from powderdsl.model.logic.budget import BUDGET, MAX_QUESTION, Budget
-from powderdsl.model.logic.lasting import lasting
-from powderdsl.model.logic.satisfy import Facts, decide, example, satisfiable
-from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule, Swap, Transform
+from powderdsl.model.expressions.operands import (
+    ELEMENT_HERE,
+    TRUE,
+    conjunction,
+    disjunction,
+    look,
+    member,
+    negation,
+)
+from powderdsl.model.logic.satisfy import (
+    BUDGET,
+    HERE,
+    MAX_QUESTION,
+    Budget,
+    Conditions,
+    Facts,
+    Lets,
+    alone,
+    decide,
+    example,
+    satisfiable,
+    substeps,
+)
+from powderdsl.model.operations import OPS
+from powderdsl.model.types import FLAG, Assign, Expr, Move, Offset, Pass, Rule, Swap, Transform
 
 if TYPE_CHECKING:
     from powderdsl.model.elaborate import Elaborated
 
-HERE: Offset = (0, 0)
-
 ASSIGN = "two rules may assign"
 
-ALL_MOMENTS = 3
+ALL_SUBSTEPS = 3
 """Work for the conflicts of all substeps together, as a multiple of that for one."""
+
+GLANCE = 3
+"""What a comparison of two rules costs, in nodes."""
+
+MAX_PARTS = 64
+"""Parts of a condition that follows from a value; of a longer one nothing is kept, which is true of it too."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +100,25 @@ class _Found:
     places: list[tuple[int, int]]
 
 
+@dataclass
+class _Fate:
+    """What is known of the copies of a rule; None if that takes too much work to decide.
+
+    Args:
+        fires: whether one of them may happen.
+        useful: whether one of them may change something.
+        silent: conditions and values of those that never happen.
+    """
+
+    fires: bool | None = False
+    useful: bool | None = False
+    silent: list[tuple[Expr, Lets]] = field(default_factory=list)
+
+    @property
+    def is_decided(self) -> bool:
+        return self.fires is not None and not (self.fires and self.useful is None)
+
+
 def check_logic(
     passes: tuple[Pass, ...],
     facts: Facts,
@@ -86,38 +128,35 @@ def check_logic(
 ) -> tuple[tuple[Pass, ...], list[Span]]:
     """Report conflicts (errors), rules that never fire or do nothing (warnings), and those that sleep (notes).
 
-    Conflicts that come from `added` packs alone are settled.
+    Conflicts that come from `added` packs alone are resolved.
 
     Returns:
-        The passes, which say how conflicts are settled, and the rules that may never fire or do nothing: to tell takes
-        too much work.
+        The passes, with how conflicts are resolved, and the rules of which it takes too much work to decide whether
+        they fire or do anything.
     """
-    relaxed = replace(facts.relaxed(), budget=Budget())
-    silent: dict[Span, list[tuple[Expr, dict[str, Expr]]]] = {}
-    alive: dict[Span, bool | None] = {}
-    useful: dict[Span, bool | None] = {}
+    fates: dict[Span, _Fate] = {}
     conflicts: dict[Conflict, _Found] = {}
     work: list[tuple[int, int, Pass]] = []
-    left = ALL_MOMENTS * BUDGET
+    left = ALL_SUBSTEPS * BUDGET
     for at, pass_ in enumerate(passes):
-        earlier: dict[str, Expr] = {}
-        for number, moment in enumerate(pass_.moments):
-            lets = earlier | {let.name: let.value for let in moment.lets}
+        earlier: Lets = {}
+        for number, (_, moment, own) in enumerate(substeps([pass_])):
+            lets = earlier | own
             earlier = lasting(lets)
             live = []
             for rule in moment.rules:
                 fires = rule.mask is None or decide(facts, [(rule.mask, HERE)], lets)
-                alive[rule.span] = _either(alive.get(rule.span, False), fires)
                 changes = _changes(rule, facts, lets) if fires else fires is False or None
-                useful[rule.span] = _either(useful.get(rule.span, False), changes)
+                fate = fates.setdefault(rule.span, _Fate())
+                fate.fires, fate.useful = _either(fate.fires, fires), _either(fate.useful, changes)
                 if fires is not False:
                     live.append(rule)
                 elif rule.mask is not None:
-                    silent.setdefault(rule.span, []).append((rule.mask, lets))
+                    fate.silent.append((rule.mask, lets))
             if moment.policy == "prove":
                 given = min(BUDGET, left)
                 asked = replace(facts, budget=Budget(given))
-                for conflict, found in _check_moment(live, asked, lets):
+                for conflict, found in _check_substep(live, asked, lets):
                     known = conflicts.setdefault(conflict, _Found(found, [], []))
                     known.labels.append(moment.label)
                     known.places.append((at, number))
@@ -126,30 +165,39 @@ def check_logic(
     if _too_much(work, reporter):
         return passes, []
     passes = _report_conflicts(conflicts, passes, facts, added, reporter)
-    for span, fires in alive.items():
-        if fires is None or (fires and useful[span] is None):
-            continue
-        if not fires and span in elaborated.asleep:
-            _report_sleep(f"`{elaborated.asleep[span]}` is not loaded", span, reporter)
-        elif not fires and span in elaborated.empty:
-            _report_sleep(f"no element is in `{elaborated.empty[span]}`", span, reporter)
-        elif not fires and any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in silent.get(span, [])):
-            _report_sleep("no loaded element has the properties it asks for", span, reporter)
-        elif not fires:
-            reporter.report(
-                "PD503",
-                "this rule can never fire",
-                span,
-                "no cell can fulfill all of it",
-                helps=["look for conditions that exclude each other, or that no element's properties meet"],
+    relaxed = replace(facts.relaxed(), budget=Budget())
+    for span, fate in fates.items():
+        if fate.is_decided:
+            _report_fate(span, fate, relaxed, elaborated, reporter)
+    return passes, [span for span, fate in fates.items() if not fate.is_decided]
+
+
+def _report_fate(span: Span, fate: _Fate, relaxed: Facts, elaborated: Elaborated, reporter: Reporter) -> None:
+    """Report a rule that never fires, and why, or that changes nothing."""
+    if fate.fires:
+        if not fate.useful:
+            label, fix = (
+                "the cell already is what it becomes",
+                "remove it, or name another element after `->`",
             )
-        elif not useful[span]:
-            reporter.report(
-                "PD509", "this rule changes nothing", span, "the cell already is what it becomes",
-                helps=["remove it, or name another element after `->`"],
-            )  # fmt: skip
-    undecided = [span for span, fires in alive.items() if fires is None or (fires and useful[span] is None)]
-    return passes, undecided
+            reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
+        return
+    if span in elaborated.asleep:
+        reason = f"`{elaborated.asleep[span]}` is not loaded"
+    elif span in elaborated.empty:
+        reason = f"no element is in `{elaborated.empty[span]}`"
+    elif any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in fate.silent):
+        reason = "no loaded element has the properties it asks for"
+    else:
+        fix = "look for conditions that exclude each other, or that no element's properties meet"
+        label = "no cell can fulfill all of it"
+        reporter.report("PD503", "this rule can never fire", span, label, helps=[fix])
+        return
+    label, fix = (
+        "cannot happen with these packs",
+        "it becomes active with a pack that brings what it asks for",
+    )
+    reporter.report("PD506", f"this rule is inactive: {reason}", span, label, helps=[fix])
 
 
 def _report_conflicts(
@@ -159,8 +207,8 @@ def _report_conflicts(
     added: AddedPacks | None,
     reporter: Reporter,
 ) -> tuple[Pass, ...]:
-    """Report conflicts; the passes with those settled that added packs bring about."""
-    settled: set[tuple[int, int]] = set()
+    """Report conflicts; the passes with those resolved that added packs bring about."""
+    resolved: set[tuple[int, int]] = set()
     for conflict, found in conflicts.items():
         words = _in_words(facts, found.example)
         pass_ = passes[found.places[0][0]]
@@ -170,23 +218,17 @@ def _report_conflicts(
             conflict.report(found.labels, words, reporter)
             continue
         assigns = conflict.message.startswith(ASSIGN)
-        settles = assigns or all(may_settle(passes[at].moments[number]) for at, number in found.places)
-        if settles and not assigns:
-            settled.update(found.places)
+        resolves = assigns or all(may_settle(passes[at].moments[number]) for at, number in found.places)
+        if resolves and not assigns:
+            resolved.update(found.places)
         notes = [words] if words else []
-        report_added(conflict.code, conflict.claims, notes, causes, pass_.name, settles, assigns, reporter)
-    return tuple(
-        replace(
-            pass_,
-            moments=tuple(
-                replace(moment, policy="first_wins") if (at, number) in settled else moment
-                for number, moment in enumerate(pass_.moments)
-            ),
-        )
-        if any(one == at for one, _ in settled)
-        else pass_
-        for at, pass_ in enumerate(passes)
-    )
+        report_added(conflict.code, conflict.claims, notes, causes, pass_.name, resolves, assigns, reporter)
+    changed = list(passes)
+    for at, number in sorted(resolved):
+        moments = list(changed[at].moments)
+        moments[number] = replace(moments[number], policy="first_wins")
+        changed[at] = replace(changed[at], moments=tuple(moments))
+    return tuple(changed)
 
 
 def _either(first: bool | None, second: bool | None) -> bool | None:
@@ -201,38 +243,30 @@ def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
         work: for each substep the work that was spent, the number of its rules, and its pass.
     """
     hard = {pass_.name: (count, pass_) for spent, count, pass_ in work if spent > BUDGET}
-    together = sum(spent for spent, _, _ in work) > ALL_MOMENTS * BUDGET
+    together = sum(spent for spent, _, _ in work) > ALL_SUBSTEPS * BUDGET
     if together and not hard:
         _, count, most = max(work, key=lambda one: one[0])
         hard = {most.name: (count, most)}
     for count, pass_ in hard.values():
-        reporter.error(
-            "PD508", f"comparing the rules of `{pass_.name}` with each other takes too much work", pass_.span,
-            f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs",
-            helps=[
-                "choose what happens to conflicts, then nothing is compared: `conflicts: first_wins`",
-                "or divide the list until its parts are short enough: rules that need not happen at once go under `then:`",
-            ],
-        )  # fmt: skip
+        message = f"comparing the rules of `{pass_.name}` with each other takes too much work"
+        label = f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs"
+        helps = [
+            "choose what happens to conflicts, then nothing is compared: `conflicts: first_wins`",
+            "or divide the list until its parts are short enough: rules that need not happen at once go under `then:`",
+        ]
+        reporter.error("PD508", message, pass_.span, label, helps=helps)
     return bool(hard)
 
 
-def _report_sleep(reason: str, span: Span, reporter: Reporter) -> None:
-    reporter.report(
-        "PD506", f"this rule is inactive: {reason}", span, "cannot happen with these packs",
-        helps=["it becomes active with a pack that brings what it asks for"],
-    )  # fmt: skip
-
-
-def _changes(rule: Rule, facts: Facts, lets: dict[str, Expr]) -> bool | None:
+def _changes(rule: Rule, facts: Facts, lets: Lets) -> bool | None:
     if isinstance(rule, Transform) and rule.target.op == "const" and not rule.effects:
-        same = member_of(ELEMENT_HERE, (rule.target.value,))
+        same = member(ELEMENT_HERE, (rule.target.value,))
         return decide(facts, [(rule.mask, HERE), (negation(same), HERE)], lets)
     return True
 
 
-def _check_moment(
-    rules: list[Rule], facts: Facts, lets: dict[str, Expr]
+def _check_substep(
+    rules: list[Rule], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
     """The conflicts of one substep, with an example: for each rule the first one, maybe itself, that it meets."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
@@ -244,29 +278,21 @@ def _check_moment(
                 return
             answer, question = _meet(first, second, glances, facts, lets)
             if answer:
-                yield (
-                    _parity(_conflict(first, second), question, facts, lets),
-                    example(facts, question, lets),
-                )
+                conflict = _parity(_conflict(first, second), question, facts, lets)
+                yield conflict, example(facts, question, lets)
                 break
             if answer is None and undecided is None:
                 undecided = first
         else:
             if undecided is not None and not facts.budget.is_exhausted:
                 yield _undecided(_conflict(undecided, second)), {}
-    plain: list[tuple[Assign, Expr | None]] = [
-        (rule, rule.mask) for rule in rules if isinstance(rule, Assign)
-    ]
-    effects: list[tuple[Assign, Expr | None]] = [
-        (effect, rule.mask) for rule in movers for effect in rule.effects
-    ]
-    for assigns in (plain, effects):
-        yield from _check_assigns(assigns, facts, lets)
+    yield from _check_assigns([(one, one.mask) for one in rules if isinstance(one, Assign)], facts, lets)
+    yield from _check_assigns([(one, rule.mask) for rule in movers for one in rule.effects], facts, lets)
 
 
 def _meet(
-    first: Rule, second: Rule, glances: Glances, facts: Facts, lets: dict[str, Expr]
-) -> tuple[bool | None, Sequence[tuple[Expr, Offset]]]:
+    first: Rule, second: Rule, glances: Glances, facts: Facts, lets: Lets
+) -> tuple[bool | None, Conditions]:
     """Whether two rules may claim one cell, and the conditions with which they do; None if that is too hard."""
     answer: bool | None = False
     assert first.mask is not None
@@ -284,7 +310,7 @@ def _meet(
 
 
 def _check_assigns(
-    assigns: list[tuple[Assign, Expr | None]], facts: Facts, lets: dict[str, Expr]
+    assigns: Sequence[tuple[Assign, Expr | None]], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
     """Two `:=` of one field must not meet in a cell with different values."""
     sets = [(assign, mask) for assign, mask in assigns if assign.op == ":=" and mask is not None]
@@ -313,19 +339,11 @@ _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the l
 
 def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
     """What may stand where two rules meet, such as `x` here and `y` below."""
-    found = sorted(elements.items())
-    if not 0 < len(found) <= 4:
+    found = [(at, facts.names[number]) for at, number in sorted(elements.items()) if number in facts.names]
+    if not found or len(elements) > 4:
         return ""
-    places = [
-        f"`{facts.names[n]}` {_PLACES.get(at) or f'at({at[0]}, {at[1]})'}"
-        for at, n in found
-        if n in facts.names
-    ]
-    return (
-        "for example with " + " and ".join(filter(None, [", ".join(places[:-1]), places[-1]]))
-        if places
-        else ""
-    )
+    *places, last = [f"`{name}` {_PLACES.get(at) or f'at({at[0]}, {at[1]})'}" for at, name in found]
+    return "for example with " + " and ".join(filter(None, [", ".join(places), last]))
 
 
 def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
@@ -358,25 +376,20 @@ _EXCLUDE = "make their conditions exclude each other, or put one under `then:`"
 
 def _conflict(first: Rule, second: Rule) -> Conflict:
     if first is second or first.span == second.span:
+        message = "a cell may be both mover and target"
         note = "the moves of one substep happen at once: no cell may take part in two of them"
         helps = (
             "add a condition that a target cannot fulfill, such as a comparison of densities",
             "or choose what happens then: `conflicts: drop_both`",
         )
-        return Conflict(
-            "PD501", "a cell may be both mover and target", first.span, first.span, (note,), helps
-        )
-    movement = isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move))
+        return Conflict("PD501", message, first.span, first.span, (note,), helps)
+    code = "PD501" if isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move)) else "PD502"
     message = "two rules may claim one cell in the same substep"
     choice = "or choose what happens then: `conflicts: first_wins` or `conflicts: drop_both`"
-    return Conflict(
-        "PD501" if movement else "PD502", message, first.span, second.span, (), (_EXCLUDE, choice)
-    )
+    return Conflict(code, message, first.span, second.span, (), (_EXCLUDE, choice))
 
 
-def _parity(
-    conflict: Conflict, question: Sequence[tuple[Expr, Offset]], facts: Facts, lets: dict[str, Expr]
-) -> Conflict:
+def _parity(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) -> Conflict:
     """The conflict with the fix for rules that alternate by row or column: worlds without a seam keep them apart."""
     asked = [*(condition for condition, _ in question), *lets.values()]
     nodes = [node for one in asked for node in one.walk()]
@@ -393,71 +406,69 @@ def _parity(
 
 
 def _undecided(conflict: Conflict) -> Conflict:
-    """The conflict of two rules whose conditions are too hard: to say that they must exclude each other is not a help."""
+    """The conflict of two rules whose conditions are too hard to decide: excluding each other would not help."""
     note = "their conditions combine too many values to decide whether they can meet"
     helps = ("choose what happens if they do: `conflicts: first_wins`", "or put one of them under `then:`")
     return replace(conflict, notes=(note,), helps=helps)
 
 
-def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
-    """For each of these properties the ids whose cells may hold their own value: those that some rule assigns it to.
+class Glances:
+    """What conditions of a substep's rules ask of single variables: elements, fields and counts at places."""
 
-    A value of its own may fulfill the condition of another such rule: this continues until nothing is added.
+    def __init__(self, masks: Sequence[Expr], facts: Facts, lets: Lets):
+        self._facts = facts
+        numbers: dict[tuple[str, object], int] = {}
+        self._asked: dict[int, dict[tuple[int, int, int], frozenset[object]]] = {}
+        for mask in masks:
+            self._asked[id(mask)] = {
+                (numbers.setdefault((what, name), len(numbers)), *at): values
+                for (what, name, at), values in alone(facts, mask, lets).items()
+            }
+
+    def apart(self, first: Expr, second: Expr, at: Offset) -> bool:
+        """Whether some variable cannot be as the first condition and, `at` away from it, the second ask for."""
+        self._facts.budget.left -= GLANCE
+        asked = self._asked[id(first)]
+        for (number, row, column), values in self._asked[id(second)].items():
+            known = asked.get((number, row + at[0], column + at[1]))
+            if known is not None and known.isdisjoint(values):
+                return True
+        return False
+
+
+def lasting(lets: Lets) -> Lets:
+    """The flags among some values, in the order in which they were fixed, as they can be looked through later.
+
+    Each is itself, as something unknown, and the condition on coordinates that follows from it.
     """
-    found: dict[str, frozenset[int]] = {name: frozenset() for name in names}
-    while True:
-        more = {name: found[name] | _overridden_ids(passes, name, facts) for name in found}
-        if more == found:
-            return found
-        found = more
-        stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
-        facts = replace(facts, properties={**facts.properties, **stored})
+    found: Lets = {}
+    follow: Lets = {}
+    for name, value in lets.items():
+        if value.kind != FLAG:
+            continue
+        asked = _follows(value, follow)
+        if asked != TRUE and sum(1 for _ in islice(asked.walk(), MAX_PARTS + 1)) <= MAX_PARTS:
+            follow[name] = asked
+            found[name] = conjunction([Expr("let", FLAG, value=f"{name} before"), asked])
+    return found
 
 
-def _overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
-    """The ids that some rule assigns a property to, if cells hold values of their own as `facts` say."""
-    found: set[int] = set()
-    for pass_ in passes:
-        for moment in pass_.moments:
-            lets = {let.name: let.value for let in moment.lets}
-            for rule in moment.rules:
-                assigns = [rule] if isinstance(rule, Assign) else list(rule.effects)
-                for assign in assigns:
-                    if assign.field != name:
-                        continue
-                    if assign.mask is None or assign.offset != HERE:
-                        return frozenset(facts.ids)
-                    found |= {
-                        i for i in facts.ids if i not in found
-                        and satisfiable(facts, [(member_of(ELEMENT_HERE, (i,)), HERE), (assign.mask, HERE)], lets)
-                    }  # fmt: skip
-    return frozenset(found)
+def _follows(expr: Expr, follow: Lets) -> Expr:
+    """A condition on coordinates alone that holds wherever the expression does. `follow` has those of earlier values."""
+    if all(node.op in _COORDINATES for node in expr.walk()):
+        return expr
+    match expr.op:
+        case "and":
+            return conjunction([*dict.fromkeys(_follows(arg, follow) for arg in expr.args)])
+        case "or":
+            return disjunction([*dict.fromkeys(_follows(arg, follow) for arg in expr.args)])
+        case "look":
+            return look(_follows(expr.args[0], follow), expr.value)
+        case "let":
+            return follow.get(str(expr.value), TRUE)
+    return TRUE
 
 
-def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
-    """The ids that some rule may bring about."""
-    found: set[int] = set()
-    for pass_ in passes:
-        for moment in pass_.moments:
-            for rule in moment.rules:
-                target = (
-                    rule.target
-                    if isinstance(rule, Transform)
-                    else rule.leaving
-                    if isinstance(rule, Move)
-                    else None
-                )
-                if target is not None:
-                    found |= {target.value} if target.op == "const" else set(facts.ids)
-    return frozenset(found)
-
-
-def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
-    """The passes without assignments to properties that no cell can come to override: there is no place for them."""
-
-    def kept(moment: Moment) -> Moment:
-        return replace(
-            moment, rules=tuple(r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead))
-        )
-
-    return tuple(replace(pass_, moments=tuple(kept(moment) for moment in pass_.moments)) for pass_ in passes)
+_COORDINATES = frozenset(
+    ("const", "coordinate", "and", "or", *(name for name, row in OPS.items() if row.evaluate))
+)

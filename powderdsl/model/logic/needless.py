@@ -1,4 +1,5 @@
-"""What is written and decides nothing: comparisons that always come out alike, rules that others always overrule.
+"""What is written and decides nothing: comparisons that always come out alike, rules that others always overrule,
+writes that no cell keeps.
 
 Rules are legal with these, so they are warnings. Loops and symmetries write a rule out many times: a warning is
 given only if all its copies deserve it.
@@ -6,27 +7,51 @@ given only if all its copies deserve it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Label, Reporter, Span
-from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
-from powderdsl.model.logic.budget import Budget, Exhausted
-from powderdsl.model.logic.satisfy import Facts, decide
-from powderdsl.model.logic.undecided import settled
-from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule, Ruleset, Transform
+from powderdsl.model.expressions.operands import ELEMENT_HERE, look, member, negation
+from powderdsl.model.logic.satisfy import (
+    HERE,
+    Budget,
+    Exhausted,
+    Facts,
+    Lets,
+    can_hold,
+    decide,
+    substeps,
+    writes_of,
+)
+from powderdsl.model.text import place_of
+from powderdsl.model.types import (
+    Assign,
+    Expr,
+    Field,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Property,
+    Rule,
+    Ruleset,
+    Swap,
+    Transform,
+)
 from powderdsl.syntax.ast import Syntax
 
-HERE: Offset = (0, 0)
-
 BUDGET = 100_000
-"""Nodes evaluated for these warnings: a quarter of a second. After that nothing more is found, and a note says so."""
+"""Nodes evaluated for each kind of these warnings: a quarter of a second. After that nothing more is found, and a note
+says so."""
 
 GLANCES = 10
 """Rules of a substep that are looked at for the work of one node."""
 
+MAX_LISTED = 20
+"""Rules that are named; the others are counted."""
+
 SILENT = ("PD503", "PD506", "PD509")
-"""Who reads that a rule never happens does not want to read why twice."""
+"""Rules already reported with these codes get no second warning."""
 
 
 def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) -> list[Span]:
@@ -35,14 +60,17 @@ def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) 
     Returns:
         The rules that may be overruled: to tell takes too much work.
     """
-    quick = replace(facts, budget=Budget(BUDGET, BUDGET // 4))
     known = silent_rules(reporter)
     _report_decided(passes, known, reporter)
-    return _report_overruled(passes, quick, known, reporter)
+    return _report_overruled(passes, _quick(facts), known, reporter)
+
+
+def _quick(facts: Facts) -> Facts:
+    return replace(facts, budget=Budget(BUDGET, BUDGET // 4))
 
 
 def silent_rules(reporter: Reporter) -> list[Span]:
-    """The rules of which it was reported already that they never happen."""
+    """The rules that were reported already as never happening."""
     return [one.primary.span for one in reporter.diagnostics if one.code in SILENT and one.primary.span]
 
 
@@ -56,7 +84,7 @@ def _report_decided(passes: tuple[Pass, ...], known: Sequence[Span], reporter: R
             if node.op in ("eq", "lt", "le") and node.span is not None:
                 outcomes.setdefault(node.span, set()).add(decided(node))
     for span, found in outcomes.items():
-        if found in ({True}, {False}) and not any(_inside(span, other) for other in known):
+        if found in ({True}, {False}) and not _inside_any(span, known):
             reporter.report(
                 "PD513", "this comparison decides nothing", span, "it comes out the same in every world",
                 helps=["look at the bounds of both sides", "remove it, if it is meant so"],
@@ -64,11 +92,10 @@ def _report_decided(passes: tuple[Pass, ...], known: Sequence[Span], reporter: R
 
 
 def _expressions(passes: tuple[Pass, ...]) -> Iterator[Expr]:
-    for pass_ in passes:
-        for moment in pass_.moments:
-            yield from (let.value for let in moment.lets)
-            for rule in moment.rules:
-                yield from _parts(rule)
+    for _, moment, lets in substeps(passes):
+        yield from lets.values()
+        for rule in moment.rules:
+            yield from _parts(rule)
 
 
 def _parts(rule: Rule) -> Iterator[Expr]:
@@ -95,8 +122,11 @@ def decided(node: Expr) -> bool | None:
     return True if a.kind.hi <= b.kind.lo else False if a.kind.lo > b.kind.hi else None
 
 
-def _inside(span: Span, other: Span) -> bool:
-    return span.source == other.source and other.start <= span.start and span.end <= other.end
+def _inside_any(span: Span, others: Sequence[Span]) -> bool:
+    return any(
+        span.source == other.source and other.start <= span.start and span.end <= other.end
+        for other in others
+    )
 
 
 def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:
@@ -119,25 +149,21 @@ def _report_overruled(
     found: dict[Span, Rule] = {}
     matter: dict[Span, None] = {}
     undecided: dict[Span, None] = {}
-    for pass_ in passes:
-        for moment in pass_.moments:
-            lets = {let.name: let.value for let in moment.lets}
-            for place, rule in enumerate(moment.rules):
-                if rule.span in matter:
-                    continue
-                try:
-                    winner = _overruling(rule, place, moment, facts, lets)
-                except Exhausted:
-                    undecided[rule.span] = None
-                    continue
-                if winner is None:
-                    matter[rule.span] = None
-                else:
-                    found.setdefault(rule.span, winner)
+    for _, moment, lets in substeps(passes):
+        for place, rule in enumerate(moment.rules):
+            if rule.span in matter:
+                continue
+            try:
+                winner = _overruling(rule, place, moment, facts, lets)
+            except Exhausted:
+                undecided[rule.span] = None
+                continue
+            if winner is None:
+                matter[rule.span] = None
+            else:
+                found.setdefault(rule.span, winner)
     for span, winner in found.items():
-        if span in matter or span in undecided or winner.span == span:
-            continue
-        if any(_inside(span, other) for other in known):
+        if span in matter or span in undecided or winner.span == span or _inside_any(span, known):
             continue
         words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
         reporter.report(
@@ -145,12 +171,10 @@ def _report_overruled(
             secondary=[Label(winner.span, words)],
             helps=["make their conditions exclude each other", "or remove one of them"],
         )  # fmt: skip
-    return [
-        span for span in undecided if span not in matter and not any(_inside(span, other) for other in known)
-    ]
+    return [span for span in undecided if span not in matter and not _inside_any(span, known)]
 
 
-def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: dict[str, Expr]) -> Rule | None:
+def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: Lets) -> Rule | None:
     """One of the rules of a substep that never leave anything to this one; None if it matters. Raises Exhausted."""
     if rule.mask is None:
         return None
@@ -159,7 +183,7 @@ def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: dict
     if not rivals or decide(facts, [(rule.mask, HERE)], lets) is False:
         return None
     conditions = [(rule.mask, HERE), *((negation(other.mask), HERE) for other in rivals if other.mask)]
-    return None if settled(facts, conditions, lets) else rivals[0]
+    return None if can_hold(facts, conditions, lets) else rivals[0]
 
 
 def _rivals(rule: Rule, place: int, moment: Moment) -> Iterator[Rule]:
@@ -195,19 +219,15 @@ def report_undrawn(
     Returns:
         The chances that no rule may draw: to tell takes too much work.
     """
-    quick = replace(facts, budget=Budget(BUDGET, BUDGET // 4))
+    quick = _quick(facts)
     undecided = []
-    chances = {prop.name: prop for prop in ruleset.properties if prop.kind.name == "chance"}
+    shown = {channel.source for channel in ruleset.matrix}
+    chances = {p.name: p for p in ruleset.properties if p.kind.name == "chance" and p.name not in shown}
     for name, number, span in given:
-        prop = chances.get(name)
-        if (
-            prop is None
-            or any(name == channel.source for channel in ruleset.matrix)
-            or prop.values[number] == 0
-        ):
+        if name not in chances or chances[name].values[number] == 0:
             continue
         try:
-            drawn = _drawn(prop, number, ruleset, quick)
+            drawn = _drawn(chances[name], number, ruleset, quick)
         except Exhausted:
             undecided.append(span)
             continue
@@ -224,8 +244,7 @@ def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> bool:
     """Whether some rule that reads the property may happen where this element stands. Raises Exhausted."""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
-        for moment in pass_.moments:
-            lets = {let.name: let.value for let in moment.lets}
+        for _, moment, lets in substeps([pass_]):
             for rule in moment.rules:
                 reads = _Reads(prop.name, lets, everywhere)
                 for part in _parts(rule):
@@ -234,7 +253,7 @@ def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> bool:
                     return True
                 for at in reads.places:
                     here = (member(ELEMENT_HERE, (number,)), at)
-                    if settled(facts, [(rule.mask, HERE), here], lets):  # type: ignore[list-item]
+                    if can_hold(facts, [(rule.mask, HERE), here], lets):  # type: ignore[list-item]
                         return True
     return False
 
@@ -244,8 +263,8 @@ class _Reads:
     """Where expressions read a property. `many`: also of cells whose places or substeps are not told apart."""
 
     name: str
-    lets: dict[str, Expr]
-    everywhere: dict[str, Expr]
+    lets: Lets
+    everywhere: Lets
     places: dict[Offset, None] = field(default_factory=dict)
     many: bool = False
     _opened: set[tuple[str, Offset, bool]] = field(default_factory=set)
@@ -268,3 +287,107 @@ class _Reads:
         unclear |= expr.op in ("count", "sum")
         for arg in args:
             self.find(arg, at, unclear)
+
+
+# Writes that are lost: `of:` limits a field to other elements
+
+
+def report_lost_writes(
+    passes: tuple[Pass, ...], fields: dict[str, Field], facts: Facts, known: list[Span], reporter: Reporter
+) -> list[Span]:
+    """Warn of assignments and effects that are lost wherever their rule happens, in all its copies.
+
+    Args:
+        known: rules about which more has been said already.
+
+    Returns:
+        The writes that may be lost: to tell takes too much work.
+    """
+    limited = {name: field for name, field in fields.items() if field.of is not None}
+    quick = _quick(facts)
+    lost: dict[tuple[Span, str], bool | None] = {}
+    for _, moment, lets in substeps(passes) if limited else ():
+        for rule in moment.rules:
+            for write in writes_of(rule):
+                key = write.span, write.field
+                if write.field in limited and lost.get(key, True) is not False and rule.span not in known:
+                    ids = limited[write.field].of or frozenset()
+                    try:
+                        here = not _arrives(write, rule, ids, moment, quick, lets)
+                    except Exhausted:
+                        here = None
+                    lost[key] = None if here and lost.get(key, True) is None else here
+    for (span, name), always in lost.items():
+        if always:
+            reporter.report(
+                "PD516", f"this write to `{name}` is always lost", span, f"no cell that it reaches has a `{name}`",
+                secondary=[Label(limited[name].span, "`of:` says which elements have it")],
+                helps=["widen `of:`, or write to a cell that holds one of its elements"],
+            )  # fmt: skip
+    return [span for (span, _), always in lost.items() if always is None]
+
+
+def _arrives(
+    write: Assign, rule: Rule, ids: frozenset[int], moment: Moment, facts: Facts, lets: Lets
+) -> bool:
+    """Whether the cell may hold one of these elements when the write lands. Effects come after all that moves.
+
+    Raises Exhausted if to tell takes too much work.
+    """
+    if rule.mask is None:
+        return True
+
+    def may(mask: Expr, what: Expr) -> bool:
+        return can_hold(facts, [(mask, HERE), (member(what, tuple(sorted(ids))), HERE)], lets)
+
+    if isinstance(rule, Assign):
+        return may(rule.mask, look(ELEMENT_HERE, write.offset))
+    if isinstance(rule, Transform) and write.offset == HERE:
+        return may(rule.mask, rule.target)
+    if isinstance(rule, Swap) and write.offset in (HERE, rule.offset):
+        other = rule.offset if write.offset == HERE else HERE
+        return may(rule.mask, look(ELEMENT_HERE, other))
+    if isinstance(rule, Move) and write.offset == rule.offset:
+        return may(rule.mask, ELEMENT_HERE)
+    if any(may(mask, what) for mask, what in _brought(moment)):
+        return True
+    if isinstance(rule, Move) and write.offset == HERE:
+        return False  # what leaves is gone, and nothing brings one
+    return may(rule.mask, look(ELEMENT_HERE, write.offset))
+
+
+def _brought(moment: Moment) -> Iterator[tuple[Expr, Expr]]:
+    """What the rules of a substep may bring into some cell, with the condition under which they do."""
+    for rule in moment.rules:
+        if isinstance(rule, Transform):
+            yield rule.mask, rule.target
+        elif isinstance(rule, Swap):
+            yield rule.mask, ELEMENT_HERE
+            yield rule.mask, look(ELEMENT_HERE, rule.offset)
+        elif isinstance(rule, Move):
+            yield rule.mask, ELEMENT_HERE
+            yield rule.mask, rule.leaving
+
+
+# What could not be decided
+
+
+def report_undecided(spans: Iterable[Span], reporter: Reporter) -> None:
+    """Note the rules of which it is not known whether they ever have an effect.
+
+    Args:
+        spans: rules, writes and values; repetitions count once.
+    """
+    places = sorted(dict.fromkeys(spans), key=lambda span: (span.source.name, span.start))
+    if not places:
+        return
+    listed = places[:MAX_LISTED]
+    words = ", ".join(dict.fromkeys(place_of(span) for span in listed))
+    more = f" and {len(places) - len(listed):,} more" if len(places) > len(listed) else ""
+    reporter.report(
+        "PD518", f"it takes too much work to decide whether these lines have any effect: {words}{more}", listed[0],
+        "its conditions combine too many values",
+        secondary=[Label(span, "this too") for span in listed[1:]],
+        notes=["nothing wrong was found; warnings about them, such as PD503 and PD514, may be missing"],
+        helps=["`powderdsl test` lists the rules that never happen; a test of your own shows what one does"],
+    )  # fmt: skip

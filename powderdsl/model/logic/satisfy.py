@@ -8,22 +8,71 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from powderdsl.model.logic.budget import QUESTION, Budget, Exhausted
 from powderdsl.model.operations import OPS, Bounds
-from powderdsl.model.types import Expr, Offset, Property
+from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule
+
+HERE: Offset = (0, 0)
 
 Key = tuple[str, object, Offset]
-Assignment = dict[Key, object]
+Assignment = dict[Key, Any]
+Lets = dict[str, Expr]
+"""Values of a substep by name."""
+Conditions = Sequence[tuple[Expr, Offset]]
+"""Each with the place where it is asked."""
 
 MAX_DOMAIN = 256
 MAX_LET = 150
 """Nodes of a let's value that are looked through; a larger one is taken for free."""
+
+
+BUDGET = 500_000
+"""Nodes evaluated in a group of questions: half a second. The largest shipped ruleset needs a twentieth of it."""
+
+MAX_QUESTION = 100_000
+"""Nodes evaluated for one question. A harder one stays undecided, and the others keep their share."""
+
+QUESTION = 60
+"""What a question costs besides its evaluations."""
+
+
+class Exhausted(Exception):
+    """The question takes too much work to answer."""
+
+
+@dataclass
+class Budget:
+    """Work that is left for some questions, counted in nodes: the same on every machine, in every order."""
+
+    left: int = BUDGET
+    most: int = MAX_QUESTION
+    """For one question."""
+
+    def spend(self, nodes: int) -> None:
+        self.left -= nodes
+        if self.left < 0:
+            raise Exhausted
+
+    @property
+    def is_exhausted(self) -> bool:
+        return self.left < 0
+
+    @contextmanager
+    def question(self, most: int | None = None) -> Iterator[None]:
+        """Spend at most this much within. What one question may not spend is left for the next."""
+        reserve = max(self.left - (most or self.most), 0)
+        self.left -= reserve
+        try:
+            yield
+        finally:
+            if reserve:
+                self.left = max(self.left, 0) + reserve
 
 
 @dataclass(frozen=True)
@@ -43,10 +92,13 @@ class Facts:
 
     def relaxed(self) -> Facts:
         """The same cells, but with any element's properties: what a rule could meet in other packs."""
+        ids = frozenset(self.ids)
         free = {
-            name: replace(p, values=("?",) * len(p.values)) if p.kind.name == "chance" else replace(p, stored=frozenset(self.ids))
+            name: replace(p, values=("?",) * len(p.values))
+            if p.kind.name == "chance"
+            else replace(p, stored=ids)
             for name, p in self.properties.items()
-        }  # fmt: skip
+        }
         return replace(self, properties=free)
 
 
@@ -66,12 +118,12 @@ class _Joint(NamedTuple):
 class Search:
     """One question. Conditions are given with the place they are asked at."""
 
-    def __init__(self, facts: Facts, lets: dict[str, Expr] | None = None):
+    def __init__(self, facts: Facts, lets: Lets | None = None):
         self.facts = facts
         self.lets = lets or {}
         self.conditions: list[tuple[Expr, Offset]] = []
         self._chosen: Assignment = {}
-        self._domains: dict[Key, list[object]] = {}
+        self._domains: dict[Key, list[Any]] = {}
         self._opened: dict[str, tuple[Expr, int]] = {}
 
     def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
@@ -107,18 +159,16 @@ class Search:
     def thresholds(self) -> dict[object, list[float]]:
         """Constants that each stream is compared with: between two of them all draws are alike."""
         found: dict[object, set[float]] = {}
-        for condition, _ in self.conditions:
-            for node in condition.walk():
-                if node.op == "lt" and any(arg.kind.name == "draw" for arg in node.args):
-                    draws = [n.value for arg in node.args for n in arg.walk() if n.op == "draw"]
-                    numbers = [
-                        float(n.value)
-                        for arg in node.args
-                        for n in arg.walk()
-                        if n.op == "const" and isinstance(n.value, (int, Fraction))
-                    ]
-                    for stream in draws:
-                        found.setdefault(stream, set()).update(number % 1 for number in numbers)
+        for node in (node for condition, _ in self.conditions for node in condition.walk()):
+            if node.op == "lt" and any(arg.kind.name == "draw" for arg in node.args):
+                parts = [part for arg in node.args for part in arg.walk()]
+                numbers = [
+                    float(part.value)
+                    for part in parts
+                    if part.op == "const" and isinstance(part.value, (int, Fraction))
+                ]
+                for draw in (part for part in parts if part.op == "draw"):
+                    found.setdefault(draw.value, set()).update(number % 1 for number in numbers)
         return {stream: sorted(values) for stream, values in found.items()}
 
     def possible(self) -> bool:
@@ -142,11 +192,8 @@ class Search:
     def _narrow(self) -> list[_Joint] | None:
         """Apply the conditions on one variable; the others, or None if no assignment is left."""
         variables = [self._variables(condition, at) for condition, at in self.conditions]
-        domains = self._domains = {}
-        for keys in variables:
-            for key in keys or ():
-                if key not in domains:
-                    domains[key] = self._domain(key)
+        named = dict.fromkeys(key for keys in variables for key in keys or ())
+        domains = self._domains = {key: self._domain(key) for key in named}
         joint = []
         for (condition, at), keys in zip(self.conditions, variables, strict=True):
             if keys is None:
@@ -166,7 +213,7 @@ class Search:
     def example(self) -> dict[Offset, int]:
         """After `possible`: an element for each place that the conditions ask about."""
         keys = [key for key in self._domains if key[0] == "element"]
-        return {key[2]: int(str(self._chosen.get(key, self._domains[key][0]))) for key in keys}
+        return {key[2]: self._chosen.get(key, self._domains[key][0]) for key in keys}
 
     def _assign(self, order: list[Key], index: int, joint: list[_Joint], chosen: Assignment) -> bool:
         if index == len(order):
@@ -196,26 +243,26 @@ class Search:
         except _Unknown:
             return True
 
-    def _domain(self, key: Key) -> list[object]:
+    def _domain(self, key: Key) -> list[Any]:
         what, name, _ = key
         if what == "element":
             return list(self.facts.ids)
         if what == "side":
             return list(range(self.facts.side_multiple))
-        if what == "property":
-            kind = self.facts.properties[str(name)].kind
-            return [0, 1] if kind.name == "flag" else list(range(int(kind.lo), int(kind.hi) + 1))
         if what == "draw":
             cuts = [0.0, *self.thresholds.get(name, []), 1.0]
             between = ((a + b) / 2 for a, b in itertools.pairwise(cuts) if a < b)
             # A draw of 16 or 32 bits may be a threshold itself: neither above nor below it.
             return [*between, *(c for c in cuts if (c * 2**17) % 2 == 1 or (c * 2**33) % 2 == 1)]
-        assert isinstance(name, Expr)
-        if name.kind.name in ("element", "direction"):
-            return list(self.facts.ids) if name.kind.name == "element" else list(range(8))
-        if name.kind.name == "flag":
-            return [0, 1]
-        return list(range(int(name.kind.lo), int(name.kind.hi) + 1))
+        kind = name.kind if isinstance(name, Expr) else self.facts.properties[str(name)].kind
+        match kind.name:
+            case "element":
+                return list(self.facts.ids)
+            case "direction":
+                return list(range(8))
+            case "flag":
+                return [0, 1]
+        return list(range(int(kind.lo), int(kind.hi) + 1))
 
     def _variables(self, expr: Expr, at: Offset) -> dict[Key, None] | None:
         """What the value depends on, in the order it is named; None if some of it cannot be enumerated."""
@@ -269,7 +316,6 @@ class Search:
             case "property":
                 prop = self.facts.properties[str(node.value)]
                 element = chosen[("element", None, at)]
-                assert isinstance(element, int)
                 return chosen[("property", prop.name, at)] if element in prop.stored else prop.values[element]
             case "field" if node.value in self.facts.field_sets:
                 if chosen[("element", None, at)] not in self.facts.field_sets[str(node.value)]:
@@ -279,7 +325,7 @@ class Search:
                 return chosen[("draw", node.value, at)]
             case "coordinate":
                 key, shift = _coordinate(node, at, self.facts.side_multiple)
-                return (int(str(chosen[key])) + shift) % node.value[1]
+                return (chosen[key] + shift) % node.value[1]
             case "look":
                 return self._value(node.args[0], _plus(at, node.value), chosen)
             case _ if _is_opaque(node):
@@ -309,7 +355,7 @@ class Search:
                 prop = self.facts.properties[str(node.value)]
                 key: Key = ("element", None, at)
                 elements = [chosen[key]] if key in chosen else self._domains[key]
-                values = [prop.values[int(str(one))] for one in elements if one not in prop.stored]
+                values = [prop.values[one] for one in elements if one not in prop.stored]
                 numbers = [value for value in values if isinstance(value, (int, float, Fraction))]
                 if len(values) < len(elements):
                     numbers += self._span(("property", prop.name, at), chosen)
@@ -330,7 +376,7 @@ class Search:
                 key, shift = _coordinate(node, at, self.facts.side_multiple)
                 if key not in chosen:
                     return 0, node.value[1] - 1
-                return ((int(str(chosen[key])) + shift) % node.value[1],) * 2
+                return ((chosen[key] + shift) % node.value[1],) * 2
             case "look":
                 return self._bounds(node.args[0], _plus(at, node.value), chosen)
             case _ if _is_opaque(node):
@@ -355,8 +401,7 @@ _ANY: Bounds = (-math.inf, math.inf)
 _EVALUATE = {name: row.evaluate for name, row in OPS.items() if row.evaluate}
 
 
-def _plus(at: Offset, offset: object) -> Offset:
-    assert isinstance(offset, tuple)
+def _plus(at: Offset, offset: Offset) -> Offset:
     return (at[0] + offset[0], at[1] + offset[1])
 
 
@@ -378,66 +423,76 @@ def _coordinate(node: Expr, at: Offset, sides: int) -> tuple[Key, int]:
     return ("side", axis, (0, 0)), at[axis == "column"]
 
 
+_FLOATS = ("real", "vec2", "chance")
+
+
 def _is_opaque(node: Expr) -> bool:
     """Whether a node is a variable of its own: a count, a field, or something that floats decide."""
-    if node.op in ("field", "let", "count", "sum", "inside", "octant", "param"):
-        if (
-            node.kind.name in ("real", "vec2", "chance", "draw", "number")
-            or node.kind.hi - node.kind.lo >= MAX_DOMAIN
-        ):
+    kind, op = node.kind, node.op
+    if op in ("field", "let", "count", "sum", "inside", "octant", "param"):
+        if kind.name in (*_FLOATS, "draw", "number") or kind.hi - kind.lo >= MAX_DOMAIN:
             raise _Unknown
         return True
-    if node.op in ("eq", "lt", "le") and any(
-        arg.kind.name in ("real", "vec2", "chance") and arg.op != "const" for arg in node.args
-    ):
+    if op in ("eq", "lt", "le") and any(a.kind.name in _FLOATS and a.op != "const" for a in node.args):
         return True
     if node.op not in _EVALUATE and node.op not in ("and", "or", "choose"):
         raise _Unknown
     return False
 
 
-def satisfiable(
-    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None
-) -> bool:
-    """False only if the conditions, each at its place, can never hold together."""
-    return decide(facts, conditions, lets) is not False
+Answer = TypeVar("Answer")
 
 
-def decide(
-    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None = None
-) -> bool | None:
-    """Whether the conditions may hold together; None if that takes too much work. False is a proof."""
+def _ask(
+    facts: Facts, conditions: Conditions, lets: Lets | None, answer: Callable[[Search], Answer]
+) -> Answer | None:
+    """The answer of a search for these conditions; None if that takes too much work."""
     try:
         with facts.budget.question():
-            return _search(facts, conditions, lets).possible()
+            facts.budget.spend(QUESTION)
+            search = Search(facts, lets)
+            for condition, at in conditions:
+                search.require(condition, at)
+            return answer(search)
     except Exhausted:
         return None
 
 
-def alone(facts: Facts, condition: Expr, lets: dict[str, Expr]) -> dict[Key, frozenset[object]]:
+def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
+    """Whether the conditions may hold together; None if that takes too much work. False is a proof."""
+    return _ask(facts, conditions, lets, Search.possible)
+
+
+def satisfiable(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool:
+    """False only if the conditions, each at its place, can never hold together."""
+    return decide(facts, conditions, lets) is not False
+
+
+def can_hold(facts: Facts, conditions: Conditions, lets: Lets) -> bool:
+    """Like `decide`, but raises Exhausted if that takes too much work."""
+    answer = decide(facts, conditions, lets)
+    if answer is None:
+        raise Exhausted
+    return answer
+
+
+def alone(facts: Facts, condition: Expr, lets: Lets) -> dict[Key, frozenset[object]]:
     """What a condition leaves of variables that parts of it decide alone: an element, a field, a count at a place."""
-    try:
-        with facts.budget.question():
-            return _search(facts, [(condition, (0, 0))], lets).alone() or {}
-    except Exhausted:
-        return {}
+    return _ask(facts, [(condition, HERE)], lets, Search.alone) or {}
 
 
-def example(
-    facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr]
-) -> dict[Offset, int]:
-    """Elements by place with which the conditions hold together, or nothing where none can be told."""
-    try:
-        with facts.budget.question():
-            search = _search(facts, conditions, lets)
-            return search.example() if search.possible() else {}
-    except Exhausted:
-        return {}
+def example(facts: Facts, conditions: Conditions, lets: Lets) -> dict[Offset, int]:
+    """Elements by place with which the conditions hold together, or nothing if none are found."""
+    return _ask(facts, conditions, lets, lambda one: one.example() if one.possible() else {}) or {}
 
 
-def _search(facts: Facts, conditions: Sequence[tuple[Expr, Offset]], lets: dict[str, Expr] | None) -> Search:
-    facts.budget.spend(QUESTION)
-    search = Search(facts, lets)
-    for condition, at in conditions:
-        search.require(condition, at)
-    return search
+def substeps(passes: Iterable[Pass]) -> Iterator[tuple[Pass, Moment, Lets]]:
+    """The substeps of some passes with the values that `let` fixes in each."""
+    for pass_ in passes:
+        for moment in pass_.moments:
+            yield pass_, moment, {let.name: let.value for let in moment.lets}
+
+
+def writes_of(rule: Rule) -> tuple[Assign, ...]:
+    """The assignments that a rule is or has."""
+    return (rule,) if isinstance(rule, Assign) else rule.effects

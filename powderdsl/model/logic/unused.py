@@ -1,14 +1,18 @@
-"""Definitions that nothing uses, sets without elements, elements that no rule makes."""
+"""Definitions that nothing uses, sets without elements; what rules produce and override."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import PackDecl
+from powderdsl.model.expressions.operands import ELEMENT_HERE, member
 from powderdsl.model.expressions.typer import Typer
+from powderdsl.model.logic.satisfy import HERE, Facts, satisfiable, substeps, writes_of
+from powderdsl.model.types import Assign, Moment, Move, Pass, Transform
 
 
 def report_unused(composition: Composition, typer: Typer, produced: frozenset[int]) -> None:
@@ -89,3 +93,56 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
     ):
         for line in lines:
             yield from words_of(line)
+
+
+# What rules produce and override
+
+
+def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
+    """For each of these properties the ids whose cells may hold their own value: those that some rule assigns it to.
+
+    A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
+    """
+    found: dict[str, frozenset[int]] = {name: frozenset() for name in names}
+    while True:
+        more = {name: found[name] | _overridden_ids(passes, name, facts) for name in found}
+        if more == found:
+            return found
+        found = more
+        stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
+        facts = replace(facts, properties={**facts.properties, **stored})
+
+
+def _overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
+    """The ids that some rule assigns a property to, if cells hold values of their own as `facts` say."""
+    found: set[int] = set()
+    for _, moment, lets in substeps(passes):
+        for assign in (write for rule in moment.rules for write in writes_of(rule) if write.field == name):
+            if assign.mask is None or assign.offset != HERE:
+                return frozenset(facts.ids)
+            for number in facts.ids:
+                here = (member(ELEMENT_HERE, (number,)), HERE)
+                if number not in found and satisfiable(facts, [here, (assign.mask, HERE)], lets):
+                    found.add(number)
+    return frozenset(found)
+
+
+def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
+    """The passes without assignments to properties that no cell can come to override: there is no place for them."""
+
+    def kept(moment: Moment) -> Moment:
+        rules = tuple(r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead))
+        return replace(moment, rules=rules)
+
+    return tuple(replace(pass_, moments=tuple(kept(moment) for moment in pass_.moments)) for pass_ in passes)
+
+
+def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
+    """The ids that some rule may bring about."""
+    found: set[int] = set()
+    for _, moment, _ in substeps(passes):
+        for rule in moment.rules:
+            if isinstance(rule, (Transform, Move)):
+                target = rule.target if isinstance(rule, Transform) else rule.leaving
+                found |= {target.value} if target.op == "const" else set(facts.ids)
+    return frozenset(found)
