@@ -1,14 +1,14 @@
-"""Arguments and options that several commands share, and what their values mean."""
+"""Arguments and options of commands, and what their values mean. Commands import this module as `opt`."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,20 +19,21 @@ from powderdsl.diagnostics import Severity
 if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
 
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+Option = Callable[[Any], Any]
+"""A decorator that gives a command an option."""
 
 MAX_SIDE = 1 << 24
 """Rows or columns of a world; how many cells it may have is the worlds' business."""
 
 
-def layout_options(about: str, *more: tuple[str, str]) -> Callable[[Decorated], Decorated]:
+def layouts(about: str, *more: tuple[str, str]) -> Option:
     """`--json` as every command has it, passed on as `layout`: ``text``, ``json``, or one of `more` (flag, help).
 
     `--format LAYOUT` means the same; it was the spelling of some commands, and is hidden now.
     """
     flags = (("json", about), *more)
 
-    def decorate(function: Decorated) -> Decorated:
+    def decorate(function: Any) -> Any:
         @wraps(function)
         def command(*args: Any, layout: str | None, **values: Any) -> Any:
             asked = [name for name, _ in flags if values.pop(f"as_{name}")] + ([layout] if layout else [])
@@ -43,12 +44,9 @@ def layout_options(about: str, *more: tuple[str, str]) -> Callable[[Decorated], 
         decorated = option(command)
         for name, help_text in reversed(flags):
             decorated = click.option(f"--{name}", f"as_{name}", is_flag=True, help=help_text)(decorated)
-        return decorated  # type: ignore[return-value]
+        return decorated
 
     return decorate
-
-
-PATH = click.Path(path_type=Path)
 
 
 class Integer(click.ParamType):
@@ -114,35 +112,82 @@ def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...
     return found
 
 
-def setting_options(config: type) -> Callable[[Decorated], Decorated]:
-    """An option for each field of a dataclass that says what it is for (`system.settings`); None where none is given."""
+def integer(name: str, low: int, high: int, about: str, default: Any = None, **more: Any) -> Option:
+    """An integer from `low` to `high`."""
+    return _option(name, about, type=Integer(low, high), default=default, **more)
 
-    def decorate(function: Decorated) -> Decorated:
-        for one in reversed(fields(config)):
-            if about := one.metadata.get("about"):
-                usual = CountType() if isinstance(one.default, int) else type(one.default)
-                kind = click.Choice(one.metadata["choices"]) if one.metadata["choices"] else usual
-                name = f"--{one.name.replace('_', '-')}"
-                function = click.option(name, one.name, type=kind, help=about)(function)
+
+def text(name: str, metavar: str, about: str, default: str | None = None, **more: Any) -> Option:
+    """Any text, which the help calls `metavar`."""
+    return _option(name, about, metavar=metavar, default=default, **more)
+
+
+def path(name: str, metavar: str, about: str, **more: Any) -> Option:
+    """A file or folder."""
+    return _option(name, about, type=click.Path(path_type=Path), metavar=metavar, **more)
+
+
+def choice(name: str, choices: Iterable[str], about: str, default: str | None = None, **more: Any) -> Option:
+    """One of some words."""
+    return _option(name, about, type=click.Choice(list(choices)), default=default, **more)
+
+
+def flag(name: str, about: str, **more: Any) -> Option:
+    """On or off."""
+    return _option(name, about, is_flag=True, **more)
+
+
+def knobs(about: str) -> Option:
+    """Values for knobs of a task, as written: see `task_sheets.knob_values`."""
+    return _option("--knob", about, to="knobs", multiple=True, metavar="NAME=N")
+
+
+def _option(name: str, about: str, to: str = "", **more: Any) -> Option:
+    """`to`: the parameter of the command, where it has another name."""
+    return click.option(name, *([to] if to else []), help=about, **more)
+
+
+def several(*options: Option) -> Option:
+    """A decorator that stands for some options, in their order."""
+
+    def decorate(function: Any) -> Any:
+        for option in reversed(options):
+            function = option(function)
         return function
 
     return decorate
 
 
-def rules_argument(function: Decorated) -> Decorated:
-    """RULES: what `powderdsl.load` takes."""
-    return click.argument("rules", metavar="RULES")(function)
+def settings_of(config: type) -> Option:
+    """An option for each field of a dataclass that says what it is for (`system.settings`); None where none is given."""
+
+    def decorate(function: Any) -> Any:
+        for one in reversed(fields(config)):
+            if about := one.metadata.get("about"):
+                usual = CountType() if isinstance(one.default, int) else type(one.default)
+                kind = click.Choice(one.metadata["choices"]) if one.metadata["choices"] else usual
+                function = _option(f"--{one.name.replace('_', '-')}", about, to=one.name, type=kind)(function)
+        return function
+
+    return decorate
 
 
-def set_option(function: Decorated) -> Decorated:
-    return click.option(
-        "--set",
-        "settings",
-        multiple=True,
-        metavar="PACK.PARAM=VALUE",
-        callback=_settings,
-        help="Another value for a parameter of the rules, such as 5%. May be repeated.",
-    )(function)
+rules = click.argument("rules", metavar="RULES")
+"""RULES: what `powderdsl.load` takes."""
+
+parameters = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="PACK.PARAM=VALUE",
+    callback=_settings,
+    help="Another value for a parameter of the rules, such as 5%. May be repeated.",
+)
+world = click.option(
+    "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
+)
+size = click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
+device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 
 
 class ManyWords(click.Command):
@@ -163,20 +208,19 @@ class ManyWords(click.Command):
         return super().parse_args(ctx, found)
 
 
-def packs_option(function: Decorated) -> Decorated:
-    """Of a command whose class is `ManyWords`: packs that are added to the rules of its task."""
-    return click.option(
-        "--packs",
-        multiple=True,
-        metavar="PACK…",
-        callback=lambda ctx, param, words: tuple(_place_of(word) for word in words),
-        help="Packs, by name or file, that are added to the task's rules.",
-    )(function)
-
-
 def _place_of(word: str) -> str:
     """A pack as runs keep it: files by their whole path."""
     return str(Path(word).absolute()) if word.endswith((".yaml", ".yml")) else word
+
+
+packs = click.option(
+    "--packs",
+    multiple=True,
+    metavar="PACK…",
+    callback=lambda ctx, param, words: tuple(_place_of(word) for word in words),
+    help="Packs, by name or file, that are added to the task's rules.",
+)
+"""For commands whose class is `ManyWords`."""
 
 
 class BackendType(click.Choice):
@@ -197,14 +241,8 @@ def renamed_backend(name: str) -> str:
     return new
 
 
-def backend_option(
-    default: str, about: str = "Backend that runs the rules."
-) -> Callable[[Decorated], Decorated]:
+def backend(default: str, about: str = "Backend that runs the rules.") -> Option:
     return click.option("--backend", type=BackendType(), default=default, help=about)
-
-
-def device_option(function: Decorated) -> Decorated:
-    return click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")(function)
 
 
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:

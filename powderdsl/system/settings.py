@@ -1,6 +1,6 @@
 """Settings of a run: fields of a dataclass that say what they are for and which values they take.
 
-Checks and the options of commands (`cli.options.setting_options`) follow from the declaration.
+Checks and the options of commands (`cli.options.settings_of`) follow from the declaration.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from powderdsl.cli.options import setting_options
+from powderdsl.cli.options import settings_of
 from powderdsl.system.settings import check_bounds, out_of_bounds, setting
 
 
@@ -42,7 +42,7 @@ def test_all_mistakes_are_said_at_once() -> None:
 
 def test_options_follow_from_settings() -> None:
     @click.command()
-    @setting_options(Config)
+    @settings_of(Config)
     def command(**given: object) -> None:
         click.echo(sorted(given.items()))
 

@@ -8,17 +8,9 @@ from typing import Any
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import OK, print_json, user_values
-from powderdsl.cli.options import (
-    PATH,
-    BackendType,
-    Integer,
-    SizeType,
-    check_writable,
-    device_option,
-    load_rules,
-    set_option,
-)
+from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.progress import progress
 from powderdsl.experiments.bench.figures import CellFigures, Report, make_report, report_data
 from powderdsl.experiments.bench.machine import load_average, this_machine
@@ -46,46 +38,26 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @click.option(
     "--backend",
     "backends",
-    type=BackendType(),
+    type=opt.BackendType(),
     multiple=True,
     help="Backend that runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
 )
-@click.option(
-    "--batch",
-    "batches",
-    type=Integer(1, 1 << 20),
-    multiple=True,
-    default=(1, 32),
-    help="Number of worlds in a batch.",
-)
-@click.option("--size", "sizes", type=SizeType(), multiple=True, help="Rows and columns.  [default: 64]")
-@click.option(
-    "--elements", type=Integer(1, 256), multiple=True, help="Use only the first N elements in the worlds."
-)
+@opt.integer("--batch", 1, 1 << 20, "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
+@click.option("--size", "sizes", type=opt.SizeType(), multiple=True, help="Rows and columns.  [default: 64]")
+@opt.integer("--elements", 1, 256, "Use only the first N elements in the worlds.", multiple=True)
 @click.option("--only", metavar="NAME,NAME", callback=_names, help="Use only these elements in the worlds.")
-@click.option("--threads", type=Integer(1, 1024), multiple=True, default=(1,), help="CPU threads.")
-@click.option(
-    "--workload", type=click.Choice(list(WORKLOADS)), default="gusts", help="The worlds to start from."
-)
-@device_option
-@click.option("--steps", type=Integer(1, 1 << 20), default=16, help="Maximum steps per call.")
+@opt.integer("--threads", 1, 1024, "CPU threads.", (1,), multiple=True)
+@opt.choice("--workload", list(WORKLOADS), "The worlds to start from.", "gusts")
+@opt.device
+@opt.integer("--steps", 1, 1 << 20, "Maximum steps per call.", 16)
 @click.option("--seconds", type=float, default=2.0, help="Measuring time per combination, in seconds.")
-@click.option(
-    "--rounds",
-    type=Integer(1, 1000),
-    default=5,
-    help="Rounds: in each, all combinations are measured in turn.",
-)
-@click.option("--seed", type=Integer(0, 2**63 - 1), default=0, help="Seed of the start worlds.")
-@set_option
-@click.option("--profile", is_flag=True, help="Also measure the time of each pass.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of tables.")
-@click.option(
-    "--out", "data", type=PATH, metavar="FILE.json", help="Also write the JSON object to this file."
-)
-@click.option(
-    "--plot", type=PATH, metavar="FILE.png", help="Plot rates against batch sizes. Needs matplotlib."
-)
+@opt.integer("--rounds", 1, 1000, "Rounds: in each, all combinations are measured in turn.", 5)
+@opt.integer("--seed", 0, 2**63 - 1, "Seed of the start worlds.", 0)
+@opt.parameters
+@opt.flag("--profile", "Also measure the time of each pass.")
+@opt.flag("--json", "Print one JSON object instead of tables.", to="as_json")
+@opt.path("--out", "FILE.json", "Also write the JSON object to this file.", to="data")
+@opt.path("--plot", "FILE.png", "Plot rates against batch sizes. Needs matplotlib.")
 def command(
     rules: str,
     backends: tuple[str, ...],

@@ -12,8 +12,8 @@ import click
 from powderdsl.analysis.ledger.account import ledger_data, ledger_text
 from powderdsl.analysis.ledger.book import Ledger
 from powderdsl.analysis.ledger.book import ledger as make_ledger
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK, counted, print_json, write_diagnostics
-from powderdsl.cli.options import layout_options
 from powderdsl.cli.plain_table import table
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
@@ -47,14 +47,12 @@ class Checked:
 
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
-@layout_options("One JSON list instead of text.", ("short", "One line for each mistake, without carets."))
-@click.option("--notes", is_flag=True, help="Also list notes, such as inactive rules.")
-@click.option("--warnings-as-errors", is_flag=True, help="Exit with 1 if there are warnings.")
-@click.option("--quick", is_flag=True, help="Check only the rules themselves; do not try invariants.")
-@click.option("--cost", is_flag=True, help="Also report what each pass costs; in JSON as a second key.")
-@click.option(
-    "--ledger", is_flag=True, help="Also report what rules create, destroy and move; in JSON as a key."
-)
+@opt.layouts("One JSON list instead of text.", ("short", "One line for each mistake, without carets."))
+@opt.flag("--notes", "Also list notes, such as inactive rules.")
+@opt.flag("--warnings-as-errors", "Exit with 1 if there are warnings.")
+@opt.flag("--quick", "Check only the rules themselves; do not try invariants.")
+@opt.flag("--cost", "Also report what each pass costs; in JSON as a second key.")
+@opt.flag("--ledger", "Also report what rules create, destroy and move; in JSON as a key.")
 def command(
     rules: tuple[str, ...],
     layout: str,

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import PATH, backend_option, check_writable, load_rules, rules_argument, set_option
+from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.declarations import Block, PackDecl, PassDecl
@@ -24,24 +25,20 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 
 
 @click.command("compile")
-@rules_argument
-@click.option(
+@opt.rules
+@opt.choice(
     "--emit",
-    "stage",
-    type=click.Choice(STAGES),
-    required=True,
-    help="tree: rules as parsed; model: checked, loops unrolled; ir: optimized; planes: on bit planes; "
+    STAGES,
+    "tree: rules as parsed; model: checked, loops unrolled; ir: optimized; planes: on bit planes; "
     "schedule: loops, guards and buffers; kernels: what runs.",
+    to="stage",
+    required=True,
 )
-@backend_option("auto", "Whose schedule or kernels are printed.")
-@click.option(
-    "--after",
-    metavar="STAGE",
-    help="Print the schedule after this stage of the planner.  [default: the last]",
-)
-@click.option("--pass", "pass_name", metavar="NAME", help="Print only this pass of the rules.")
-@click.option("-o", "--out", type=PATH, metavar="FILE", help="Write to this file instead of stdout.")
-@set_option
+@opt.backend("auto", "Whose schedule or kernels are printed.")
+@opt.text("--after", "STAGE", "Print the schedule after this stage of the planner.  [default: the last]")
+@opt.text("--pass", "NAME", "Print only this pass of the rules.", to="pass_name")
+@opt.path("-o", "FILE", "Write to this file instead of stdout.", to="--out")
+@opt.parameters
 def command(
     rules: str,
     stage: str,

@@ -7,17 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import print_json, user_values
-from powderdsl.cli.options import (
-    PATH,
-    BackendType,
-    Integer,
-    ManyWords,
-    check_writable,
-    layout_options,
-    packs_option,
-    set_option,
-)
+from powderdsl.cli.options import check_writable
 from powderdsl.cli.plain_table import table
 from powderdsl.cli.task_sheets import find_played
 from powderdsl.tasks.task import Task
@@ -32,7 +24,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
     return [one.strip() for one in value.split(",") if one.strip()]
 
 
-@click.command("evaluate", cls=ManyWords)
+@click.command("evaluate", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option(
     "--splits",
@@ -46,20 +38,18 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
     metavar="A,B",
     help="Policies among trained, random, nothing.  [default: all]",
 )
-@click.option("--episodes", type=Integer(1, 10**6), default=256, help="Episodes per split and policy.")
+@opt.integer("--episodes", 1, 10**6, "Episodes per split and policy.", 256)
 @click.option(
     "--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one as in training."
 )
-@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Seed of what policies draw.")
-@click.option(
-    "--knob", "knobs", multiple=True, metavar="NAME=N", help="For a task: another value for a knob."
-)
-@set_option
-@packs_option
-@click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
+@opt.integer("--seed", 0, 2**32 - 1, "Seed of what policies draw.", 0)
+@opt.knobs("For a task: another value for a knob.")
+@opt.parameters
+@opt.packs
+@click.option("--backend", type=opt.BackendType(), help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
-@layout_options("One JSON object instead of a table.")
-@click.option("--out", type=PATH, metavar="FILE.json", help="Also write the JSON object to this file.")
+@opt.layouts("One JSON object instead of a table.")
+@opt.path("--out", "FILE.json", "Also write the JSON object to this file.")
 def command(
     run: str,
     knobs: tuple[str, ...],

@@ -9,8 +9,9 @@ from string import Template
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import PATH, check_writable
+from powderdsl.cli.options import check_writable
 from powderdsl.compiler import read, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.model.check import check
@@ -25,7 +26,7 @@ TEMPLATE = Path(__file__).with_name("first_pack.yaml")
 
 @click.command("new")
 @click.argument("name")
-@click.option("--dir", "folder", default=".", type=PATH, help="The folder of the new file.")
+@opt.path("--dir", "PATH", "The folder of the new file.", to="folder", default=".")
 def command(name: str, folder: Path) -> None:
     """Write NAME.yaml, a first pack: an element, a rule and a test.
 

@@ -11,16 +11,8 @@ from typing import Any
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, counted, user_values, write_diagnostics
-from powderdsl.cli.options import (
-    PATH,
-    Integer,
-    ManyWords,
-    backend_option,
-    device_option,
-    packs_option,
-    set_option,
-)
 from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
@@ -31,48 +23,29 @@ from powderdsl.tasks.task import Task
 SCRIPTED = ("random", "nothing")
 
 
-@click.command("record", cls=ManyWords)
+@click.command("record", cls=opt.ManyWords)
 @click.argument("task", required=False)
-@click.option("--out", type=PATH, metavar="FOLDER", help="Folder of the dataset.")
-@click.option("--episodes", type=Integer(1, 1 << 32), help="Number of episodes to record.")
-@click.option("--split", default="train", help="Split: the set of worlds.")
-@click.option(
+@opt.path("--out", "FOLDER", "Folder of the dataset.")
+@opt.integer("--episodes", 1, 1 << 32, "Number of episodes to record.")
+@opt.text("--split", "SPLIT", "The set of worlds.", "train")
+@opt.text(
     "--policy",
-    metavar="random|nothing|RUN",
-    default="random",
-    help="Policy: every action equally likely, no action, or a trained agent.",
+    "random|nothing|RUN",
+    "Policy: every action equally likely, no action, or a trained agent.",
+    "random",
 )
-@click.option(
-    "--observation",
-    type=click.Choice(("ids", "compact")),
-    default="ids",
-    help="Record elements only, or the whole state.",
-)
-@click.option(
-    "--seed",
-    type=Integer(0, (1 << 61) - 1),
-    default=0,
-    help="World of the first episode, and seed of the policy.",
-)
-@click.option(
-    "--worlds",
-    type=Integer(1, (1 << 61) - 1),
-    default=1_000_000,
-    help="Number of worlds: they are numbered from 0.",
-)
-@click.option(
-    "--knob", "knobs", multiple=True, metavar="NAME=N", help="Another value for a knob of the task."
-)
-@set_option
-@packs_option
-@click.option("--shard", type=Integer(1, 1 << 32), help="Episodes per file.  [default: 256, or 256 MiB]")
-@click.option("--compress", is_flag=True, help="Smaller files, slower to read.")
-@click.option(
-    "--envs", type=Integer(1, 1 << 20), default=256, help="Maximum number of episodes played at once."
-)
-@backend_option("auto")
-@device_option
-@click.option("--verify", type=PATH, metavar="FOLDER", help="Record nothing: read every byte of a dataset.")
+@opt.choice("--observation", ("ids", "compact"), "Record elements only, or the whole state.", "ids")
+@opt.integer("--seed", 0, (1 << 61) - 1, "World of the first episode, and seed of the policy.", 0)
+@opt.integer("--worlds", 1, (1 << 61) - 1, "Number of worlds: they are numbered from 0.", 1_000_000)
+@opt.knobs("Another value for a knob of the task.")
+@opt.parameters
+@opt.packs
+@opt.integer("--shard", 1, 1 << 32, "Episodes per file.  [default: 256, or 256 MiB]")
+@opt.flag("--compress", "Smaller files, slower to read.")
+@opt.integer("--envs", 1, 1 << 20, "Maximum number of episodes played at once.", 256)
+@opt.backend("auto")
+@opt.device
+@opt.path("--verify", "FOLDER", "Record nothing: read every byte of a dataset.")
 def command(
     task: str | None, out: Path | None, episodes: int | None, policy: str, verify: Path | None, **how: Any
 ) -> int:

@@ -6,16 +6,17 @@ from pathlib import Path
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import PATH, Integer, SizeType, check_writable, load_rules
+from powderdsl.cli.options import check_writable, load_rules
 
 
 @click.command("render")
 @click.argument("world", metavar="WORLD")
-@click.option("--rules", required=True, metavar="RULES", help="Rules whose elements the world has.")
-@click.option("--out", required=True, metavar="FILE", type=PATH, help="The .png file to write.")
-@click.option("--size", type=SizeType(), help="Rows and columns of a scene, such as 48x64.")
-@click.option("--scale", type=Integer(1, 64), help="Pixels per cell.  [default: about 400 a side]")
+@opt.text("--rules", "RULES", "Rules whose elements the world has.", required=True)
+@opt.path("--out", "FILE", "The .png file to write.", required=True)
+@click.option("--size", type=opt.SizeType(), help="Rows and columns of a scene, such as 48x64.")
+@opt.integer("--scale", 1, 64, "Pixels per cell.  [default: about 400 a side]")
 def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
     """Draw a world as a picture, without running it.
 

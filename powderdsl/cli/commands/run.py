@@ -11,17 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import counted, user_values
-from powderdsl.cli.options import (
-    Integer,
-    SizeType,
-    backend_option,
-    check_writable,
-    device_option,
-    load_rules,
-    rules_argument,
-    set_option,
-)
+from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -63,25 +55,23 @@ def _out(ctx: click.Context, param: click.Parameter, value: str | None) -> Path 
 
 
 @click.command("run")
-@rules_argument
-@click.option(
-    "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
-)
-@click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
-@click.option("--batch", type=Integer(1, 1 << 20), help="Number of worlds.  [default: 1]")
-@click.option("--steps", type=Integer(0, 10**9), default=240, help="Number of steps.")
-@click.option("--seed", type=Integer(0, 2**63 - 1), help="Seed of all random numbers.  [default: 0]")
-@backend_option("auto")
-@device_option
-@set_option
+@opt.rules
+@opt.world
+@opt.size
+@opt.integer("--batch", 1, 1 << 20, "Number of worlds.  [default: 1]")
+@opt.integer("--steps", 0, 10**9, "Number of steps.", 240)
+@opt.integer("--seed", 0, 2**63 - 1, "Seed of all random numbers.  [default: 0]")
+@opt.backend("auto")
+@opt.device
+@opt.parameters
 @click.option(
     "--out", metavar="FILE", callback=_out, help="Write a .png, .gif or .mp4, or save the world as .npz."
 )
-@click.option("--scale", type=Integer(1, 64), help="Pixels per cell.  [default: about 400 a side]")
-@click.option("--every", type=Integer(1, 10**6), default=1, help="Show every n-th step.")
-@click.option("--fps", type=Integer(1, 240), default=30, help="Frames per second.")
-@click.option("--watch", is_flag=True, help="Show the first world in the terminal while it runs.")
-@click.option("--threads", type=Integer(1, 1024), help="CPU threads.  [default: 1 for small batches]")
+@opt.integer("--scale", 1, 64, "Pixels per cell.  [default: about 400 a side]")
+@opt.integer("--every", 1, 10**6, "Show every n-th step.", 1)
+@opt.integer("--fps", 1, 240, "Frames per second.", 30)
+@opt.flag("--watch", "Show the first world in the terminal while it runs.")
+@opt.integer("--threads", 1, 1024, "CPU threads.  [default: 1 for small batches]")
 @click.option("-v", "--verbose", is_flag=True, help="Report the speed, and how many cells each element has.")
 def command(
     rules: str,

@@ -10,8 +10,9 @@ from typing import Any
 import click
 
 from powderdsl.analysis.reactions import reactions
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, color_wanted, print_json
-from powderdsl.cli.options import PATH, Integer, layout_options, load_rules, set_option
+from powderdsl.cli.options import load_rules
 from powderdsl.cli.plain_table import Painted, table
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
@@ -22,16 +23,12 @@ from powderdsl.tasks.shipped import is_task
 
 @click.command("show")
 @click.argument("rules", metavar="RULES|TASK")
-@layout_options("One JSON object instead of tables.")
-@set_option
-@click.option(
-    "--knob", "knobs", multiple=True, metavar="NAME=N", help="For a task: another value for a knob."
-)
-@click.option("--split", default="train", help="For a task: the set of worlds.")
-@click.option("--seeds", type=Integer(1, 256), default=16, help="For a task: the number of worlds.")
-@click.option(
-    "--out", type=PATH, metavar="FILE.png", help="For a task: draw these worlds, with regions outlined."
-)
+@opt.layouts("One JSON object instead of tables.")
+@opt.parameters
+@opt.knobs("For a task: another value for a knob.")
+@opt.text("--split", "SPLIT", "For a task: the set of worlds.", "train")
+@opt.integer("--seeds", 1, 256, "For a task: the number of worlds.", 16)
+@opt.path("--out", "FILE.png", "For a task: draw these worlds, with regions outlined.")
 def command(
     rules: str,
     layout: str,

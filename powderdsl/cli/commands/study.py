@@ -11,9 +11,9 @@ from pathlib import Path
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.cli.exits import FAILED, OK, BadInput, counted
-from powderdsl.cli.options import PATH, Integer
 from powderdsl.cli.progress import progress
 from powderdsl.cli.study.checks import check_study
 from powderdsl.diagnostics.printable import printable
@@ -76,22 +76,13 @@ def called(words: tuple[str, ...]) -> click.Command:
 
 @click.command("study")
 @click.argument("study", metavar="STUDY", required=False)
-@click.option(
-    "--size", type=click.Choice(SIZES), default="small", help="Size of the study: values of its settings."
-)
-@click.option("--seeds", type=Integer(1, 1000), help="Runs of each combination.  [default: the study's]")
-@click.option("--jobs", type=Integer(1, 256), default=2, help="Processes that run at a time.")
-@click.option("--threads", type=Integer(1, 256), default=1, help="Threads per process.")
-@click.option(
-    "--only",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Run only combinations with this value. May be repeated.",
-)
-@click.option(
-    "--out", type=PATH, metavar="FOLDER", help="Folder of the results.  [default: studies/STUDY-SIZE]"
-)
-@click.option("--dry-run", is_flag=True, help="Print the commands without running them.")
+@opt.choice("--size", SIZES, "Size of the study: values of its settings.", "small")
+@opt.integer("--seeds", 1, 1000, "Runs of each combination.  [default: the study's]")
+@opt.integer("--jobs", 1, 256, "Processes that run at a time.", 2)
+@opt.integer("--threads", 1, 256, "Threads per process.", 1)
+@opt.text("--only", "NAME=VALUE", "Run only combinations with this value. May be repeated.", multiple=True)
+@opt.path("--out", "FOLDER", "Folder of the results.  [default: studies/STUDY-SIZE]")
+@opt.flag("--dry-run", "Print the commands without running them.")
 def command(
     study: str | None,
     size: str,

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import FAILED, OK, BadInput, print_json
-from powderdsl.cli.options import Integer, backend_option, check_writable, load_rules, set_option
+from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.compiler import shipped_tests
 
 MAX_SECONDS = 24 * 3600
@@ -15,37 +16,35 @@ MAX_SECONDS = 24 * 3600
 
 @click.command("test")
 @click.argument("rules", nargs=-1, metavar="[RULES]...")
-@backend_option("arrays")
-@set_option
-@click.option("--examples", type=Integer(0, 10_000_000), default=1000,
-              help="Random worlds on which each invariant is tried.")  # fmt: skip
-@click.option("--drawn", type=Integer(0, 1_000_000), default=100,
-              help="Additional worlds, drawn by Hypothesis.")  # fmt: skip
-@click.option("--seconds", type=Integer(1, MAX_SECONDS), default=60,
-              help="Time limit for random worlds, per RULES, in seconds.")  # fmt: skip
-@click.option("--seed", type=Integer(0, 2**31 - 1), default=0,
-              help="Seed of the random worlds.")  # fmt: skip
-@click.option(
-    "--replay", type=click.Path(dir_okay=False, path_type=Path), help="Only try this counterexample again."
-)
-@click.option("--picture", type=click.Path(dir_okay=False, path_type=Path),
-              help="Draw the first counterexample, before and after, as a .png.")  # fmt: skip
+@opt.backend("arrays")
+@opt.parameters
+@opt.integer("--examples", 0, 10_000_000, "Random worlds on which each invariant is tried.", 1000)
+@opt.integer("--drawn", 0, 1_000_000, "Additional worlds, drawn by Hypothesis.", 100)
+@opt.integer("--seconds", 1, MAX_SECONDS, "Time limit for random worlds, per RULES, in seconds.", 60)
+@opt.integer("--seed", 0, 2**31 - 1, "Seed of the random worlds.", 0)
+@opt.path("--replay", "FILE", "Only try this counterexample again.")
+@opt.path("--picture", "FILE", "Draw the first counterexample, before and after, as a .png.")
 @click.option(
     "--keep/--no-keep",
     default=None,
     help="Keep counterexamples in .powderdsl/.  [default: unless $CI is set]",
 )
-@click.option("--json", "as_json", is_flag=True, help="One JSON object instead of text.")
-@click.option(
-    "--mutate", is_flag=True, help="Put mistakes into the packs, and list those that nothing notices."
+@opt.flag("--json", "One JSON object instead of text.", to="as_json")
+@opt.flag("--mutate", "Put mistakes into the packs, and list those that nothing notices.")
+@opt.text(
+    "--pack", "PACK", "With --mutate: only mistakes in this pack. May be repeated.", to="packs", multiple=True
 )
-@click.option("--pack", "packs", multiple=True, metavar="PACK",
-              help="With --mutate: only mistakes in this pack. May be repeated.")  # fmt: skip
-@click.option("--mutants", type=Integer(1, 1_000_000), metavar="N",
-              help="With --mutate: maximum number of mutants, of each kind in proportion.")  # fmt: skip
-@click.option("--write", is_flag=True, help="With --mutate: add tests that notice them to their packs.")
-@click.option("--jobs", type=Integer(1, 256), metavar="N",
-              help="With --mutate: number of processes.  [default: one per processor]")  # fmt: skip
+@opt.integer(
+    "--mutants",
+    1,
+    1_000_000,
+    "With --mutate: maximum number of mutants, of each kind in proportion.",
+    metavar="N",
+)
+@opt.flag("--write", "With --mutate: add tests that notice them to their packs.")
+@opt.integer(
+    "--jobs", 1, 256, "With --mutate: number of processes.  [default: one per processor]", metavar="N"
+)
 def command(
     rules: tuple[str, ...],
     backend: str,

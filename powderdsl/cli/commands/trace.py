@@ -8,8 +8,9 @@ from typing import Any
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, color_wanted, print_json, user_values
-from powderdsl.cli.options import Integer, SizeType, backend_option, load_rules, rules_argument, set_option
+from powderdsl.cli.options import load_rules
 from powderdsl.diagnostics.printable import write_styled
 
 
@@ -30,26 +31,20 @@ class CellType(click.ParamType):
 
 
 @click.command("trace")
-@rules_argument
-@click.option(
-    "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
-)
-@click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
-@click.option("--seed", type=Integer(0, 2**63 - 1), help="Seed of all random numbers.  [default: 0]")
+@opt.rules
+@opt.world
+@opt.size
+@opt.integer("--seed", 0, 2**63 - 1, "Seed of all random numbers.  [default: 0]")
 @click.option("--at", "cell", type=CellType(), required=True, help="Row and column of the cell, from 0.")
-@click.option("--step", type=Integer(1, 10**9), required=True, help="Step of the run, from 1.")
-@click.option(
-    "--of",
-    "names",
-    multiple=True,
-    metavar="NAME",
-    help="Explain only `element`, or this field. May be repeated.",
+@opt.integer("--step", 1, 10**9, "Step of the run, from 1.", required=True)
+@opt.text(
+    "--of", "NAME", "Explain only `element`, or this field. May be repeated.", to="names", multiple=True
 )
-@click.option("--number", type=Integer(0, 1 << 20), default=0, help="Number of the world in a saved batch.")
-@click.option("--all", "every_rule", is_flag=True, help="List every rule that did not happen, and why.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@backend_option("auto", "Backend that runs the steps before it.")
-@set_option
+@opt.integer("--number", 0, 1 << 20, "Number of the world in a saved batch.", 0)
+@opt.flag("--all", "List every rule that did not happen, and why.", to="every_rule")
+@opt.flag("--json", "Print one JSON object.", to="as_json")
+@opt.backend("auto", "Backend that runs the steps before it.")
+@opt.parameters
 def command(
     rules: str,
     world: str | None,

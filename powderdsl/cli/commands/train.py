@@ -7,52 +7,32 @@ from typing import Any
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import (
-    PATH,
-    Integer,
-    ManyWords,
-    backend_option,
-    packs_option,
-    set_option,
-    setting_options,
-)
 from powderdsl.cli.progress import progress
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 
 
-@click.command("train", cls=ManyWords)
+@click.command("train", cls=opt.ManyWords)
 @click.argument("task", metavar="TASK", required=False)
-@click.option(
-    "--run", "folder", type=PATH, metavar="DIR", help="Folder of the run.  [default: runs/TASK-seedN]"
-)
-@click.option("--resume", type=PATH, metavar="DIR", help="Continue a run with its own settings.")
-@click.option(
+@opt.path("--run", "DIR", "Folder of the run.  [default: runs/TASK-seedN]", to="folder")
+@opt.path("--resume", "DIR", "Continue a run with its own settings.")
+@opt.choice(
     "--preset",
-    "preset_name",
-    type=click.Choice(list(PRESETS)),
-    default="paper",
-    help="Settings that other options change: the paper's, or those for a few minutes on one core.",
+    list(PRESETS),
+    "Settings that other options change: the paper's, or those for a few minutes on one core.",
+    "paper",
+    to="preset_name",
 )
-@setting_options(TrainConfig)
-@click.option(
-    "--knob",
-    "knobs",
-    multiple=True,
-    metavar="NAME=N",
-    help="Another value for a knob of the task. May be repeated.",
-)
-@click.option("--n-lines", "lines", type=Integer(0, 10**6), help="Short for --knob lines=N.")
-@click.option("--n-disks", "disks", type=Integer(0, 10**6), help="Short for --knob disks=N.")
-@click.option(
-    "--complexity",
-    type=Integer(0, 10**6),
-    help="Short for --knob complexity=N.",
-)
-@set_option
-@packs_option
-@backend_option("auto")
+@opt.settings_of(TrainConfig)
+@opt.knobs("Another value for a knob of the task. May be repeated.")
+@opt.integer("--n-lines", 0, 10**6, "Short for --knob lines=N.", to="lines")
+@opt.integer("--n-disks", 0, 10**6, "Short for --knob disks=N.", to="disks")
+@opt.integer("--complexity", 0, 10**6, "Short for --knob complexity=N.")
+@opt.parameters
+@opt.packs
+@opt.backend("auto")
 @click.option(
     "--checkpoint-every",
     "checkpoint_minutes",

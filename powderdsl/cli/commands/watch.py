@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import (
-    PATH,
-    BackendType,
-    Integer,
-    ManyWords,
-    check_writable,
-    packs_option,
-    set_option,
-)
+from powderdsl.cli.options import check_writable
 from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.cli.task_sheets import find_played
 from powderdsl.rl.config import TrainConfig
@@ -30,32 +23,23 @@ if TYPE_CHECKING:
 SUFFIXES = (".gif", ".mp4")
 
 
-@click.command("watch", cls=ManyWords)
+@click.command("watch", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option("--split", help="Split: the set of worlds.  [default: test where the task has it, else train]")
-@click.option("--worlds", type=Integer(1, 64), default=4, help="Number of worlds, side by side.")
-@click.option("--first", type=Integer(0, 2**62), default=0, help="Number of the first world.")
-@click.option(
-    "--policy",
-    type=click.Choice(("trained", "random", "nothing")),
-    help="Policy that acts.  [default: trained; for a TASK: random]",
+@opt.integer("--worlds", 1, 64, "Number of worlds, side by side.", 4)
+@opt.integer("--first", 0, 2**62, "Number of the first world.", 0)
+@opt.choice(
+    "--policy", ("trained", "random", "nothing"), "Policy that acts.  [default: trained; for a TASK: random]"
 )
 @click.option("--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one.")
-@click.option("--seed", type=Integer(0, 2**32 - 1), default=0, help="Seed of what the policy draws.")
-@click.option(
-    "--knob", "knobs", multiple=True, metavar="NAME=N", help="For a task: another value for a knob."
-)
-@set_option
-@packs_option
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="FILE",
-    help="The .gif or .mp4 to write.  [default: watch.gif in the run's folder]",
-)
-@click.option("--fps", type=Integer(1, 240), default=15, help="Frames per second.")
-@click.option("--scale", type=Integer(1, 32), default=4, help="Pixels per cell.")
-@click.option("--backend", type=BackendType(), help="Backend that runs the rules.  [default: the run's]")
+@opt.integer("--seed", 0, 2**32 - 1, "Seed of what the policy draws.", 0)
+@opt.knobs("For a task: another value for a knob.")
+@opt.parameters
+@opt.packs
+@opt.path("--out", "FILE", "The .gif or .mp4 to write.  [default: watch.gif in the run's folder]")
+@opt.integer("--fps", 1, 240, "Frames per second.", 15)
+@opt.integer("--scale", 1, 32, "Pixels per cell.", 4)
+@click.option("--backend", type=opt.BackendType(), help="Backend that runs the rules.  [default: the run's]")
 def command(
     run: str,
     split: str | None,

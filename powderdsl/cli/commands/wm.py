@@ -3,47 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, print_json, user_values
-from powderdsl.cli.options import (
-    PATH,
-    Integer,
-    ManyWords,
-    backend_option,
-    check_writable,
-    device_option,
-    layout_options,
-    set_option,
-)
+from powderdsl.cli.options import check_writable
 from powderdsl.cli.progress import progress
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.scores import Tested
     from powderdsl.worldmodel.training import Machine, TrainConfig, TrainingProgress
-
-
-Option = Callable[[Any], Any]
-
-
-def _words(name: str, about: str) -> Option:
-    return click.option(name, multiple=True, metavar="PACK…", help=about)
-
-
-def _options(*options: Option) -> Option:
-    """A decorator that stands for several, in their order."""
-
-    def decorate(function: Any) -> Any:
-        for option in reversed(options):
-            function = option(function)
-        return function
-
-    return decorate
 
 
 KNOBS = ("kinds", "lines", "disks", "squares")
@@ -53,63 +27,50 @@ VARIETY = ("chances", "swaps", "leave_out")
 TRAINING = ("iterations", "batch", "learning_rate", "seed")
 MACHINE = ("device", "threads", "backend", "store", "compiled")
 
-_data_options = _options(
-    click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: world-model]"),
-    click.option("--split", metavar="SPLIT", help="Split of the task to train on.  [default: train]"),
-    click.option("--rules", metavar="RULES", help="Rules of the worlds.  [default: the task's own]"),
-    _words("--packs", "Keep only these packs of the rules, or add them."),
-    _words("--held-out", "Leave these packs of the rules out."),
-    click.option("--elements", "kinds", type=Integer(0, 255), help="Number of elements drawn besides empty."),
-    click.option("--lines", type=Integer(0, 256), help="Maximum number of lines per world."),
-    click.option("--disks", type=Integer(0, 256), help="Maximum number of disks per world."),
-    click.option("--squares", type=Integer(0, 256), help="Maximum number of squares per world."),
-    click.option(
-        "--knob", "knobs", multiple=True, metavar="NAME=N", help="Another value for a knob of the task."
-    ),
-    click.option("--states", type=Integer(1, 1 << 32), help="Number of start worlds."),
-    click.option("--buffer", "capacity", type=Integer(1, 1 << 32), help="Capacity of the buffer, in pairs."),
-    click.option(
-        "--refresh", type=Integer(1, 1 << 20), help="Pairs that each iteration replaces in the buffer."
-    ),
-    set_option,
-    click.option("--rulesets", type=Integer(0, 1024), help="Number of rulesets to draw around the rules."),
-    click.option(
-        "--first-ruleset", type=Integer(0, 1 << 31), help="Number of the first drawn ruleset.  [default: 0]"
-    ),
+_data_options = opt.several(
+    opt.text("--task", "TASK", "A shipped task or a file.  [default: world-model]"),
+    opt.text("--split", "SPLIT", "Split of the task to train on.  [default: train]"),
+    opt.text("--rules", "RULES", "Rules of the worlds.  [default: the task's own]"),
+    opt.text("--packs", "PACK…", "Keep only these packs of the rules, or add them.", multiple=True),
+    opt.text("--held-out", "PACK…", "Leave these packs of the rules out.", multiple=True),
+    opt.integer("--elements", 0, 255, "Number of elements drawn besides empty.", to="kinds"),
+    opt.integer("--lines", 0, 256, "Maximum number of lines per world."),
+    opt.integer("--disks", 0, 256, "Maximum number of disks per world."),
+    opt.integer("--squares", 0, 256, "Maximum number of squares per world."),
+    opt.knobs("Another value for a knob of the task."),
+    opt.integer("--states", 1, 1 << 32, "Number of start worlds."),
+    opt.integer("--buffer", 1, 1 << 32, "Capacity of the buffer, in pairs.", to="capacity"),
+    opt.integer("--refresh", 1, 1 << 20, "Pairs that each iteration replaces in the buffer."),
+    opt.parameters,
+    opt.integer("--rulesets", 0, 1024, "Number of rulesets to draw around the rules."),
+    opt.integer("--first-ruleset", 0, 1 << 31, "Number of the first drawn ruleset.  [default: 0]"),
     click.option("--chances", type=float, help="Factor by which chances of drawn rulesets differ, at most."),
-    click.option(
+    opt.text(
         "--swap",
-        "swaps",
+        "PROPERTY",
+        "Property whose values two elements swap in drawn rulesets.",
+        to="swaps",
         multiple=True,
-        metavar="PROPERTY",
-        help="Property whose values two elements swap in drawn rulesets.",
     ),
     click.option(
         "--leave-out", type=float, metavar="CHANCE", help="Probability that a ruleset leaves out a pack."
     ),
 )
-_machine_options = _options(
-    click.option("--threads", type=Integer(1, 1024), default=1, help="CPU threads."),
-    device_option,
-    backend_option("auto"),
+_machine_options = opt.several(
+    opt.integer("--threads", 1, 1024, "CPU threads.", 1), opt.device, opt.backend("auto")
 )
-_training_options = _options(
+_training_options = opt.several(
     _machine_options,
-    click.option("--iterations", type=Integer(1, 10**9), help="Steps of Adam."),
-    click.option("--batch", type=Integer(1, 1 << 20), help="Pairs per step."),
+    opt.integer("--iterations", 1, 10**9, "Steps of Adam."),
+    opt.integer("--batch", 1, 1 << 20, "Pairs per step."),
     click.option(
         "--learning-rate", type=click.FloatRange(min=0, min_open=True), help="Learning rate of Adam."
     ),
-    click.option("--seed", type=Integer(0, 2**63 - 1), help="Seed of weights, worlds and batches."),
-    click.option("--run", "folder", metavar="DIR", type=PATH, help="Folder of the run."),
-    click.option(
-        "--store",
-        type=click.Choice(["auto", "memory", "disk"]),
-        default="auto",
-        help="Where to keep the buffer.",
-    ),
+    opt.integer("--seed", 0, 2**63 - 1, "Seed of weights, worlds and batches."),
+    opt.path("--run", "DIR", "Folder of the run.", to="folder"),
+    opt.choice("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
     click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
-    click.option("--save-every", type=Integer(1, 10**6), default=60, help="Seconds between checkpoints."),
+    opt.integer("--save-every", 1, 10**6, "Seconds between checkpoints.", 60),
 )
 
 
@@ -124,16 +85,16 @@ def command() -> None:
     """
 
 
-@command.command("train", cls=ManyWords)
-@click.option(
+@command.command("train", cls=opt.ManyWords)
+@opt.choice(
     "--preset",
-    type=click.Choice(["small", "paper"]),
-    default="small",
-    help="Settings that other options change: `small` for a CPU, `paper` for a GPU.",
+    ["small", "paper"],
+    "Settings that other options change: `small` for a CPU, `paper` for a GPU.",
+    "small",
 )
 @_data_options
-@click.option("--width", type=Integer(1, 1024), help="Features of the first block.")
-@click.option("--slots", type=Integer(1, 256), help="Room for this many elements, for packs that come later.")
+@opt.integer("--width", 1, 1024, "Features of the first block.")
+@opt.integer("--slots", 1, 256, "Room for this many elements, for packs that come later.")
 @_training_options
 def train_command(
     preset: str,
@@ -175,9 +136,14 @@ def train_command(
     _run(config, folder or Path("runs") / (Path(data.task).stem or "run"), values)
 
 
-@command.command("finetune", cls=ManyWords)
+@command.command("finetune", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN")
-@_words("--packs", "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.")
+@opt.text(
+    "--packs",
+    "PACK…",
+    "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.",
+    multiple=True,
+)
 @_training_options
 def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
     """Continue from a run's weights, on worlds of other packs' elements alone.
@@ -197,40 +163,22 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     _run(config, target, values, parent=trained.checkpoint, note=note)
 
 
-@command.command("eval", cls=ManyWords)
+@command.command("eval", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN")
-@click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
-@click.option("--split", metavar="SPLIT", default="designed", help="Split of the task to test on.")
-@click.option("--rules", metavar="RULES", help="Rules to test under.  [default: the run's]")
-@_words("--only", "Draw elements of these packs only.  [default: the run's]")
-@click.option(
-    "--knob",
-    "knobs",
-    multiple=True,
-    metavar="NAME=N",
-    help="Another value for a knob of the task.  [default: the run's]",
+@opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]")
+@opt.text("--split", "SPLIT", "Split of the task to test on.", "designed")
+@opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]")
+@opt.text("--only", "PACK…", "Draw elements of these packs only.  [default: the run's]", multiple=True)
+@opt.knobs("Another value for a knob of the task.  [default: the run's]")
+@opt.integer(
+    "--worlds", 1, 1 << 20, "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
 )
-@click.option(
-    "--worlds",
-    type=Integer(1, 1 << 20),
-    help="Worlds of the split, or futures of each designed world.  [default: 32, 4]",
-)
-@click.option(
-    "--rulesets",
-    type=Integer(0, 1024),
-    default=0,
-    help="Number of rulesets that training never saw, to test under.",
-)
-@layout_options("One JSON object instead of a table.")
-@click.option("--out", metavar="FILE", type=PATH, help="File of the results.  [default: RUN/evaluation.json]")
+@opt.integer("--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.", 0)
+@opt.layouts("One JSON object instead of a table.")
+@opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
 @_machine_options
 def eval_command(
-    run: str,
-    only: tuple[str, ...],
-    knobs: tuple[str, ...],
-    layout: str,
-    out: Path | None,
-    **values: Any,
+    run: str, only: tuple[str, ...], knobs: tuple[str, ...], layout: str, out: Path | None, **values: Any
 ) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
@@ -257,24 +205,17 @@ def eval_command(
         click.echo("\n".join(_text(tested, plain)))
 
 
-@command.command("show", cls=ManyWords)
+@command.command("show", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN")
-@click.option("--out", metavar="FILE", required=True, type=PATH, help="The .png file to write.")
-@click.option("--steps", type=Integer(1, 4096), help="Steps to predict.  [default: as trained]")
-@click.option("--after", type=Integer(0, 10**6), default=0, help="Steps that worlds run before the start.")
-@click.option("--task", metavar="TASK", help="A shipped task or a file.  [default: the run's]")
-@click.option("--split", metavar="SPLIT", default="designed", help="Split of the task.")
-@click.option("--rules", metavar="RULES", help="Rules to test under.  [default: the run's]")
-@click.option("--scale", type=Integer(1, 16), default=2, help="Pixels per cell.")
+@opt.path("--out", "FILE", "The .png file to write.", required=True)
+@opt.integer("--steps", 1, 4096, "Steps to predict.  [default: as trained]")
+@opt.integer("--after", 0, 10**6, "Steps that worlds run before the start.", 0)
+@opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]")
+@opt.text("--split", "SPLIT", "Split of the task.", "designed")
+@opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]")
+@opt.integer("--scale", 1, 16, "Pixels per cell.", 2)
 @_machine_options
-def show_command(
-    run: str,
-    out: Path,
-    steps: int | None,
-    after: int,
-    scale: int,
-    **values: Any,
-) -> None:
+def show_command(run: str, out: Path, steps: int | None, after: int, scale: int, **values: Any) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
     For several times the steps that the network was trained for, it is applied to what it predicted.
