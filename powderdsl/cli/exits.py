@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import click
 
+from powderdsl.cli.output import counted, write_diagnostics
 from powderdsl.system.interrupts import Terminated
-
-if TYPE_CHECKING:
-    from powderdsl.diagnostics import Diagnostic
 
 OK = 0
 FAILED = 1
@@ -49,32 +47,6 @@ def user_values() -> Iterator[None]:
         # str() of a KeyError is the repr of its message.
         words = error.args[0] if isinstance(error, KeyError) and error.args else error
         raise BadInput(" ".join(str(words).split())) from error
-
-
-def color_wanted(stream: IO[Any]) -> bool:
-    """Color only on a terminal that has it, and without NO_COLOR (https://no-color.org)."""
-    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-
-
-def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> None:
-    """Full texts with carets, an empty line between two."""
-    from powderdsl.diagnostics.printable import write_styled
-    from powderdsl.diagnostics.render import render_text
-
-    color = color_wanted(stream)
-    write_styled(stream, "\n\n".join(render_text(one, color=color) for one in diagnostics) + "\n")
-
-
-def print_json(value: Any) -> None:
-    """Print a value as indented JSON."""
-    import json
-
-    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
-
-
-def counted(number: int, thing: str) -> str:
-    """`no errors`, `1 error`, `2 errors`."""
-    return f"{number or 'no'} {thing}{'' if number == 1 else 's'}"
 
 
 def report_failure(error: BaseException) -> int:

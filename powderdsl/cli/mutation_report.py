@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import FAILED, OK, BadInput, counted, print_json
-from powderdsl.cli.progress import progress
+from powderdsl.cli.exits import FAILED, OK, BadInput
+from powderdsl.cli.output import counted, print_json, progress
 
 if TYPE_CHECKING:
     from powderdsl.testing.mutation.mutants import Mutant

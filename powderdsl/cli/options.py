@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.exits import counted
+from powderdsl.cli.output import counted
 from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS, load_with_diagnostics
 from powderdsl.diagnostics import Severity
 
@@ -142,8 +142,10 @@ def knobs(about: str) -> Option:
     return _option("--knob", about, to="knobs", multiple=True, metavar="NAME=N")
 
 
-def _option(name: str, about: str, to: str = "", **more: Any) -> Option:
+def _option(name: str, about: str, to: str = "", default: Any = None, **more: Any) -> Option:
     """`to`: the parameter of the command, where it has another name."""
+    if default is not None:  # click takes None for a value, which a required option then has
+        more["default"] = default
     return click.option(name, *([to] if to else []), help=about, **more)
 
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from powderdsl.cli.exits import BadInput, print_json
+from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
+from powderdsl.cli.output import print_json, table
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
-from powderdsl.cli.plain_table import table
 from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
 from powderdsl.tasks.shipped import check_split, is_task, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task

@@ -10,7 +10,8 @@ from typing import Any
 
 import click
 
-from powderdsl.cli.exits import BadInput, counted
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.output import counted
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.media import write_png

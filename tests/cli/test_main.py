@@ -9,7 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from powderdsl.cli import exits, main
+from powderdsl.cli import exits, main, output
 from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Label
 from tests.cli.commands import powderdsl, process
@@ -156,13 +156,13 @@ class Terminal:
 def test_color_is_for_terminals_that_want_it(monkeypatch):
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
-    assert exits.color_wanted(Terminal(True))
-    assert not exits.color_wanted(Terminal(False))
+    assert output.color_wanted(Terminal(True))
+    assert not output.color_wanted(Terminal(False))
     monkeypatch.setenv("TERM", "dumb")
-    assert not exits.color_wanted(Terminal(True))
+    assert not output.color_wanted(Terminal(True))
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("NO_COLOR", "1")
-    assert not exits.color_wanted(Terminal(True))
+    assert not output.color_wanted(Terminal(True))
 
 
 def test_a_terminal_without_the_characters_gets_others():

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from powderdsl.cli.dispatch import GuardedCommand
-from powderdsl.cli.exits import FAILED, OK, BadInput, counted
+from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.options import Integer, renamed_backend
-from powderdsl.cli.progress import progress
+from powderdsl.cli.output import counted, progress
 from powderdsl.system.interrupts import Terminated
 
 if TYPE_CHECKING:

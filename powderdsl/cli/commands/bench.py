@@ -9,9 +9,9 @@ from typing import Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import OK, print_json, user_values
+from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.options import check_writable, load_rules
-from powderdsl.cli.progress import progress
+from powderdsl.cli.output import print_json, progress
 from powderdsl.experiments.bench.figures import CellFigures, Report, make_report, report_data
 from powderdsl.experiments.bench.machine import load_average, this_machine
 from powderdsl.experiments.bench.measure import measuring

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from powderdsl.cli.exits import counted, print_json
+from powderdsl.cli.output import counted, print_json
 
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
 

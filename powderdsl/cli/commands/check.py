@@ -13,8 +13,8 @@ from powderdsl.analysis.ledger.account import ledger_data, ledger_text
 from powderdsl.analysis.ledger.book import Ledger
 from powderdsl.analysis.ledger.book import ledger as make_ledger
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BAD_INPUT, FAILED, OK, counted, print_json, write_diagnostics
-from powderdsl.cli.plain_table import table
+from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
+from powderdsl.cli.output import counted, print_json, table, write_diagnostics
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import print_json, user_values
+from powderdsl.cli.exits import user_values
 from powderdsl.cli.options import check_writable
-from powderdsl.cli.plain_table import table
+from powderdsl.cli.output import print_json, table
 from powderdsl.cli.task_sheets import find_played
 from powderdsl.tasks.task import Task
 

@@ -6,7 +6,8 @@ import sys
 
 import click
 
-from powderdsl.cli.exits import BadInput, color_wanted
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.output import color_wanted
 from powderdsl.diagnostics.codes import CODES
 from powderdsl.diagnostics.explain import find_code, page, similar
 from powderdsl.diagnostics.printable import unguarded

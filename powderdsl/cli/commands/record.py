@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, counted, user_values, write_diagnostics
-from powderdsl.cli.progress import progress
+from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, user_values
+from powderdsl.cli.output import counted, progress, write_diagnostics
 from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
 from powderdsl.diagnostics import CompileError, Diagnostic

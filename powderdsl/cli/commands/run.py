@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import counted, user_values
+from powderdsl.cli.exits import user_values
 from powderdsl.cli.options import check_writable, load_rules
-from powderdsl.cli.progress import progress
+from powderdsl.cli.output import counted, progress
 
 if TYPE_CHECKING:
     from powderdsl.cli.terminal import LiveView

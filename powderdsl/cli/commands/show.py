@@ -11,9 +11,9 @@ import click
 
 from powderdsl.analysis.reactions import reactions
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BadInput, color_wanted, print_json
+from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import load_rules
-from powderdsl.cli.plain_table import Painted, table
+from powderdsl.cli.output import Painted, color_wanted, print_json, table
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value

@@ -13,8 +13,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.dispatch import COMMANDS
-from powderdsl.cli.exits import FAILED, OK, BadInput, counted
-from powderdsl.cli.progress import progress
+from powderdsl.cli.exits import FAILED, OK, BadInput
+from powderdsl.cli.output import counted, progress
 from powderdsl.cli.study.checks import check_study
 from powderdsl.diagnostics.printable import printable
 from powderdsl.experiments.studies.file import load_study, shipped_studies

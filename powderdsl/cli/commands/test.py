@@ -7,8 +7,9 @@ from pathlib import Path
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import FAILED, OK, BadInput, print_json
+from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.options import check_writable, load_rules
+from powderdsl.cli.output import print_json
 from powderdsl.compiler import shipped_tests
 
 MAX_SECONDS = 24 * 3600

@@ -9,8 +9,9 @@ from typing import Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BadInput, color_wanted, print_json, user_values
+from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import load_rules
+from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics.printable import write_styled
 
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BadInput, print_json, user_values
+from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import check_writable
-from powderdsl.cli.progress import progress
+from powderdsl.cli.output import print_json, progress, table
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.scores import Tested
@@ -293,7 +293,6 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
 
 
 def _text(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
-    from powderdsl.cli.plain_table import table
 
     predictors = list(plain["mean"])
     yield f"{tested.rules}, {tested.task}/{tested.split}, after {tested.step:,} iterations: loss (accuracy; of cells that change)"

@@ -1,17 +1,79 @@
-"""How long work shows on stderr how far it is: a bar on a terminal, elsewhere a line now and then, or nothing."""
+"""What commands print: diagnostics, JSON, tables, and how far work has come."""
 
 from __future__ import annotations
 
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Protocol
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import click
 
-from powderdsl.diagnostics.printable import printable, printable_streams, unguarded
+from powderdsl.diagnostics.printable import printable, printable_streams, unguarded, write_styled
+
+if TYPE_CHECKING:
+    from powderdsl.diagnostics import Diagnostic
+
+
+def color_wanted(stream: IO[Any]) -> bool:
+    """Color only on a terminal that has it, and without NO_COLOR (https://no-color.org)."""
+    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> None:
+    """Full texts with carets, an empty line between two."""
+    from powderdsl.diagnostics.render import render_text
+
+    color = color_wanted(stream)
+    write_styled(stream, "\n\n".join(render_text(one, color=color) for one in diagnostics) + "\n")
+
+
+def print_json(value: Any) -> None:
+    """Print a value as indented JSON."""
+    import json
+
+    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def counted(number: int, thing: str) -> str:
+    """`no errors`, `1 error`, `2 errors`."""
+    return f"{number or 'no'} {thing}{'' if number == 1 else 's'}"
+
+
+# Tables
+
+
+class Painted(str):
+    """A cell with colors of ours; what other cells have of a terminal's codes is escaped."""
+
+
+def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines with aligned columns, the first row as heading; numbers stand to the right."""
+    if len(rows) < 2:
+        yield "  none"
+        return
+    rows = [[cell if isinstance(cell, Painted) else printable(cell) for cell in row] for row in rows]
+    widths = [max(_width(row[i]) for row in rows) for i in range(len(rows[0]))]
+    right = [all(_bare(row[i]).isdigit() for row in rows[1:]) for i in range(len(rows[0]))]
+    for row in rows:
+        cells = []
+        for cell, width, to_right in zip(row, widths, right, strict=True):
+            gap = " " * (width - _width(cell))
+            cells.append(gap + cell if to_right else cell + gap)
+        yield ("  " + "  ".join(cells)).rstrip()
+
+
+def _bare(cell: str) -> str:
+    return click.unstyle(cell)
+
+
+def _width(cell: str) -> int:
+    return len(_bare(cell))
+
+
+# Progress
 
 SECONDS = 30
 """Between two lines, where there is no terminal."""
