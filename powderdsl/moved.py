@@ -1,4 +1,4 @@
-"""Modules that stand elsewhere now: their old names still import, with a DeprecationWarning."""
+"""Modules that have moved: their old names still import, with a DeprecationWarning."""
 
 from __future__ import annotations
 

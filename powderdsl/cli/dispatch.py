@@ -104,7 +104,7 @@ def main() -> None:
     """Physics as data, compiled to tensor kernels.
 
     RULES names rules everywhere: a shipped ruleset or pack, a rule file, or several of them joined by `+`;
-    what stands behind a `-` is left out.
+    packs after a `-` are left out.
 
     \b
         powderdsl run RULES --watch

@@ -1,4 +1,4 @@
-"""How commands end: exit codes, and what people read when something went wrong."""
+"""How commands end: exit codes, and messages about failures."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from powderdsl.system.interrupts import Terminated
 
 OK = 0
 FAILED = 1
-"""A command did its work and the answer is no: a test failed, a warning counts as an error."""
+"""The command ran, and its answer is no: a test failed, or a warning counts as an error."""
 BAD_INPUT = 2
 INTERNAL = 70
-"""Our own mistake (EX_SOFTWARE of sysexits.h)."""
+"""A mistake in powderdsl itself (EX_SOFTWARE of sysexits.h)."""
 INTERRUPTED = 130
 """Ctrl-C. Other signals that end a command give 128 and their number, as shells have it: 143 for SIGTERM."""
 
 
 class BadInput(click.ClickException):
-    """Something that a user gave cannot be used; one line says what."""
+    """The user's input cannot be used; the message is one line."""
 
     exit_code = BAD_INPUT
 
@@ -40,7 +40,7 @@ def version() -> str:
 
 @contextmanager
 def user_values() -> Iterator[None]:
-    """What the Python API says about bad values, as one line: for calls that hand on what a user gave."""
+    """Turn errors that the Python API raises for bad values into one line, where the values come from the user."""
     try:
         yield
     except (ValueError, TypeError, KeyError) as error:
@@ -50,7 +50,7 @@ def user_values() -> Iterator[None]:
 
 
 def report_failure(error: BaseException) -> int:
-    """Say on stderr what ended a command; the exit code."""
+    """Report on stderr why a command ended, and return the exit code."""
     from powderdsl.diagnostics import CompileError
 
     match error:
@@ -74,7 +74,7 @@ def report_failure(error: BaseException) -> int:
             file = f"{error.filename}: " if error.filename else ""
             click.echo(f"error: {file}{error.strerror or error}", err=True)
             return BAD_INPUT
-    # torch says it with a RuntimeError of its own on every device.
+    # torch raises a RuntimeError of its own on every device.
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error)):
         click.echo("error: not enough memory: fewer or smaller worlds may fit", err=True)
         return BAD_INPUT

@@ -1,4 +1,4 @@
-"""`powderdsl test --mutate`: realistic mistakes in packs, which of them nothing notices, and tests that would."""
+"""`powderdsl test --mutate`: put realistic mistakes into packs, list those that nothing notices, and write tests for them."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _tell(
 
 
 def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
-    """How many there were, and what noticed them."""
+    """The number of mutants, and what noticed them."""
     from powderdsl.testing.mutation.tally import noticed_share, tally
 
     counts = tally(outcome for _, outcome in found)

@@ -23,13 +23,13 @@ Option = Callable[[Any], Any]
 """A decorator that gives a command an option."""
 
 MAX_SIDE = 1 << 24
-"""Rows or columns of a world; how many cells it may have is the worlds' business."""
+"""Rows or columns of a world; `worlds` limits the number of cells."""
 
 
 def layouts(about: str, *more: tuple[str, str]) -> Option:
-    """`--json` as every command has it, passed on as `layout`: ``text``, ``json``, or one of `more` (flag, help).
+    """`--json` for every command, passed on as `layout`: ``text``, ``json``, or one of `more` (flag, help).
 
-    `--format LAYOUT` means the same; it was the spelling of some commands, and is hidden now.
+    `--format LAYOUT` means the same; it is the hidden older spelling.
     """
     flags = (("json", about), *more)
 
@@ -102,7 +102,7 @@ class SizeType(click.ParamType):
 
 
 def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
-    """`pack.param=VALUE` options as a mapping; the checked model knows which names and values are right."""
+    """`pack.param=VALUE` options as a mapping; names and values are checked later, with the model."""
     found = {}
     for value in values:
         name, equals, text = value.partition("=")
@@ -161,7 +161,7 @@ def several(*options: Option) -> Option:
 
 
 def settings_of(config: type) -> Option:
-    """An option for each field of a dataclass that says what it is for (`system.settings`); None where none is given."""
+    """An option for each field of a dataclass that has a help text (`system.settings`). Its default is None."""
 
     def decorate(function: Any) -> Any:
         for one in reversed(fields(config)):
@@ -193,7 +193,7 @@ device = click.option("--device", default="cpu", help="A torch device: cpu, cuda
 
 
 class ManyWords(click.Command):
-    """Its options for packs take all words up to the next option: ``--packs ONE ANOTHER``."""
+    """A command whose options for packs take all words up to the next option: ``--packs ONE ANOTHER``."""
 
     MANY = ("--packs", "--held-out", "--only")
 
@@ -211,7 +211,7 @@ class ManyWords(click.Command):
 
 
 def _place_of(word: str) -> str:
-    """A pack as runs keep it: files by their whole path."""
+    """A pack as runs record it: files by their absolute path."""
     return str(Path(word).absolute()) if word.endswith((".yaml", ".yml")) else word
 
 
@@ -226,7 +226,7 @@ packs = click.option(
 
 
 class BackendType(click.Choice):
-    """A backend. An old name gives the new one, with a note on stderr."""
+    """A backend. An old name is replaced, with a note on stderr."""
 
     def __init__(self) -> None:
         super().__init__(list(BACKENDS))
@@ -236,7 +236,7 @@ class BackendType(click.Choice):
 
 
 def renamed_backend(name: str) -> str:
-    """The name of a backend as it is now; an old one is noted on stderr."""
+    """The current name of a backend; an old name gets a note on stderr."""
     new = RENAMED_BACKENDS.get(name, name)
     if new != name:
         click.echo(f"note: the backend `{name}` is called `{new}` now", err=True)
@@ -248,7 +248,7 @@ def backend(default: str, about: str = "Backend that runs the rules.") -> Option
 
 
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
-    """The checked model of RULES with `--set` values; how many warnings there are goes to stderr."""
+    """The checked model of RULES with `--set` values. The number of warnings is printed on stderr."""
     ruleset, remarks = load_with_diagnostics(rules, params=settings)
     warnings = sum(one.severity is Severity.WARNING for one in remarks)
     if warnings:

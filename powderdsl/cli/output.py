@@ -1,4 +1,4 @@
-"""What commands print: diagnostics, JSON, tables, and how far work has come."""
+"""What commands print: diagnostics, JSON, tables, and progress."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def color_wanted(stream: IO[Any]) -> bool:
-    """Color only on a terminal that has it, and without NO_COLOR (https://no-color.org)."""
+    """Whether to use color: on a terminal that supports it, and without NO_COLOR (https://no-color.org)."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> None:
-    """Full texts with carets, an empty line between two."""
+    """Write diagnostics as full texts with carets, separated by empty lines."""
     from powderdsl.diagnostics.render import render_text
 
     color = color_wanted(stream)
@@ -46,11 +46,11 @@ def counted(number: int, thing: str) -> str:
 
 
 class Painted(str):
-    """A cell with colors of ours; what other cells have of a terminal's codes is escaped."""
+    """A cell with our own colors; in other cells, terminal codes are escaped."""
 
 
 def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines with aligned columns, the first row as heading; numbers stand to the right."""
+    """Lines with aligned columns, the first row as heading; numbers are aligned to the right."""
     if len(rows) < 2:
         yield "  none"
         return
@@ -76,21 +76,21 @@ def _width(cell: str) -> int:
 # Progress
 
 SECONDS = 30
-"""Between two lines, where there is no terminal."""
+"""Time between two lines where there is no terminal."""
 
 
 class Show(Protocol):
-    """Says how much is done, with words that stand beside it."""
+    """Shows how much is done, with words beside it."""
 
     def __call__(self, done: float, words: str = "") -> None: ...
 
 
 @contextmanager
 def progress(title: str, total: float | None = None, *, lines: bool = False) -> Iterator[Show]:
-    """A bar that goes at the end; what is printed meanwhile stands above it.
+    """A bar that disappears at the end; other output appears above it.
 
     Args:
-        total: what `done` will be at the end. Without it the bar only says that something happens, and for how long.
+        total: the final value of `done`. Without it the bar only shows that work continues, and for how long.
         lines: where stderr is not a terminal, write a line every `SECONDS`; otherwise nothing.
     """
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":

@@ -1,4 +1,4 @@
-"""Batches of worlds as one picture, and what of them is shown as motion."""
+"""Batches of worlds as one picture, and the fields that pictures show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `powderdsl test` prints: the tests and the invariants of packs, and which rules never happened meanwhile."""
+"""What `powderdsl test` prints: the results of tests and invariants, and the rules that never happened."""
 
 from __future__ import annotations
 

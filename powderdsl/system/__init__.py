@@ -1,1 +1,1 @@
-"""What is asked of the operating system: files, archives, processes, signals."""
+"""Access to the operating system: files, archives, processes, signals."""

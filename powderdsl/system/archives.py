@@ -1,4 +1,4 @@
-"""Arrays of .npz files from strangers: what an archive claims to hold is known before any of it is unpacked."""
+"""Arrays of .npz files from strangers: the contents that an archive claims are checked before any of it is unpacked."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from powderdsl.system.reading import open_regular
 
 MAX_ENTRIES = 256
-"""Arrays of an archive."""
+"""Maximum number of arrays in an archive."""
 MAX_DIRECTORY = 1 << 20
-"""Bytes of its list of contents."""
+"""Maximum bytes of its list of contents."""
 MAX_HEADER = 10_000
-"""Bytes of an array's header."""
+"""Maximum bytes of an array's header."""
 _END, _END64 = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q")
 _LOCATOR = 20
 
@@ -60,7 +60,7 @@ class Archive:
         return sum(header.size for header in self.headers.values())
 
     def read(self, name: str) -> NDArray[Any]:
-        """An array, read-only, which takes as many bytes as its header says. Raises BadArchive."""
+        """Read an array of the size that its header claims; it is read-only. Raises BadArchive."""
         header = self.headers[name]
         with _as_bad_archive(), self._zip.open(header.entry) as member:
             data = member.read()

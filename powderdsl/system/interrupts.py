@@ -41,7 +41,7 @@ class Terminated(KeyboardInterrupt):
 
 @dataclass
 class _State:
-    """What has come so far. `held`: how many blocks of `held_back` are open; `pending`: what has come in them."""
+    """The signals so far. `held`: the number of open `held_back` blocks; `pending`: the signal that came in them."""
 
     last: int = 0
     when: float = -1e9
@@ -86,7 +86,7 @@ def interruptible(*, until_exit: bool = False) -> Iterator[Callable[[], None]]:
 def held_back() -> Iterator[Callable[[], bool]]:
     """Hold signals back until the end of the block, which raises then; a second signal is not held back.
 
-    Yields a function that says whether one has come. In other threads than the main one nothing is held back: signals
+    Yields a function that says whether one has come. In threads other than the main one nothing is held back: signals
     do not reach them.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -118,7 +118,7 @@ def end_with_stdin() -> None:
 
 
 def _installed(signals: tuple[int, ...]) -> dict[int, Any]:
-    """Install our handler for signals that do what they do by default; what they had before."""
+    """Install our handler for signals with default handlers; returns the previous handlers."""
     usual = (signal.SIG_DFL, signal.default_int_handler)
     before = {number: signal.getsignal(number) for number in signals if signal.getsignal(number) in usual}
     for number in before:
@@ -169,7 +169,7 @@ def _exception(number: int) -> KeyboardInterrupt:
 
 
 def _redeliver(usual: Callable[[Any], Any]) -> Callable[[Any], None]:
-    """A hook for exceptions that cannot be raised, in `__del__` for one: a signal that came there comes again."""
+    """A hook for exceptions that cannot be raised, such as in `__del__`: a signal that came there is sent again."""
 
     def hook(found: Any) -> None:
         if not isinstance(found.exc_value, KeyboardInterrupt):

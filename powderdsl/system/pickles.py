@@ -1,4 +1,4 @@
-"""What a checkpoint holds, checked before torch reads it: a small machine follows its pickle and builds nothing.
+"""Check the contents of a checkpoint before torch reads it: a small machine follows its pickle and builds nothing.
 
 torch's reader executes nothing either, but believes sizes: a storage of ten numbers may call itself a storage of a
 thousand million, a tensor may repeat one number without end, and containers may be nested until the stack overflows.
@@ -18,7 +18,7 @@ from typing import Any
 from powderdsl.system.archives import BadArchive, check_directory
 
 MAX_PICKLE = 1 << 20
-"""Bytes of what is not numbers in tensors."""
+"""Maximum bytes of everything but the numbers of tensors."""
 MAX_RECORDS = 1 << 14
 MAX_DEPTH = 32
 
@@ -29,7 +29,7 @@ _ORDERED, _TENSOR = "collections OrderedDict", "torch._utils _rebuild_tensor_v2"
 
 
 class NotSaved(Exception):
-    """What is in a file that no training saves."""
+    """A file has contents that no training saves."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Files that may come from strangers: reading them within bounds, and keeping the paths that they name in their folders.
+"""Files that may come from strangers: reading them within bounds, and confining the paths that they name to their folders.
 
 Every loader reads through `open_regular` or `read_bytes`. Every path that a file names goes through `inside`, every
 folder that is one thing (a run, a dataset, the results of a study) through `check_links`.
@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 MAX_LINKS_SEARCHED = 1 << 20
-"""Entries of a folder among which links are looked for."""
+"""Maximum number of entries of a folder that are searched for links."""
 
 _KINDS = (
     (stat.S_ISDIR, errno.EISDIR, "it is a folder, not a file"),
@@ -27,7 +27,7 @@ _KINDS = (
 
 
 def open_regular(path: str | Path) -> BufferedReader:
-    """Open a regular file for reading, also through links. Never waits.
+    """Open a regular file for reading, also through links, without blocking.
 
     Raises:
         OSError: it cannot be opened, or is a folder, a pipe, a socket or a device; `strerror` says which.

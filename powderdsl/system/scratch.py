@@ -28,7 +28,7 @@ MARK = ".powderdsl-"
 NAME = re.compile(r".*\.powderdsl-[0-9a-f]{16}(\..*)?", re.DOTALL)
 
 OLD = 24 * 3600.0
-"""Seconds after which leftovers are removed where the system or the file system has no locks."""
+"""Age in seconds after which leftovers are removed where there are no file locks."""
 
 _mine: dict[Path, int] = {}
 """What is to be removed when this process ends, with the descriptor that holds its lock, or -1."""
@@ -80,7 +80,7 @@ def is_scratch(name: str) -> bool:
 
 
 def _made(parent: Path, start: str, suffix: str, make: Callable[[Path], int]) -> Path:
-    """A new file or folder, locked. A signal may come between any two lines: its name is noted down before it is made."""
+    """Make and lock a new file or folder. Its name is recorded first: a signal may come between any two lines."""
     while True:
         path = parent / f"{start}{MARK}{token_hex(8)}{suffix}"
         _mine[path] = -1
@@ -104,7 +104,7 @@ def _new_folder(path: Path) -> int:
 
 
 def _hold(path: Path, handle: int) -> bool:
-    """Lock what has just been made; False if whoever sweeps has removed it in between."""
+    """Lock a new file or folder; False if another process has swept it in between."""
     if fcntl is None:
         return True
     try:
@@ -170,7 +170,7 @@ def _remove(path: Path) -> None:
 
 @atexit.register
 def _remove_all() -> None:
-    """What threads that are no longer run had made, or a signal kept from being removed."""
+    """Remove what daemon threads had made, and what a signal kept from being removed."""
     for path in list(_mine):
         with suppress(OSError):
             _remove(path)

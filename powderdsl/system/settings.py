@@ -25,7 +25,7 @@ def setting(
 
 
 def out_of_bounds(config: Any) -> Iterator[str]:
-    """What is wrong with the numbers of a dataclass of settings, a sentence each."""
+    """Yield a sentence for each number of a dataclass of settings that is out of bounds."""
     for one in fields(config):
         value, bounds = getattr(config, one.name), one.metadata.get("bounds")
         if bounds is None:
@@ -41,6 +41,6 @@ def out_of_bounds(config: Any) -> Iterator[str]:
 
 
 def check_bounds(config: Any) -> None:
-    """Raises ValueError with all that `out_of_bounds` finds."""
+    """Raise ValueError with everything that `out_of_bounds` finds."""
     if wrong := "; ".join(out_of_bounds(config)):
         raise ValueError(wrong)

@@ -1,4 +1,4 @@
-"""The user's private cache folder. What lies there is loaded and executed, so nobody else may write to it."""
+"""The user's private cache folder. Its contents are loaded and executed, so nobody else may write to it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def cache_folder(name: str) -> Path:
 
 
 def check_private(folder: Path) -> None:
-    """Refuse a folder in which somebody else can have put something. Raises PermissionError."""
+    """Refuse a folder to which another user may write. Raises PermissionError."""
     if not hasattr(os, "getuid"):
         return
     # A link is looked at too: whoever owns it decides where it leads.

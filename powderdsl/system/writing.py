@@ -15,13 +15,13 @@ from powderdsl.system.scratch import scratch_file
 def failure(
     code: str, message: str, *, notes: tuple[str, ...] = (), helps: tuple[str, ...] = ()
 ) -> CompileError:
-    """A single error without a place in a text: about a file, a picture, a size."""
+    """A single error without a location in a text: about a file, a picture, a size."""
     return CompileError([Diagnostic(code, message, Label(None), notes=notes, helps=helps)])
 
 
 @contextmanager
 def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
-    """A temporary path beside `path`, with its suffix, that takes its place when the block ends well.
+    """A temporary path beside `path`, with its suffix, that replaces it when the block succeeds.
 
     When the block fails or is interrupted, nothing is left and an older file stays as it was. When the process is
     killed, the next one that writes to the folder removes what is left. Raises CompileError (PD613) if the file cannot
@@ -68,7 +68,7 @@ def destination(path: Path, *, follow: bool) -> Path:
 
 
 def not_writable(path: Path, error: Exception) -> CompileError:
-    """PD613, with what the system said."""
+    """PD613, with the reason that the system gave."""
     reason = getattr(error, "strerror", None) or str(error)
     return failure("PD613", f"cannot write {path}", notes=(reason,))
 

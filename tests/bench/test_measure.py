@@ -10,11 +10,10 @@ import pytest
 
 import powderdsl
 from powderdsl.experiments.bench import make_plan, measure, report_data, report_text
-from powderdsl.experiments.bench.figures import CellFigures, make_report
 from powderdsl.experiments.bench.machine import Machine, Memory, peak_growth
 from powderdsl.experiments.bench.measure import interleaved, measuring
-from powderdsl.experiments.bench.tables import aligned, number
-from powderdsl.experiments.bench.workloads import start_worlds
+from powderdsl.experiments.bench.plan import start_worlds
+from powderdsl.experiments.bench.report import CellFigures, aligned, make_report, number
 from powderdsl.model.state import slots
 from powderdsl.targets.cpp.build import Building, building
 

@@ -9,9 +9,9 @@ from PIL import Image
 
 import powderdsl
 from powderdsl.experiments.bench import make_plan
-from powderdsl.experiments.bench.figures import CellFigures, make_report
 from powderdsl.experiments.bench.machine import Machine, Memory
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
+from powderdsl.experiments.bench.report import CellFigures, make_report
 
 MACHINE = Machine("Linux", "some processor", 4, "cpu", "3", "2", "none", "0", load=0.1)
 

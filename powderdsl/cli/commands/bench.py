@@ -12,12 +12,11 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.output import print_json, progress
-from powderdsl.experiments.bench.figures import CellFigures, Report, make_report, report_data
 from powderdsl.experiments.bench.machine import load_average, this_machine
 from powderdsl.experiments.bench.measure import measuring
 from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
-from powderdsl.experiments.bench.tables import report_text
+from powderdsl.experiments.bench.report import CellFigures, Report, make_report, report_data, report_text
 from powderdsl.model.world_sides import fitting
 from powderdsl.system.writing import write_text
 from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
@@ -104,7 +103,7 @@ def command(
 
 
 def _usual_backends(device: str) -> tuple[str, ...]:
-    """What runs here without asking: what starts at once, and the fastest code for the device, if it can be compiled."""
+    """The default backends: the one that starts at once, and the fastest one for the device if it can be compiled."""
     if device != "cpu":
         return ("torch", "cuda") if device.startswith("cuda") else ("torch",)
     try:
@@ -116,7 +115,7 @@ def _usual_backends(device: str) -> tuple[str, ...]:
 
 
 def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
-    """The report of a plan, or of as much of it as was done when Ctrl-C or another signal came."""
+    """The report of a plan, or of the part that was done when Ctrl-C or another signal came."""
     machine = this_machine(plan.device)
     cells: list[CellFigures] = []
     interrupt: KeyboardInterrupt | None = None

@@ -1,4 +1,4 @@
-"""`powderdsl cache`: what has been compiled on this machine, and how to be rid of it."""
+"""`powderdsl cache`: list and remove compiled code."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class AgeType(click.ParamType):
 
 @click.group("cache")
 def command() -> None:
-    """Compiled code that is kept on this machine: list it, clear it, say where it lies.
+    """List or remove the compiled code that this machine keeps, or print its folder.
 
-    Native code is compiled once for a ruleset, a compiler and a processor, and is private to the user. Of more than
-    512 MB, what was used longest ago is removed.
+    Native code is compiled once for a ruleset, a compiler and a processor, and is private to the user. Beyond
+    512 MB, the code that was used least recently is removed.
     """
 
 
 @command.command("list")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON list with all details.")
 def list_entries(as_json: bool) -> None:
-    """What has been compiled, the last used first."""
+    """List compiled code, the most recently used first."""
     from powderdsl.targets.cache import entries
 
     found = entries(_folder())
@@ -67,7 +67,7 @@ def list_entries(as_json: bool) -> None:
     help="Remove only what has not been used for this time, such as 30d.",
 )
 def clear_entries(older_than: float) -> None:
-    """Remove compiled code. What still runs continues; it will be compiled again when it is next needed."""
+    """Remove compiled code. Running programs continue; code is compiled again when it is next needed."""
     from powderdsl.targets.cache import clear
 
     gone = clear(_folder(), older_than)
@@ -77,7 +77,7 @@ def clear_entries(older_than: float) -> None:
 
 @command.command("path")
 def print_path() -> None:
-    """The folder, on stdout."""
+    """Print the folder on stdout."""
     click.echo(_folder())
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 ALWAYS_TOLD = ("PD515", "PD518")
-"""Notes below the summary without `--notes` too, in a line each: what added packs change, what was not decided."""
+"""Notes that are always printed, a line each below the summary: effects of added packs, undecided invariants."""
 
 
 @dataclass(frozen=True)

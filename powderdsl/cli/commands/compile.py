@@ -1,4 +1,4 @@
-"""`powderdsl compile`: what each stage of the compiler makes of rules, as text."""
+"""`powderdsl compile`: print the output of a compiler stage."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def command(
     out: Path | None,
     settings: dict[str, str],
 ) -> None:
-    """Print what a stage of the compiler makes of rules."""
+    """Print the output of a compiler stage."""
     if after is not None and stage != "schedule":
         raise BadInput("--after goes with --emit schedule")
     if out is not None:
@@ -68,7 +68,7 @@ def command(
 def _checked(
     rules: str, stage: str, backend: str, after: str | None, pass_name: str | None, settings: dict[str, str]
 ) -> str:
-    """The stages from the checked model on."""
+    """The output of a stage after parsing."""
     ruleset = load_rules(rules, settings)
     if pass_name is not None:
         _check_known("pass", pass_name, [p.name for p in ruleset.passes], "passes")

@@ -1,4 +1,4 @@
-"""`powderdsl evaluate`: an agent beside acting at random and doing nothing, on each split of its task."""
+"""`powderdsl evaluate`: compare an agent with a random policy and with doing nothing, on each split of its task."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ def command(
 ) -> None:
     """Mean return and 95 % interval of the agent of a RUN, on each split, in the same worlds as the other policies.
 
-    The result is also written to evaluation.json in the run's folder. Of a TASK, the policies that need no training.
+    The result is also written to evaluation.json in the run's folder. For a TASK,
+    policies that need no training are compared.
     """
     played = find_played(run, knobs, settings, packs)
     if out is not None:

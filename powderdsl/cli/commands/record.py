@@ -1,4 +1,4 @@
-"""`powderdsl record`: episodes of a task, written to disk for offline learning and world models."""
+"""`powderdsl record`: record episodes of a task for offline learning and world models."""
 
 from __future__ import annotations
 
@@ -51,8 +51,7 @@ def command(
 ) -> int:
     """Record whole episodes of TASK: observations, actions, rewards, ends.
 
-    What is recorded follows from the options alone, and not from --envs. When it was interrupted, the same command
-    continues.
+    The data depend only on the options, and not on --envs. After an interruption, the same command continues.
 
     \b
         powderdsl record TASK --out data --episodes 1000

@@ -1,4 +1,4 @@
-"""`powderdsl render`: a world as a picture, as it stands."""
+"""`powderdsl render`: draw a world as a picture."""
 
 from __future__ import annotations
 

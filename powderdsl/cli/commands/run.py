@@ -1,4 +1,4 @@
-"""`powderdsl run`: a world, some steps, and what is to be seen of them."""
+"""`powderdsl run`: run a world for some steps, and show or write the result."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 ANIMATIONS = (".gif", ".mp4")
 SUFFIXES = (".png", *ANIMATIONS, ".npz")
 MOST_PICTURES = 64
-"""How many worlds of a batch a picture shows."""
+"""The maximum number of worlds in a picture."""
 
 SMALL_BATCH = 1 << 20
-"""Cells of a batch up to which one thread is as fast as several: handing out work has a price."""
+"""Cells of a batch up to which one thread is as fast as several: distributing work costs time."""
 
 
 @dataclass(frozen=True)
 class Playback:
-    """How a run goes: what is shown and written, and how often."""
+    """What a run shows and writes, and how often."""
 
     steps: int
     every: int
@@ -86,7 +86,7 @@ def command(
     verbose: bool,
     **playback: Any,
 ) -> None:
-    """Run rules on a world: watch it, or write what became of it.
+    """Run rules on a world: watch it, or write the result.
 
     Without --out and --watch the last step is drawn in the terminal. Without --world, shapes of all elements
     are scattered at random: the same ones for the same --seed and --size.

@@ -57,7 +57,7 @@ def command(
 
 
 def rule_spans(pass_: Pass) -> tuple[Span, ...]:
-    """Where the rules of a pass stand, each line once: loops and symmetries make many rules of one."""
+    """The spans of the rules of a pass, each line once: loops and symmetries make many rules of one."""
     return tuple(dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules))
 
 

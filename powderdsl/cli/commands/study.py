@@ -41,11 +41,11 @@ MEANS = {
     "FILE": FILE,
     "FILE.json": FILE,
 }
-"""What arguments and options are, by the word that stands for their values."""
+"""The meaning of arguments and options, by their metavar."""
 
 
 def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
-    """These commands, with what their options and their argument (``on``) are.
+    """These commands, with the meaning of their options and of their argument (``on``).
 
     Options that name folders are left out, but for `run`, which the study gives: a step writes where the study says.
     """
@@ -66,7 +66,7 @@ def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
 
 
 def called(words: tuple[str, ...]) -> click.Command:
-    """The command of some words."""
+    """The click command that some words name."""
     found: click.Command = import_module(f"powderdsl.cli.commands.{COMMANDS[words[0]][0]}").command
     for word in words[1:]:
         assert isinstance(found, click.Group)

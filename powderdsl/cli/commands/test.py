@@ -1,4 +1,4 @@
-"""`powderdsl test`: the tests and the invariants of packs, and which rules never happened meanwhile."""
+"""`powderdsl test`: run the tests of packs, check their invariants, and list rules that never happened."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def command(
     write: bool,
     jobs: int | None,
 ) -> int:
-    """Run the tests of packs, and hold their invariants against the rules.
+    """Run the tests of packs and check their invariants.
 
     Without RULES, all that come with powderdsl. A test without a seed runs with five. Invariants are proven where that
     is possible, else tried on random worlds; one that breaks is shown by a small world, kept in .powderdsl/, and tried

@@ -60,7 +60,7 @@ def command(
     backend: str,
     settings: dict[str, str],
 ) -> None:
-    """Say why a cell holds what it holds after a step.
+    """Explain why a cell holds what it holds after a step.
 
     Which rules wrote it in that step, what they read, and which rules nearly wrote it. Worlds are those of
     `powderdsl run` with the same --world, --size and --seed.

@@ -58,8 +58,8 @@ def command(
 ) -> None:
     """Play worlds of a RUN's task with its agent, side by side, and write the film.
 
-    Regions are outlined, and so is where the agent acts; below each world stand its return so far and the action. Of a
-    TASK, at random or with nobody acting.
+    Regions are outlined, and so is where the agent acts; below each world stand its return so far and the action. For a
+    TASK, actions are random, or nobody acts.
     """
     played = find_played(run, knobs, settings, packs)
     if isinstance(played, Task):

@@ -146,9 +146,9 @@ def train_command(
 )
 @_training_options
 def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
-    """Continue from a run's weights, on worlds of other packs' elements alone.
+    """Continue from the weights of a run, on worlds that draw only elements of other packs.
 
-    RUN is a run's folder, or its name in runs/. The new run is one of its own.
+    RUN is a run's folder, or its name in runs/. The result is a new run.
     """
     from powderdsl.worldmodel.training import load_trained
     from powderdsl.worldmodel.transfer import finetuned
@@ -260,7 +260,7 @@ def _machine(values: dict[str, Any]) -> Machine:
 
 
 def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
-    """What stands for the rules of a run; nothing, if they are the task's own."""
+    """The rules of a run as text; empty if they are the task's own."""
     if not packs and not held_out:
         return rules or ""
     from powderdsl.tasks.shipped import load_task
@@ -271,7 +271,7 @@ def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_ou
 
 
 def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any) -> None:
-    """Train, and say how it goes."""
+    """Train, and show the progress."""
     from powderdsl.worldmodel.training import train
 
     machine = _machine(values)

@@ -5,10 +5,9 @@
 
 from __future__ import annotations
 
-from powderdsl.experiments.bench.figures import CellFigures, Report, report_data
 from powderdsl.experiments.bench.measure import measure
 from powderdsl.experiments.bench.plan import WORKLOADS, Cell, Plan, make_plan
-from powderdsl.experiments.bench.tables import report_text
+from powderdsl.experiments.bench.report import CellFigures, Report, report_data, report_text
 
 __all__ = [
     "WORKLOADS",

@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from powderdsl.experiments.bench.figures import CellFigures, Report, make_report
 from powderdsl.experiments.bench.machine import load_average, peak_growth, this_machine
-from powderdsl.experiments.bench.plan import Cell, Plan
-from powderdsl.experiments.bench.workloads import start_worlds
+from powderdsl.experiments.bench.plan import Cell, Plan, start_worlds
+from powderdsl.experiments.bench.report import CellFigures, Report, make_report
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
@@ -70,7 +69,7 @@ def interleaved(
     clock: Clock = time.perf_counter,
     processor: Clock = time.process_time,
 ) -> Iterator[tuple[int, int, float, float]]:
-    """Each work once, then each once more, and so on: (round, index of the work, seconds, processor seconds)."""
+    """Do each work once, then each once more, and so on; yields (round, index of the work, seconds, processor seconds)."""
     for number in range(rounds):
         for index, work in enumerate(works):
             began, used = clock(), processor()

@@ -1,18 +1,28 @@
-"""What is measured: the cells of a cross product, as values."""
+"""What is measured: the cells of a cross product, as values, and the worlds that they start from.
+
+Worlds are made from a ruleset's tables alone: no element has a name here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from powderdsl.analysis.reactions import moved_ids
 from powderdsl.compiler import BACKENDS, current_backend
 from powderdsl.diagnostics import suggest
-from powderdsl.model.types import Ruleset
+from powderdsl.model.types import Field, Ruleset
 from powderdsl.model.world_sides import check_sides
-from powderdsl.worlds.raster import Size
-from powderdsl.worlds.strewn import check_cells
+from powderdsl.worlds.raster import Size, mask
+from powderdsl.worlds.strewn import check_cells, random_shape
+
+if TYPE_CHECKING:
+    from powderdsl.simulation.simulator import Simulator, World
 
 WORKLOADS: dict[str, str] = {
     "gusts": "shapes, and rectangles of ±20 in every vector field that stays in its place: busy worlds",
@@ -85,10 +95,10 @@ def make_plan(
     """The plan of a cross product of backends, batches, sizes (rows, columns), elements and threads.
 
     Args:
-        elements: the worlds have the first so many elements of the ruleset, the ground among them.
+        elements: numbers of elements: the worlds have the first N of the ruleset, the ground included.
         only: the worlds have these elements on the ground, by plain or qualified name.
         workload: one of `WORKLOADS`.
-        steps: of a call, at most.
+        steps: maximum steps of a call.
         seconds: measured time of each cell, all rounds together.
         profile: time each pass too.
 
@@ -147,3 +157,69 @@ def _elements(
         movers_first = sorted(others, key=lambda element: (element.id not in moved, element.id))
         return [tuple(element.name for element in movers_first[:2]) or (ground.name,)]
     return [tuple(element.name for element in known)]
+
+
+# Worlds
+
+SHAPES, GUSTS = 26, 4
+"""Numbers of shapes and gusts in 64×64 cells; larger worlds have proportionally more."""
+PER_CELLS = 64 * 64
+REACH = 7
+"""Size of the shapes in cells. They cover about a quarter of the world."""
+GUST_SIDE, GUST_SPEED = 10, 20.0
+NOISE = 3.0
+"""Standard deviation of noisy floats."""
+
+
+def start_worlds(sim: Simulator, cell: Cell, workload: str, seed: int) -> World:
+    """The worlds of a cell: world i depends on `seed`, its size and i alone."""
+    random = [np.random.default_rng([seed, index]) for index in range(cell.batch)]
+    ids = np.stack([_ids(sim.ruleset, cell, workload, one) for one in random])
+    fields = {
+        field.name: np.stack([_field(field, cell, workload, one) for one in random])
+        for field in _fields(sim.ruleset, workload)
+    }
+    return sim.replace(sim.world(ids, seed=seed), **fields)
+
+
+def _ids(ruleset: Ruleset, cell: Cell, workload: str, random: np.random.Generator) -> NDArray[np.uint8]:
+    """One world: uint8 [H, W]."""
+    found = [ruleset.element(name) for name in cell.elements]
+    ids = [element.id for element in found if element is not None]
+    if workload == "noise":
+        return random.choice(np.array(ids, dtype=np.uint8), cell.size)
+    ground = ruleset.elements[0].id
+    world = np.full(cell.size, ground, dtype=np.uint8)
+    others = [number for number in ids if number != ground]
+    for i in range(_many(SHAPES, cell) if others else 0):
+        world[mask(random_shape(random, cell.size, REACH), cell.size)] = others[i % len(others)]
+    return world
+
+
+def _fields(ruleset: Ruleset, workload: str) -> list[Field]:
+    """The fields that do not start at their default."""
+    lasting = [field for field in ruleset.fields if not field.resets and field.of is None]
+    if workload == "noise":
+        return [field for field in lasting if field.kind.name in ("real", "vec2")]
+    if workload == "gusts":
+        return [field for field in lasting if field.kind.name == "vec2" and field.at == "place"]
+    return []
+
+
+def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator) -> NDArray[np.float32]:
+    """A field of one world: float32 [H, W], or [2, H, W] of a vector."""
+    shape = (2, *cell.size) if field.kind.name == "vec2" else cell.size
+    if workload == "noise":
+        values = NOISE * random.standard_normal(shape, dtype=np.float32)
+    else:
+        values = np.zeros(shape, dtype=np.float32)
+        for _ in range(_many(GUSTS, cell)):
+            top, left = (int(random.integers(max(side - GUST_SIDE, 1))) for side in cell.size)
+            speed = GUST_SPEED * random.integers(-1, 2, 2)
+            values[:, top : top + GUST_SIDE, left : left + GUST_SIDE] = speed[:, None, None]
+    bounded = field.kind.hi > field.kind.lo
+    return np.clip(values, field.kind.lo, field.kind.hi) if bounded else values
+
+
+def _many(count: int, cell: Cell) -> int:
+    return max(1, round(count * cell.world_cells / PER_CELLS))

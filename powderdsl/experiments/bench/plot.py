@@ -1,4 +1,4 @@
-"""The scaling figure: world-steps a second against the batch, and time a cell against the size of worlds."""
+"""The scaling figure: world-steps a second against the batch, and time per cell against the size of worlds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.experiments.bench.figures import CellFigures, Report, extra_words
+from powderdsl.experiments.bench.report import CellFigures, Report, extra_words
 from powderdsl.system.writing import failure, replacing
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def require_matplotlib() -> None:
-    """Raises CompileError (PD612) if matplotlib is not installed: before long work, not after it."""
+    """Raise CompileError (PD612) if matplotlib is not installed: before long work, not after it."""
     if find_spec("matplotlib") is None:
         raise failure(
             "PD612",
