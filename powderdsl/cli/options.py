@@ -49,56 +49,54 @@ def layouts(about: str, *more: tuple[str, str]) -> Option:
     return decorate
 
 
-class Integer(click.ParamType):
-    """An integer from `low` to `high`."""
+class Parsed(click.ParamType):
+    """A value that a function makes of a text. The function raises ValueError with what is wrong with the text."""
 
-    name = "N"
+    def __init__(self, name: str, make: Callable[[str], Any]):
+        self.name, self.make = name, make
 
-    def __init__(self, low: int, high: int):
-        self.low, self.high = low, high
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        if isinstance(value, int):
-            return value
-        if not re.fullmatch(r"[0-9]{1,20}", str(value)) or not self.low <= int(value) <= self.high:
-            self.fail(f"`{value}` is not an integer from {self.low} to {self.high}", param, ctx)
-        return int(value)
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return self.make(value) if isinstance(value, str) else value
+        except ValueError as error:
+            self.fail(f"`{value}` {error}", param, ctx)
 
 
-class CountType(click.ParamType):
-    """An integer, also written as ``1e6`` or ``200_000``. The settings check whether it is in range."""
+def _integer(low: int, high: int) -> Parsed:
+    def make(text: str) -> int:
+        if not re.fullmatch(r"[0-9]{1,20}", text) or not low <= int(text) <= high:
+            raise ValueError(f"is not an integer from {low} to {high}")
+        return int(text)
 
-    name = "N"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        if isinstance(value, int):
-            return value
-        text = str(value).replace("_", "")
-        if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
-            self.fail(f"`{value}` is not an integer: write 200000 or 2e5", param, ctx)
-        number = float(text) if "e" in text.lower() else int(text)
-        if number != int(number):
-            self.fail(f"`{value}` is not an integer", param, ctx)
-        return int(number)
+    return Parsed("N", make)
 
 
-class SizeType(click.ParamType):
-    """`48x64`: rows and columns; `64`: as many of both."""
+def _count(text: str) -> int:
+    text = text.replace("_", "")
+    if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
+        raise ValueError("is not an integer: write 200000 or 2e5")
+    number = float(text) if "e" in text.lower() else int(text)
+    if number != int(number):
+        raise ValueError("is not an integer")
+    return int(number)
 
-    name = "HxW"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        if isinstance(value, tuple):
-            return value
-        match = re.fullmatch(r"([0-9]{1,8})(?:[xX×]([0-9]{1,8}))?", str(value))
-        if match is None:
-            self.fail(f"`{value}` is not a size: write ROWSxCOLUMNS, such as 48x64", param, ctx)
-        rows, columns = int(match[1]), int(match[2] or match[1])
-        if not (1 <= rows <= MAX_SIDE and 1 <= columns <= MAX_SIDE):
-            self.fail(f"`{value}`: a world has at least one row and one column", param, ctx)
-        return rows, columns
+COUNT = Parsed("N", _count)
+"""An integer, also written as ``1e6`` or ``200_000``. The settings check whether it is in range."""
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,8})(?:[xX×]([0-9]{1,8}))?", text)
+    if match is None:
+        raise ValueError("is not a size: write ROWSxCOLUMNS, such as 48x64")
+    size = int(match[1]), int(match[2] or match[1])
+    if not 1 <= min(size) <= max(size) <= MAX_SIDE:
+        raise ValueError("is not a size: a world has at least one row and one column")
+    return size
+
+
+SIZE = Parsed("HxW", _size)
+"""`48x64`: rows and columns; `64`: as many of both."""
 
 
 def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -114,7 +112,7 @@ def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...
 
 def integer(name: str, low: int, high: int, about: str, default: Any = None, **more: Any) -> Option:
     """An integer from `low` to `high`."""
-    return _option(name, about, type=Integer(low, high), default=default, **more)
+    return _option(name, about, type=_integer(low, high), default=default, **more)
 
 
 def text(name: str, metavar: str, about: str, default: str | None = None, **more: Any) -> Option:
@@ -166,7 +164,7 @@ def settings_of(config: type) -> Option:
     def decorate(function: Any) -> Any:
         for one in reversed(fields(config)):
             if about := one.metadata.get("about"):
-                usual = CountType() if isinstance(one.default, int) else type(one.default)
+                usual = COUNT if isinstance(one.default, int) else type(one.default)
                 kind = click.Choice(one.metadata["choices"]) if one.metadata["choices"] else usual
                 function = _option(f"--{one.name.replace('_', '-')}", about, to=one.name, type=kind)(function)
         return function
@@ -188,7 +186,7 @@ parameters = click.option(
 world = click.option(
     "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
 )
-size = click.option("--size", type=SizeType(), help="Rows and columns, such as 48x64.")
+size = click.option("--size", type=SIZE, help="Rows and columns, such as 48x64.")
 device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 
 

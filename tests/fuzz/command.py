@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.dispatch import GuardedCommand
 from powderdsl.cli.exits import FAILED, OK, BadInput
-from powderdsl.cli.options import Integer, renamed_backend
+from powderdsl.cli.options import renamed_backend
 from powderdsl.cli.output import counted, progress
 from powderdsl.system.interrupts import Terminated
 
@@ -64,14 +65,14 @@ class BackendsType(click.ParamType):
 
 @click.command("fuzz", cls=GuardedCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--seeds", type=SeedsType(), help="Which rulesets, or damaged files.  [default: 0..200]")
-@click.option("--seconds", type=Integer(1, 10_000_000), help="Run so long, with as many seeds as it takes.")
+@opt.integer("--seconds", 1, 10_000_000, "Run for this time, with as many seeds as it takes.")
 @click.option(
     "--backends",
     type=BackendsType(),
     help=f"What is compared: {', '.join(NAMES)}.  [default: all; those that need a C++ compiler if there is one]",
 )
-@click.option("--worlds", type=Integer(1, 100), default=4, show_default=True, help="Worlds of a ruleset.")
-@click.option("--steps", type=Integer(1, 10_000), default=3, show_default=True, help="Steps of a world.")
+@opt.integer("--worlds", 1, 100, "Worlds of a ruleset.", 4, show_default=True)
+@opt.integer("--steps", 1, 10_000, "Steps of a world.", 3, show_default=True)
 @click.option(
     "--level",
     type=click.Choice(LEVELS),
@@ -89,7 +90,7 @@ class BackendsType(click.ParamType):
 )
 @click.option("--resume", is_flag=True, help="Continue where the run in that folder ended.")
 @click.option("--front-end", is_flag=True, help="Damage rule files instead, and load them.")
-@click.option("--jobs", type=Integer(1, 256), help="Processes.  [default: one a processor]")
+@opt.integer("--jobs", 1, 256, "Processes.  [default: one per processor]")
 @click.option(
     "--replay",
     type=click.Path(path_type=Path, dir_okay=False),

@@ -42,7 +42,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     help="Backend that runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
 )
 @opt.integer("--batch", 1, 1 << 20, "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
-@click.option("--size", "sizes", type=opt.SizeType(), multiple=True, help="Rows and columns.  [default: 64]")
+@click.option("--size", "sizes", type=opt.SIZE, multiple=True, help="Rows and columns.  [default: 64]")
 @opt.integer("--elements", 1, 256, "Use only the first N elements in the worlds.", multiple=True)
 @click.option("--only", metavar="NAME,NAME", callback=_names, help="Use only these elements in the worlds.")
 @opt.integer("--threads", 1, 1024, "CPU threads.", (1,), multiple=True)

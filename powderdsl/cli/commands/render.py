@@ -15,7 +15,7 @@ from powderdsl.cli.options import check_writable, load_rules
 @click.argument("world", metavar="WORLD")
 @opt.text("--rules", "RULES", "Rules whose elements the world has.", required=True)
 @opt.path("--out", "FILE", "The .png file to write.", required=True)
-@click.option("--size", type=opt.SizeType(), help="Rows and columns of a scene, such as 48x64.")
+@click.option("--size", type=opt.SIZE, help="Rows and columns of a scene, such as 48x64.")
 @opt.integer("--scale", 1, 64, "Pixels per cell.  [default: about 400 a side]")
 def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
     """Draw a world as a picture, without running it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-from typing import Any
 
 import click
 
@@ -15,20 +14,15 @@ from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics.printable import write_styled
 
 
-class CellType(click.ParamType):
+def _cell(text: str) -> tuple[int, int]:
     """`3,4`: row 3, column 4, both from 0."""
+    match = re.fullmatch(r"([0-9]{1,9}),([0-9]{1,9})", text)
+    if match is None:
+        raise ValueError("is not a cell: write ROW,COLUMN from 0, such as 3,4")
+    return int(match[1]), int(match[2])
 
-    name = "ROW,COLUMN"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        if isinstance(value, tuple):
-            return value
-        match = re.fullmatch(r"([0-9]{1,9}),([0-9]{1,9})", str(value))
-        if match is None:
-            self.fail(f"`{value}` is not a cell: write ROW,COLUMN from 0, such as 3,4", param, ctx)
-        return int(match[1]), int(match[2])
+CELL = opt.Parsed("ROW,COLUMN", _cell)
 
 
 @click.command("trace")
@@ -36,7 +30,7 @@ class CellType(click.ParamType):
 @opt.world
 @opt.size
 @opt.integer("--seed", 0, 2**63 - 1, "Seed of all random numbers.  [default: 0]")
-@click.option("--at", "cell", type=CellType(), required=True, help="Row and column of the cell, from 0.")
+@click.option("--at", "cell", type=CELL, required=True, help="Row and column of the cell, from 0.")
 @opt.integer("--step", 1, 10**9, "Step of the run, from 1.", required=True)
 @opt.text(
     "--of", "NAME", "Explain only `element`, or this field. May be repeated.", to="names", multiple=True
