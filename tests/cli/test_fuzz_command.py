@@ -16,12 +16,16 @@ from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.cli.commands import command_line, environment_with, powderdsl, process
 from tests.compilers import skip_without_compiler
-from tests.fuzz import differential
+from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
 from tests.fuzz.case_files import read_case, write_case
 from tests.fuzz.cases import Case
 from tests.fuzz.differential import seeded_starts
 from tests.fuzz.reducer import reduce_case
 from tests.processes import started, waited
+
+
+def listed(names: tuple[str, ...]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 @pytest.mark.slow
@@ -49,7 +53,7 @@ def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
     every = process(*given)
     assert every.returncode == 0, every.stderr
-    assert "torch, arrays, native and cuda-emulated against the reference" in every.stdout
+    assert f": {listed(COMPARED)} against the reference" in every.stdout
     some = process(*given, "--backends", "reference,cuda-emulated")
     assert some.returncode == 0, some.stderr
     assert ": cuda-emulated against the reference" in some.stdout
@@ -61,7 +65,7 @@ def test_without_a_compiler_the_others_are_compared(tmp_path: Path, monkeypatch:
     usual = powderdsl(*given)
     assert usual.exit_code == 0
     assert "without `native` and `cuda-emulated`: no C++ compiler" in usual.stderr
-    assert ": torch and arrays against the reference" in usual.stdout
+    assert f": {listed(STARTS_AT_ONCE)} against the reference" in usual.stdout
     asked = powderdsl(*given, "--backends", "arrays,cuda-emulated")
     assert asked.exit_code == 2
     assert "leave `cuda-emulated` out of --backends" in asked.stderr

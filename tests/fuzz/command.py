@@ -16,6 +16,7 @@ from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.options import renamed_backend
 from powderdsl.cli.output import counted, progress
 from powderdsl.system.interrupts import Terminated
+from tests.fuzz import COMPARED, COMPILED
 
 if TYPE_CHECKING:
     from tests.fuzz.campaign import Tally
@@ -23,8 +24,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-NAMES = ("reference", "torch", "arrays", "native", "cuda-emulated")
-COMPILED = ("native", "cuda-emulated")
+NAMES = ("reference", *COMPARED)
 MAX_SEED = 1 << 40
 LEVELS = ("0", "1", "2", "3")
 
@@ -141,7 +141,6 @@ def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """The backends asked for, by default all that are there. Raises CompileError (PD701) if one is not."""
     from powderdsl.system.writing import failure
     from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler, find_compiler
-    from tests.fuzz.differential import COMPARED
 
     wanted = asked or COMPARED
     compiled = [name for name in wanted if name in COMPILED]

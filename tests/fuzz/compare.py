@@ -11,12 +11,13 @@ import numpy as np
 from powderdsl.model.types import Moment, Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import Start, load_text
+from tests.fuzz import STARTS_AT_ONCE
 from tests.fuzz.cuda_emulation import EmulatedSimulator
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
 
-BACKENDS = ("reference", "torch", "arrays")
+BACKENDS = ("reference", *STARTS_AT_ONCE)
 """What random rulesets are compared on: native code and emulated kernels take seconds to compile."""
 
 

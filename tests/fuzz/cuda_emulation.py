@@ -16,9 +16,7 @@ from powderdsl.targets.cpp.compilers import find_compiler
 from powderdsl.targets.cuda.program import Arguments, Compile, CudaProgram, Launch, worlds_of
 from powderdsl.targets.cuda.source import KernelSource
 from powderdsl.targets.torch.mixed import packed_program
-
-EMULATED = "cuda-emulated"
-"""The name of the CUDA target where its kernels run on the CPU."""
+from tests.fuzz import EMULATED
 
 FLAGS = ("-std=c++17", "-O0", "-ffp-contract=off", "-fno-strict-aliasing", "-shared", "-fPIC", "-w")
 

@@ -21,9 +21,10 @@ from powderdsl.targets.cpp.build import Building, building
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz import EMULATED, STARTS_AT_ONCE
 from tests.fuzz.cases import Case, fitted
 from tests.fuzz.compare import find_difference
-from tests.fuzz.cuda_emulation import EMULATED, EmulatedSimulator
+from tests.fuzz.cuda_emulation import EmulatedSimulator
 from tests.fuzz.exercised import Used, constructs, operations
 
 if TYPE_CHECKING:
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
 State = Mapping[str, Any]
 
 ORACLE = "reference"
-
-COMPARED = ("torch", "arrays", "native", EMULATED)
-"""Every target but CUDA on a GPU. The last two need a C++ compiler, and seconds a ruleset."""
 
 WIDTHS = (7, 31, 32, 33, 63, 64, 65, 97, 130)
 """Columns of wide worlds: the borders of words of 32 and 64 columns, and more words than one."""
@@ -47,7 +45,7 @@ MANY = 9
 class Plan:
     """What is compared for a seed: backends, the worlds of a ruleset, steps, and how native code is built."""
 
-    backends: tuple[str, ...] = ("torch", "arrays")
+    backends: tuple[str, ...] = STARTS_AT_ONCE
     worlds: int = 4
     steps: int = 3
     building: Building = field(default_factory=lambda: Building("-O0"))

@@ -9,8 +9,9 @@ import pytest
 
 from powderdsl.targets.cpp.build import Building
 from tests.compilers import skip_without_compiler
+from tests.fuzz import COMPARED
 from tests.fuzz.case_files import read_case
-from tests.fuzz.differential import COMPARED, check_case
+from tests.fuzz.differential import check_case
 
 FOLDER = Path(__file__).parent
 FILES = sorted(FOLDER.glob("*.yaml"))

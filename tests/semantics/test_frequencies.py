@@ -11,8 +11,9 @@ from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.samples import Sample, single
 from powderdsl.testing.properties.search import COPIES, InvariantSearch, SearchPlan
 from tests.compilers import skip_without_compiler
+from tests.fuzz import TARGETS
 
-BACKENDS = ["reference", "torch", "arrays", "native"]
+BACKENDS = ("reference", *TARGETS)
 
 DRIFT = """pack: drift
 elements:

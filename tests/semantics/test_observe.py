@@ -15,8 +15,9 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
+from tests.fuzz import TARGETS
 
-BACKENDS = ["reference", "torch", "arrays", "native"]
+BACKENDS = ("reference", *TARGETS)
 SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
 
 KINDS = """\

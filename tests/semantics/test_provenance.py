@@ -14,10 +14,11 @@ from powderdsl.simulation.simulator import compile
 from powderdsl.simulation.tracing.recorded import record_step, writes_of
 from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
+from tests.fuzz import STARTS_AT_ONCE
 from tests.semantics.test_differential import compositions, seeded_ruleset
 
 SHAPES = ((2, 5, 33), (1, 2, 2))
-BACKENDS = ("reference", "torch", "arrays")
+BACKENDS = ("reference", *STARTS_AT_ONCE)
 
 
 def recorded(ruleset: Ruleset, start: Start, backend: str, steps: int) -> Provenance:
