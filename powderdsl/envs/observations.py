@@ -34,20 +34,13 @@ class Observation:
 
     def of(self, world: World) -> Tensor:
         """The observations of a batch, in memory of their own: [B, *space.shape]."""
-        shape = (len(world.seed), *self.space.shape)
-        out = torch.empty(shape, dtype=_DTYPES[self.space.dtype.name], device=world.seed.device)
+        shape, dtype = (len(world.seed), *self.space.shape), getattr(torch, self.space.dtype.name)
+        out = torch.empty(shape, dtype=dtype, device=world.seed.device)
         if self.kind == "ids":
             world.read("element", out[:, 0])
-        elif self.kind == "compact":
-            world.compact(out)
-        elif self.kind == "matrix":
-            world.matrix(out)
         else:
-            world.rgb(out)
+            getattr(world, self.kind)(out)
         return out
-
-
-_DTYPES = {"uint8": torch.uint8, "float32": torch.float32}
 
 
 def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
@@ -66,20 +59,13 @@ def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
 
 def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
     """The observation of a kind. Raises ValueError for one that there is not."""
-    observer = simulator.observer
+    observer, ruleset = simulator.observer, simulator.ruleset
     channels = channels_of(kind, observer)
-    if kind in ("ids", "compact"):
-        return Observation(kind, _bytes((len(channels), *size)), channels)
-    if kind == "rgb":
-        return Observation(kind, _bytes((*size, 3)), channels)
-    ruleset = simulator.ruleset
+    shape = (*size, 3) if kind == "rgb" else (len(channels), *size)
+    if kind != "matrix":
+        # Bytes, 0..255 whatever occurs: what Stable-Baselines3 takes for pictures, and stores as such.
+        return Observation(kind, Box(0, 255, shape, np.uint8), channels)
     bounds = [abs(one) for slot in observer.slots.values() for one in (slot.kind.lo, slot.kind.hi)]
     bounds += [float(observer.table(prop.name).abs().max()) for prop in ruleset.properties]
     limit = max(ruleset.slots, *bounds)
-    box = Box(-limit, limit, (len(channels), *size), np.float32)
-    return Observation(kind, box, channels)
-
-
-def _bytes(shape: tuple[int, ...]) -> Box:
-    """Bytes, 0..255 whatever occurs: what Stable-Baselines3 takes for pictures, and stores as such."""
-    return Box(0, 255, shape, np.uint8)
+    return Observation(kind, Box(-limit, limit, shape, np.float32), channels)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from powderdsl.envs.gym import array, check_render_mode, frames
+from powderdsl.envs.gym import array, arrays, check_render_mode, frames
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
@@ -69,26 +69,17 @@ class PowderVecEnv(VecEnv):
         done = array(terminated | truncated)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if "final_obs" in info:
-            self._last_infos(infos, info, np.flatnonzero(done), array(truncated))
+            final, passed = arrays(info["final_info"]), round(time.time() - self._began, 6)
+            for place, last in zip(np.flatnonzero(done), array(info["final_obs"]), strict=True):
+                returned, length = float(final["episode_return"][place]), int(final["episode_length"][place])
+                infos[place] = {
+                    "terminal_observation": last,
+                    "TimeLimit.truncated": bool(truncated[place]),
+                    "episode": {"r": returned, "l": length, "t": passed},
+                }
+                if self.tensors.task.goal.success is not None:
+                    infos[place]["is_success"] = bool(final["success"][place])
         return array(observed), array(reward), done, infos
-
-    def _last_infos(
-        self, infos: list[dict[str, Any]], info: dict[str, Any], places: Array, truncated: Array
-    ) -> None:
-        """The infos of episodes that ended."""
-        last, final = array(info["final_obs"]), info["final_info"]
-        returned, length, success = (
-            array(final[name]) for name in ("episode_return", "episode_length", "success")
-        )
-        passed = round(time.time() - self._began, 6)
-        for number, place in enumerate(places):
-            infos[place] = {
-                "terminal_observation": last[number],
-                "TimeLimit.truncated": bool(truncated[place]),
-                "episode": {"r": float(returned[place]), "l": int(length[place]), "t": passed},
-            }
-            if self.tensors.task.goal.success is not None:
-                infos[place]["is_success"] = bool(success[place])
 
     def state(self) -> dict[str, Any]:
         """What `TensorEnv.state` gives."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
@@ -68,20 +68,21 @@ class TrainConfig:
         return {name: value for name, value in self.as_json().items() if name not in HOW}
 
 
-_SMALL: Mapping[str, Any] = MappingProxyType(
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
-        "network": "small",
-        "observation": "ids",
-        "features": 128,
-        "rollout": 128,
-        "epochs": 4,
-        "learning_rate": 1e-3,
-        "entropy": 0.01,
-        "steps": 200_000,
+        "paper": {},
+        "small": {
+            "network": "small",
+            "observation": "ids",
+            "features": 128,
+            "rollout": 128,
+            "epochs": 4,
+            "learning_rate": 1e-3,
+            "entropy": 0.01,
+            "steps": 200_000,
+        },
     }
 )
-
-PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType({"paper": MappingProxyType({}), "small": _SMALL})
 """``paper``: its network and figures. ``small``: a network and figures for a few minutes on one processor core."""
 
 
@@ -91,20 +92,15 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
     if name not in PRESETS:
         wrong.append(_wrong(f"there is no preset `{name}`", suggest(str(name), PRESETS, "presets")))
     known = [one.name for one in fields(TrainConfig)]
-    for other in changes:
-        if other not in known:
-            wrong.append(_wrong(f"there is no setting `{other}`", suggest(other, known)))
+    unknown = [other for other in changes if other not in known]
+    wrong += [_wrong(f"there is no setting `{other}`", suggest(other, known)) for other in unknown]
     given = {"task": task, **PRESETS.get(name, {})}
     given |= {one: value for one, value in changes.items() if one in known}
     # The usual observation depends on the network.
     if "network" in changes and "observation" not in changes and changes["network"] in OBSERVATIONS:
         given["observation"] = OBSERVATIONS[changes["network"]][0]
     given["packs"] = tuple(given.get("packs", ()))
-    config = TrainConfig(**given)
-    wrong += _mistakes(config)
-    if wrong:
-        raise CompileError(wrong)
-    return config
+    return check_config(TrainConfig(**given), wrong)
 
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
@@ -115,9 +111,9 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
     return preset("paper", **{"task": "", **values, "backend": backend})
 
 
-def check_config(config: TrainConfig) -> TrainConfig:
-    """The same settings. Raises CompileError (PD640) with everything that is wrong in them."""
-    wrong = _mistakes(config)
+def check_config(config: TrainConfig, known: Sequence[Diagnostic] = ()) -> TrainConfig:
+    """The same settings. Raises CompileError (PD640) with everything that is wrong in them, after what is `known`."""
+    wrong = [*known, *_mistakes(config)]
     if wrong:
         raise CompileError(wrong)
     return config

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,8 +29,7 @@ BATCH = 256
 """Episodes that are played at once."""
 
 
-@dataclass(frozen=True)
-class Played:
+class Played(NamedTuple):
     """Episodes that were played: `returns` float64 [n]; `lengths` int64 [n], actions; `success` bool [n], at the end."""
 
     returns: Tensor
@@ -112,9 +111,8 @@ def play(
     if begun is not None:
         begun(episodes)
     for step in range(program.task.agent.actions):
-        actions = None
-        if policy is not None:
-            actions = policy(sight.of(episodes.world), action_keys(seed, numbers, step))
+        keys = action_keys(seed, numbers, step)
+        actions = None if policy is None else policy(sight.of(episodes.world), keys)
         # Episodes that are over run on, and no longer count.
         episodes, reward, success, over = program.act(episodes, actions, reuse=seen is None, seen=seen)
         returns += torch.where(going, reward.double(), 0.0)
@@ -172,13 +170,8 @@ def evaluate(
         raise ValueError(f"policies are {', '.join(there)}; found {unknown[0] if unknown else 'none'}")
     if episodes < 1:
         raise ValueError(f"episodes is {episodes}: it takes an integer from 1")
-    first = compile_task(
-        task,
-        split=names[0],
-        backend=backend or config.backend,
-        device=device or config.device,
-        threads=config.threads,
-    )
+    backend, device = backend or config.backend, device or config.device
+    first = compile_task(task, split=names[0], backend=backend, device=device, threads=config.threads)
     acts: dict[str, Policy | None] = {"random": random_policy(first.action_nvec), "nothing": None}
     step = None
     if run is not None and "trained" in chosen:
@@ -189,10 +182,8 @@ def evaluate(
     for name in names:
         program = first if name == first.split else TaskProgram(task, name, first.simulator)
         count = config.worlds if run is not None and name == config.split else episodes
-        played = {
-            policy: _play_all(program, acts[policy], episodes, min(count, episodes), config.observation, seed)
-            for policy in chosen
-        }
+        worlds = torch.arange(episodes) % count
+        played = {one: _play_all(program, acts[one], worlds, config.observation, seed) for one in chosen}
         for policy in chosen:
             scores.append(_score(name, policy, played, task))
             if said is not None:
@@ -204,18 +195,14 @@ def evaluate(
 
 
 def _play_all(
-    program: TaskProgram, policy: Policy | None, episodes: int, worlds: int, observation: str, seed: int
+    program: TaskProgram, policy: Policy | None, worlds: Tensor, observation: str, seed: int
 ) -> Played:
-    parts = []
-    for start in range(0, episodes, BATCH):
-        numbers = torch.arange(start, min(start + BATCH, episodes))
-        kind = observation if policy is not None else "ids"
-        parts.append(play(program, policy, numbers % worlds, observation=kind, numbers=numbers, seed=seed))
-    return Played(
-        torch.cat([one.returns for one in parts]),
-        torch.cat([one.lengths for one in parts]),
-        torch.cat([one.success for one in parts]),
-    )
+    kind = observation if policy is not None else "ids"
+    parts = [
+        play(program, policy, worlds[numbers], observation=kind, numbers=numbers, seed=seed)
+        for numbers in torch.arange(len(worlds)).split(BATCH)
+    ]
+    return Played(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task) -> Score:

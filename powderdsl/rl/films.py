@@ -29,9 +29,9 @@ PAPER = (30, 30, 30)
 
 @dataclass(frozen=True)
 class FilmScene:
-    """One substep of all worlds: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None, `fields` [B, H, W] each,
-    those that colors follow; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns` float64
-    [B] before them; `over` bool [B]."""
+    """All worlds between two steps: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None, `fields` [B, H, W]
+    each, those that colors follow; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns`
+    float64 [B] before them; `over` bool [B]."""
 
     ids: NDArray[np.uint8]
     motion: NDArray[np.float32] | None
@@ -67,14 +67,12 @@ class FilmRecorder:
 
     def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
         """What was seen since the last call belongs to these actions; the last scene of them shows the new returns."""
-        for number, (ids, motion, fields) in enumerate(self._pending):
-            last = number == len(self._pending) - 1
-            now = (returns, over) if last else (self._returns, self._over)
-            self.scenes.append(
-                FilmScene(ids, motion, fields, actions, now[0].cpu().clone(), now[1].cpu().clone())
-            )
+        before, after = (self._returns, self._over), (returns.cpu().clone(), over.cpu().clone())
+        for number, seen in enumerate(self._pending, 1):
+            now = after if number == len(self._pending) else before
+            self.scenes.append(FilmScene(*seen, actions, *now))
         self._pending.clear()
-        self._returns, self._over = returns.clone(), over.clone()
+        self._returns, self._over = after
 
 
 def film(

@@ -52,9 +52,8 @@ class TrainedPolicy:
 
     def __call__(self, observed: Tensor, keys: Tensor) -> Tensor:
         with torch.no_grad():
-            choices: Any = self.network.get_distribution(
-                observed[:, : self.channels]
-            ).distribution  # one of each number of an action
+            # One for each number of an action.
+            choices: Any = self.network.get_distribution(observed[:, : self.channels]).distribution
         if self.deterministic:
             return torch.stack([one.probs.argmax(1) for one in choices], 1)
         drawn = uniforms(keys, len(choices))
@@ -105,18 +104,12 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
     palette = recorded_palette(run)
     if palette is None:
         return env
-    lacking = [one for one in env.task.ruleset.elements if one.id >= len(palette)]
+    lacking = [one.qualified for one in env.task.ruleset.elements if one.id >= len(palette)]
     if lacking:
-        raise failure(
-            "PD623",
-            f"{run.path} does not fit",
-            notes=tuple(
-                f"there is no free slot for `{one.qualified}`: it has {len(palette)}" for one in lacking
-            ),
-            helps=(
-                f"train with `--slots {len(palette) + len(lacking)}` to leave room for packs that come later",
-            ),
-        )
+        notes = tuple(f"there is no free slot for `{name}`: it has {len(palette)}" for name in lacking)
+        slots = len(palette) + len(lacking)
+        fix = f"train with `--slots {slots}` to leave room for packs that come later"
+        raise failure("PD623", f"{run.path} does not fit", notes=notes, helps=(fix,))
     other = [
         f"id {one.id} is `{palette[one.id]}` there, `{one.qualified}` here"
         for one in env.task.ruleset.elements

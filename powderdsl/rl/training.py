@@ -103,11 +103,7 @@ def _task_and_palette(config: TrainConfig, folder: Path) -> tuple[Task, tuple[st
 
     A run that began before palettes were kept has the ids that the rules give.
     """
-    how: dict[str, Any] = {
-        "knobs": dict(config.knobs),
-        "params": dict(config.params),
-        "packs": config.packs,
-    }
+    how: dict[str, Any] = {name: getattr(config, name) for name in ("knobs", "params", "packs")}
     if (folder / "run.json").exists():
         recorded = recorded_palette(read_run(folder))
         if recorded is None:

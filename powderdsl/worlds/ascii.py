@@ -29,7 +29,6 @@ def parse_ascii(
     visible character.
     """
     ids = _characters(elements, legend or {})
-    decode = {ord(character): chr(number) for character, number in ids.items()}
     rows: list[str] = []
     offset, good = art.start, True
     seen: set[str] = set()
@@ -38,34 +37,29 @@ def parse_ascii(
         cells = "".join(line.split())
         if not cells:
             continue
-        for character in sorted(set(cells) - ids.keys() - seen):
-            place = start + line.index(character)
-            reporter.error(
-                "PD610",
-                f"unknown character `{character}`",
-                Span(art.source, place, place + 1),
-                "no element has it",
-                helps=["known: " + "  ".join(_legend_line(ids, elements))],
-            )
         unknown = set(cells) - ids.keys()
+        for character in sorted(unknown - seen):
+            place = start + line.index(character)
+            span, helps = Span(art.source, place, place + 1), [f"known: {_known(ids, elements)}"]
+            message = f"unknown character `{character}`"
+            reporter.error("PD610", message, span, "no element has it", helps=helps)
         seen |= unknown
-        if rows and len(cells) != len(rows[0]):
+        uneven = bool(rows) and len(cells) != len(rows[0])
+        if uneven:
             begin = start + len(line) - len(line.lstrip())
-            place_of_row = Span(art.source, begin, start + len(line.rstrip()))
+            span = Span(art.source, begin, start + len(line.rstrip()))
             message = f"a row of {len(cells)} cells in a world of {len(rows[0])} columns"
-            reporter.error("PD611", message, place_of_row, f"the first row has {len(rows[0])} cells")
-            good = False
-        good = good and not unknown
+            reporter.error("PD611", message, span, f"the first row has {len(rows[0])} cells")
+        good = good and not unknown and not uneven
         rows.append(cells)
-    if not rows or len(rows) * len(rows[0]) > MAX_CELLS:
-        height, width = len(rows), len(rows[0]) if rows else 0
-        place_of_all = Span(art.source, art.start, art.start + 1)
-        reporter.error(
-            "PD607", f"a world of {height}×{width} cells", place_of_all, f"1 to {MAX_CELLS:,} cells"
-        )
+    height, width = len(rows), len(rows[0]) if rows else 0
+    if not 0 < height * width <= MAX_CELLS:
+        span, label = Span(art.source, art.start, art.start + 1), f"1 to {MAX_CELLS:,} cells"
+        reporter.error("PD607", f"a world of {height}×{width} cells", span, label)
         return None
     if not good:
         return None
+    decode = {ord(character): chr(number) for character, number in ids.items()}
     text = "".join(rows).translate(decode)
     return np.frombuffer(text.encode("latin-1"), dtype=np.uint8).reshape(len(rows), -1).copy()
 
@@ -135,6 +129,6 @@ def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[
     return characters
 
 
-def _legend_line(ids: Mapping[str, int], elements: Sequence[Element]) -> list[str]:
+def _known(ids: Mapping[str, int], elements: Sequence[Element]) -> str:
     names = {element.id: element.name for element in elements}
-    return [f"{character} {names[number]}" for character, number in ids.items()]
+    return "  ".join(f"{character} {names[number]}" for character, number in ids.items())

@@ -80,7 +80,12 @@ def _wrong_colors(
         _wrong_color(path, color, divmod(place, packed.shape[1]), count, owners)
         for color, (place, count) in listed[:MAX_REPORTED]
     ]
-    return result if len(found) <= MAX_REPORTED else [*result, _many_colors(path, len(found))]
+    if len(found) > MAX_REPORTED:
+        number = f"more than {MAX_COLORS:,}" if len(found) > MAX_COLORS else f"{len(found):,}"
+        fix = "draw with a hard brush in the elements' colors, one pixel a cell, and scale without smoothing"
+        message = f"{number} colors in {path} are not any element's"
+        result.append(Diagnostic("PD609", message, Label(None), helps=(fix,)))
+    return result
 
 
 def _ramp_colors(elements: Sequence[Element]) -> dict[int, list[Element]]:
@@ -130,9 +135,8 @@ def _decode(file: BinaryIO, path: Path) -> NDArray[np.uint8]:
 
 
 def _too_large(path: Path, size: str) -> CompileError:
-    return failure(
-        "PD607", f"{path}: a world of {size} cells", helps=(f"a world has at most {MAX_CELLS:,} cells",)
-    )
+    helps = (f"a world has at most {MAX_CELLS:,} cells",)
+    return failure("PD607", f"{path}: a world of {size} cells", helps=helps)
 
 
 def _wrong_color(
@@ -154,12 +158,6 @@ def _wrong_color(
         helps = (f"the nearest is `{nearest.name}`, {nearest.color}",)
     notes = (f"{path}: {count:,} such pixels, this is the first",)
     return Diagnostic("PD609", message, Label(None), notes=notes, helps=helps)
-
-
-def _many_colors(path: Path, count: int) -> Diagnostic:
-    number = f"more than {MAX_COLORS:,}" if count > MAX_COLORS else f"{count:,}"
-    helps = ("draw with a hard brush in the elements' colors, one pixel a cell, and scale without smoothing",)
-    return Diagnostic("PD609", f"{number} colors in {path} are not any element's", Label(None), helps=helps)
 
 
 def _distance(one: str, other: str) -> int:

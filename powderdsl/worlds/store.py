@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import ELEMENT
 from powderdsl.simulation.simulator import Simulator, World
@@ -95,11 +95,10 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
         slot = next((s for s in sim.slots if s.name == known), None)
         if slot is None:
             if sim.ruleset.property(known) is None and archive.read(key).any():
-                raise _mismatch(
-                    source,
-                    f"the field `{qualified.get(name, name)}` of {saved_in} is not in {sim.ruleset.name}",
-                    "load the pack that has it",
+                problem = (
+                    f"the field `{qualified.get(name, name)}` of {saved_in} is not in {sim.ruleset.name}"
                 )
+                raise _mismatch(source, problem, "load the pack that has it")
             continue
         if archive.headers[key].shape != (shape if slot.planes != 2 else (shape[0], 2, *shape[1:])):
             raise _bad(source, f"is not a saved world: `{key}` does not fit its elements")
@@ -173,22 +172,15 @@ def _translated(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -
         if name is None:
             raise _bad(path, f"has the id {number}, which is not in its palette")
         if name not in ours:
-            raise _mismatch(
-                path,
-                f"the element `{name}` is not in {sim.ruleset.name}",
-                f"load the pack `{name.split('.')[0]}` too",
-            )
+            fix = f"load the pack `{name.split('.')[0]}` too"
+            raise _mismatch(path, f"the element `{name}` is not in {sim.ruleset.name}", fix)
         table[number] = ours[name]
     return np.frombuffer(data.translate(table), np.uint8).reshape(ids.shape)
 
 
 def _bad(path: Path, problem: str) -> CompileError:
-    reporter = Reporter()
-    reporter.error("PD602", f"`{path}` {problem}", None)
-    return CompileError(reporter.diagnostics)
+    return failure("PD602", f"`{path}` {problem}")
 
 
 def _mismatch(path: Path, problem: str, fix: str) -> CompileError:
-    reporter = Reporter()
-    reporter.error("PD603", f"`{path}` does not fit: {problem}", None, helps=[fix])
-    return CompileError(reporter.diagnostics)
+    return failure("PD603", f"`{path}` does not fit: {problem}", helps=(fix,))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -64,15 +65,14 @@ class DrawTable:
 
     def __init__(self, blocks: Iterable[tuple[int, int, int]], device: torch.device):
         """`blocks`: number, repeats and wanted of each statement."""
-        most: dict[int, tuple[int, int]] = {}
-        for statement, repeats, wanted in blocks:
-            old = most.get(statement, (0, 0))
-            most[statement] = max(repeats, old[0]), max(wanted, old[1])
         self.blocks: dict[int, tuple[int, int, int]] = {}
         """By statement: the place of its first draw, repeats, wanted."""
+        for statement, repeats, wanted in blocks:
+            _, *old = self.blocks.get(statement, (0, 0, 0))
+            self.blocks[statement] = (0, max(repeats, old[0]), max(wanted, old[1]))
         keys: list[int] = []
         counters: list[int] = []
-        for statement, (repeats, wanted) in most.items():
+        for statement, (_, repeats, wanted) in self.blocks.items():
             self.blocks[statement] = (len(keys), repeats, wanted)
             keys += [statement * _STATEMENT & MASK] * (repeats * wanted)
             counters += [r * _NUMBERS + n for r in range(repeats) for n in range(wanted)]
@@ -146,6 +146,10 @@ def _draws_in(*amounts: Amount | None) -> int:
     return sum(part.op == "draw" for one in amounts if one is not None for part in one.walk())
 
 
+def _groups(generator: Generator) -> list[Group]:
+    return [*generator.groups, *(group for target in generator.targets for group in target.groups)]
+
+
 def _draw_blocks(generator: Generator) -> Iterator[tuple[int, int, int]]:
     """What a generator draws, as `DrawTable` takes it."""
     for name, amount in generator.lets:
@@ -153,7 +157,7 @@ def _draw_blocks(generator: Generator) -> Iterator[tuple[int, int, int]]:
     for region in generator.regions:
         for number, shape in enumerate(region.shapes):
             yield _shape_number(region, number), 1, _draws_in(*shape.amounts)
-    for group in (*generator.groups, *(group for target in generator.targets for group in target.groups)):
+    for group in _groups(generator):
         yield group.number, 1, _draws_in(group.count)
         for name, amount in group.lets:
             yield name_number(name), group.most, _draws_in(amount)
@@ -173,16 +177,16 @@ class WorldMaker:
         self.generator, self.size, self.device = generator, size, device
         self.words = -(-size[0] // 64)
         self.stamps = {stamp.name: _bordered(stamp.rows, device) for stamp in generator.stamps}
-        groups = [*generator.groups, *(group for target in generator.targets for group in target.groups)]
-        painted = [i for group in groups for one in group.drawings for i in one.ids]
+        painted = [i for group in _groups(generator) for one in group.drawings for i in one.ids]
         held = [int(i) for stamp in self.stamps.values() for i in stamp.unique() if i != NOTHING]
         self.planes = max(1, max([generator.fill, *painted, *held]).bit_length())
         self.table = DrawTable(_draw_blocks(generator), device)
         self.fixed: dict[Drawing, Tensor] = {}
         """Words of shapes that are the same in every world."""
         self._bits: dict[tuple[int, int], Tensor] = {}
+        nowhere = torch.zeros(size[1], self.words, dtype=torch.int64, device=device)
         self.fixed_regions = {
-            region.name: self._union([self.fixed_words(one) for one in region.shapes])[None]
+            region.name: reduce(torch.bitwise_or, map(self.fixed_words, region.shapes), nowhere)[None]
             for region in generator.regions
             if not region.drawn
         }
@@ -238,19 +242,13 @@ class WorldMaker:
 
     def _region(self, region: Region, hashes: Hashes, names: Mapping[str, Tensor]) -> Tensor:
         """Words [B, W, K] of a region."""
-        found = []
+        found = torch.zeros(
+            len(hashes.keys[0]), self.size[1], self.words, dtype=torch.int64, device=self.device
+        )
         for number, shape in enumerate(region.shapes):
             draws = _Draws(hashes, _shape_number(region, number), 1, names)
             words = self.drawn_words(shape, [draws.tensor(one) for one in shape.amounts])
-            full = (len(hashes.keys[0]), 1, self.size[1], self.words)
-            found.append(words.expand(full)[:, 0])
-        return self._union(found)
-
-    @staticmethod
-    def _union(words: list[Tensor]) -> Tensor:
-        found = words[0]
-        for one in words[1:]:
-            found = found | one
+            found |= words.expand(len(found), 1, *found.shape[1:])[:, 0]
         return found
 
     def drawn_words(self, drawing: Drawing, numbers: list[Tensor | None]) -> Tensor:
@@ -270,9 +268,8 @@ class WorldMaker:
     def fixed_bits(self, number: int, planes: int) -> Tensor:
         """The bits of an id, as `_plane_bits` has them."""
         if (number, planes) not in self._bits:
-            self._bits[number, planes] = _plane_bits(
-                torch.tensor(number, device=self.device), planes, self.planes
-            )
+            ids = torch.tensor(number, device=self.device)
+            self._bits[number, planes] = _plane_bits(ids, planes, self.planes)
         return self._bits[number, planes]
 
     def _paint(
@@ -320,12 +317,12 @@ class _Painter:
             bits = maker.fixed_bits(drawing.ids[0] if drawing.ids else 0, planes)
         self.bits = bits.unbind(2) if bits.shape[2] > 1 else bits.unbind(2) * repeats
         self.numbers: list[Tensor | None] = []
-        if integers(drawing.amounts) is not None and drawing.kind not in _LIMITED:
+        words = once
+        if drawing.kind not in _LIMITED and integers(drawing.amounts) is not None:
             words = maker.fixed_words(drawing) & once
         else:
             numbers = [draws.tensor(one) for one in drawing.amounts]
             self.numbers = [None if one is None else one.expand(once.shape[:2]) for one in numbers]
-            words = once
             if drawing.kind not in _LIMITED:
                 words = maker.drawn_words(drawing, self.numbers) & once
         self.words = words.unbind(1)
