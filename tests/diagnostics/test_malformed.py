@@ -178,7 +178,7 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     ("of without element", "fields: {f: {type: flag, at: place, of: weed}}\n", "PD401", "weed"),
     ("a property that is a vector", "properties: {p: {type: vec2(0..1)}}\n", "PD401", "vec2(0..1)"),
     ("a property outside", "properties: {p: {type: 0..3, weed: 7}}\n", "PD402", "7"),
-    ("a parameter that is a vector", "params: {p: {type: vec2(0..1), default: 0}}\n", "PD401", "p"),
+    ("a parameter that is a vector", "params: {p: {type: vec2(0..1), default: 0}}\n", "PD401", "vec2(0..1)"),
     ("a parameter without a kind", "params: {p: 0.2}\n", "PD401", "0.2"),
     ("a chance above 1", "params: {p: 101%}\n", "PD403", "101%"),
     ("a chance below 0", "params: {p: {type: chance, default: -5%}}\n", "PD403", "-5%"),

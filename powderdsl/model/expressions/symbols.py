@@ -9,8 +9,6 @@ from fractions import Fraction
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, FUNCTIONS, KERNELS, KIND_WORDS, grid_kernel
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.composition.names import Named
-from powderdsl.model.declarations import TypedDecl
 from powderdsl.model.expressions.coercer import Coercer, read_bounds
 from powderdsl.model.expressions.operands import Items, Operand, Place, SetOf
 from powderdsl.model.state import SNAP
@@ -162,27 +160,6 @@ def clamped(default: Value, kind: Kind) -> Value:
 def clamped_number(value: float | Fraction, kind: Kind) -> float:
     kept = min(max(float(value), kind.lo), kind.hi)
     return kept if abs(kept) >= SNAP else 0.0
-
-
-def field_from(named: Named[TypedDecl], kind: Kind, default: Value, of: frozenset[int] | None) -> Field:
-    decl = named.decl
-    resets = decl.resets is not None
-    return Field(named.name, kind, default, decl.at, resets, of, named.pack, named.span, word=named.word)
-
-
-def check_param_names(symbols: Symbols, reporter: Reporter) -> None:
-    """A parameter may not hide a global word that its pack knows: a rule would read the other one without a sign."""
-    composition = symbols.composition
-    for named in composition.params.values():
-        name = composition.names.of(named.pack, named.decl.name.text)
-        other = composition.definitions.get(name)
-        if other is not None and composition.names.knows(named.pack, name):
-            message, labels = (
-                f"the parameter `{name}` hides another `{name}`",
-                [Label(other.span, "this one")],
-            )
-            helps = ["rename the parameter"]
-            reporter.error("PD308", message, named.span, "the same word", secondary=labels, helps=helps)
 
 
 def number_value(expr: Expr, kind: Kind) -> Value:

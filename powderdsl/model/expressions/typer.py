@@ -73,7 +73,6 @@ class Typer(Coercer):
         self.absent: set[str] = set()
         self.empty: set[str] = set()
         """Tags and sets without elements that the rule asks for."""
-        self.set_definitions: dict[str, tuple[str, Syntax]] = {}
         self.resolving: list[str] = []
         self.unknown = UnknownNames(symbols, reporter)
         self._sets_too_deep = False
@@ -144,7 +143,7 @@ class Typer(Coercer):
             return Expr("param", param.kind, value=param.name, span=span)
         name = symbols.composition.names.of(scope.pack, name)
         self.used.add(name)
-        if name in self.set_definitions and name not in symbols.constants:
+        if name in symbols.composition.sets and name not in symbols.constants:
             return self.resolve_set(name, span)
         if name in symbols.constants:
             constant = self._sound(symbols.constants[name])
@@ -183,7 +182,8 @@ class Typer(Coercer):
             self._sets_too_deep = True
             message = f"more than {MAX_SET_DEPTH} sets that depend on each other"
             raise self.fail("PD508", message, span, "too many in a row", "list elements or tags")
-        pack, syntax = self.set_definitions[name]
+        named = self.symbols.composition.sets[name]
+        pack, syntax = named.pack, named.decl.members
         self.resolving.append(name)
         try:
             result = SetOf(self.set_of(self.evaluate(syntax, Scope(pack, {})), syntax.span).ids)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
-from powderdsl.diagnostics import Label, Span, suggest
+from powderdsl.diagnostics import Label, Span
+from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.expressions.operands import Poisoned, Unresolved
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.fields.words import FORMS, WordProblem, read_word
@@ -50,41 +52,38 @@ class GridReader:
     def _grid(self, key: Scalar, scalar: Scalar, given: Sequence[str], expected: bool) -> FieldGrid:
         kind = self._kind(key)
         rows = [line.split() for line in scalar.text.splitlines() if line.strip()]
-        places = self._places(scalar, sum(map(len, rows)))
-        everywhere = len(rows) == 1 and len(rows[0]) == 1
+        words = list(chain.from_iterable(rows))
+        places = self._places(scalar, len(words))
+        everywhere = len(words) == 1
         if not everywhere and [len(row) for row in rows] != [len(row) for row in given]:
             raise self.typer.fail(
-                "PD110",
-                f"`{key.text}` has another size than `given`",
-                places[0] if places else key.span,
-                f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}",
+                "PD110", f"`{key.text}` has another size than `given`", places[0] if places else key.span, size_of(given),
                 f"write a word for each cell, or one for all of them: {FORMS[kind.name][1]}",
-            )
-        words: dict[str, Cell] = {}
-        cells, at = [], 0
+            )  # fmt: skip
+        read: dict[str, Cell] = {}
         failed = False
-        for row in rows:
-            read = []
-            for word in row:
-                if word not in words:
-                    try:
-                        words[word] = self._cell(word, kind, places[at], expected)
-                    except Poisoned:
-                        words[word], failed = None, True
-                read.append(words[word])
-                at += 1
-            cells.append(tuple(read))
+        for word, place in zip(words, places, strict=True):
+            if word not in read:
+                try:
+                    read[word] = self._cell(word, kind, place, expected)
+                except Poisoned:
+                    read[word], failed = None, True
         if failed:
             raise Poisoned
-        if not expected:
-            self._check_holders(key, cells, given, places, everywhere)
         if everywhere:
-            cells = [tuple(cells[0][0] for _ in line) for line in given]
-        return FieldGrid(self._name(key), tuple(cells), everywhere, key.span)
+            return FieldGrid(
+                self._name(key), tuple((read[words[0]],) * len(row) for row in given), True, key.span
+            )
+        cells = [read[word] for word in words]
+        if not expected:
+            self._check_holders(key, cells, given, places)
+        return FieldGrid(
+            self._name(key), tuple(tuple(read[word] for word in row) for row in rows), False, key.span
+        )
 
     def _name(self, key: Scalar) -> str:
         """The global name of the field that the pack means."""
-        return self.typer.symbols.composition.names.of(self.pack, key.text.removesuffix("?"))
+        return self.typer.symbols.composition.names.of(self.pack, key.word)
 
     def _kind(self, key: Scalar) -> Kind:
         symbols = self.typer.symbols
@@ -100,13 +99,10 @@ class GridReader:
             )
         if symbols.is_declared(name, self.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
-        if key.text.endswith("?"):
+        if key.is_optional:
             raise Unresolved(name)  # the test waits for the pack that declares it
-        helps = (
-            *suggest(name, [*symbols.fields, *symbols.properties], "fields"),
-            f"if its pack may be absent, write `{name}?`",
-        )
-        raise self.typer.fail("PD301", f"unknown field `{name}`", key.span, "", *helps)
+        report_unknown("field", key, (*symbols.fields, *symbols.properties), self.typer.reporter)
+        raise Poisoned
 
     def _places(self, scalar: Scalar, count: int) -> list[Span]:
         """Where each word stands; in text that YAML changes while reading it, the whole text."""
@@ -133,30 +129,23 @@ class GridReader:
             raise self.typer.fail(wrong.code, wrong.message, place, wrong.label, *wrong.helps) from None
 
     def _check_holders(
-        self,
-        key: Scalar,
-        cells: Sequence[Sequence[Cell]],
-        given: Sequence[str],
-        places: Sequence[Span],
-        everywhere: bool,
+        self, key: Scalar, cells: Sequence[Cell], given: Sequence[str], places: Sequence[Span]
     ) -> None:
         """Refuse a value in a cell whose element does not have the field."""
-        symbols = self.typer.symbols
-        field = symbols.fields.get(self._name(key))
-        if everywhere or field is None or field.of is None:
+        field = self.typer.symbols.fields.get(self._name(key))
+        if field is None or field.of is None:
             return
-        at = 0
-        for row, characters in zip(cells, given, strict=True):
-            for cell, character in zip(row, characters, strict=True):
-                name = self.legend[character]
-                if cell and symbols.composition.elements[name].id not in field.of:
-                    self.typer.reporter.error(
-                        "PD407",
-                        f"`{name}` has no `{key.text}`",
-                        places[at],
-                        f"the cell holds `{name}`",
-                        secondary=(Label(field.span, "only some elements have it"),),
-                        helps=(f"write `{DEFAULT}` here, or add `{name}` to `of:` of `{key.text}`",),
-                    )
-                    raise Poisoned
-                at += 1
+        for cell, character, place in zip(cells, "".join(given), places, strict=True):
+            name = self.legend[character]
+            if cell and self.ids[character] not in field.of:
+                self.typer.reporter.error(
+                    "PD407", f"`{name}` has no `{key.text}`", place, f"the cell holds `{name}`",
+                    secondary=(Label(field.span, "only some elements have it"),),
+                    helps=(f"write `{DEFAULT}` here, or add `{name}` to `of:` of `{key.text}`",),
+                )  # fmt: skip
+                raise Poisoned
+
+
+def size_of(given: Sequence[str]) -> str:
+    """How large a start world is."""
+    return f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}"
