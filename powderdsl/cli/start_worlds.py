@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
-from powderdsl.model.world_sides import fitting
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene import Start, load_start

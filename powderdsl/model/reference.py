@@ -13,7 +13,19 @@ from typing import Any
 import numpy as np
 
 from powderdsl.model.state import SNAP, Slot, scratch_slots, slots
-from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Offset, Pass, Ruleset, Swap, Transform
+from powderdsl.model.types import (
+    Assign,
+    Expr,
+    Kernel,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Property,
+    Ruleset,
+    Swap,
+    Transform,
+)
 
 Array = np.ndarray[Any, Any]
 State = dict[str, Array]
@@ -23,6 +35,16 @@ FAN = {
     for op, value in (("near", 0.92387953251128674), ("far", 0.38268343236508977))
 }
 """cos(π/8) and cos(3π/8): the borders of the octants."""
+
+
+WIDE: dict[str, Any] = {
+    "flag": np.bool_,
+    "real": np.float32,
+    "vec2": np.float32,
+    "chance": np.float64,
+    "number": np.float64,
+}
+"""The dtype in which values of a kind are computed; int64 where there is none."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +112,11 @@ def look(value: Array, offset: Offset) -> Array:
     return np.roll(value, (-offset[0], -offset[1]), (-2, -1))
 
 
+def back(offset: Offset) -> Offset:
+    """The way from that neighbor to the cell."""
+    return (-offset[0], -offset[1])
+
+
 def look_or_nothing(value: Array, offset: Offset) -> Array:
     """Like `look`, but zero outside the grid."""
     return np.where(inside(value.shape[-2:], offset), look(value, offset), np.zeros((), value.dtype))
@@ -148,12 +175,7 @@ def _constant(expr: Expr, at: Context) -> Array:
 
 
 def _as_kind(kind: str, value: Any, shape: tuple[int, ...]) -> Array:
-    dtype = {"flag": np.bool_, "real": np.float32, "chance": np.float64, "number": np.float64}.get(
-        kind, np.int64
-    )
-    if kind in ("chance", "number"):
-        value = float(value)
-    return np.broadcast_to(np.asarray(value, dtype), shape)
+    return np.broadcast_to(np.asarray(value, WIDE.get(kind, np.int64)), shape)
 
 
 def _parameter(expr: Expr, at: Context) -> Array:
@@ -166,8 +188,12 @@ def _property(expr: Expr, at: Context) -> Array:
     assert prop is not None
     if prop.stored:
         return at.state[prop.name]
-    ids = at.state["element"]
-    result = np.zeros(at.shape, _as_kind(prop.kind.name, 0, ()).dtype)
+    return _of_elements(prop, at.state["element"], at)
+
+
+def _of_elements(prop: Property, ids: Array, at: Context) -> Array:
+    """What a property is for each of some elements, by id."""
+    result = _as_kind(prop.kind.name, 0, at.shape)
     for identity, value in enumerate(prop.values):
         one = (
             at.params[value][:, None, None] if isinstance(value, str) else _as_kind(prop.kind.name, value, ())
@@ -297,16 +323,12 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
             _become(evaluate(rule.leaving, at), mask, state, at, table)
     for rule in claims:
         if isinstance(rule, (Swap, Move)):
-            back = (-rule.offset[0], -rule.offset[1])
-            mask = masks[id(rule)]
+            mask, source = masks[id(rule)], back(rule.offset)
             for name, slot in table.items():
                 if slot.travels:
-                    arrived = _where(look(mask, back), look(before[name], back), state[name])
-                    state[name] = (
-                        _where(mask, look(before[name], rule.offset), arrived)
-                        if isinstance(rule, Swap)
-                        else arrived
-                    )
+                    state[name] = _where(look(mask, source), look(before[name], source), state[name])
+                    if isinstance(rule, Swap):
+                        state[name] = _where(mask, look(before[name], rule.offset), state[name])
     for write, mask in effects:
         _assign(write, values[id(write)], mask, state, table)
     for name, slot in table.items():
@@ -344,11 +366,7 @@ def _become(target: Array, mask: Array, state: State, at: Context, table: Mappin
         if name == "element":
             fresh = target
         elif (prop := at.ruleset.property(name)) is not None:
-            fresh = np.zeros(at.shape, np.int64)
-            for identity, value in enumerate(prop.values):
-                one: Any = at.params[value][:, None, None] if isinstance(value, str) else value
-                fresh = np.where(target == identity, one, fresh)
-            fresh = fresh.astype(state[name].dtype)
+            fresh = _of_elements(prop, target, at).astype(state[name].dtype)
         else:
             fresh = _default(slot, state[name])
             for identity, value in slot.own:
@@ -359,10 +377,9 @@ def _become(target: Array, mask: Array, state: State, at: Context, table: Mappin
 
 def _assign(write: Assign, value: Array, mask: Array, state: State, table: Mapping[str, Slot]) -> None:
     """`field op value` at the cell `write.offset` away from each cell of the mask; integers are cut off."""
-    back = (-write.offset[0], -write.offset[1])
-    mask, value = look(mask, back), look(value, back)
+    mask, value = look(mask, back(write.offset)), look(value, back(write.offset))
     old = state[write.field]
-    new = {":=": value, "+=": old + value, "-=": old - value}[write.op] if write.op != ":=" else value
+    new = value if write.op == ":=" else old + value if write.op == "+=" else old - value
     kind = table[write.field].kind
     if kind.name == "int":
         new = np.clip(new, int(kind.lo), int(kind.hi))
@@ -375,9 +392,7 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
 
     def claimed(rule: Any, mask: Array) -> Array:
         """The cells that a rule with this mask takes part in."""
-        return (
-            mask | look(mask, (-rule.offset[0], -rule.offset[1])) if isinstance(rule, (Swap, Move)) else mask
-        )
+        return mask | look(mask, back(rule.offset)) if isinstance(rule, (Swap, Move)) else mask
 
     def touches(rule: Any, cells: Array) -> Array:
         """Where a rule would touch one of these cells."""
@@ -386,11 +401,8 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
     taken = np.zeros_like(next(iter(wanted.values()))) if wanted else None
     for rule in claims:
         mask = wanted[id(rule)]
-        if isinstance(
-            rule, (Swap, Move)
-        ):  # pairs of one rule that share a cell have no order: none of them happens
-            back = (-rule.offset[0], -rule.offset[1])
-            mask = mask & ~(look(wanted[id(rule)], rule.offset) | look(wanted[id(rule)], back))
+        if isinstance(rule, (Swap, Move)):  # pairs of one rule that share a cell have no order: none happens
+            mask = mask & ~(look(mask, rule.offset) | look(mask, back(rule.offset)))
         if policy == "drop_both":
             for other in claims:
                 if other is not rule:
@@ -404,15 +416,15 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
 # Steps
 
 
-def settle(state: State, table: Mapping[str, Slot]) -> State:
-    """Real fields within their range, no number that is none, and nothing smaller than SNAP."""
-    settled = dict(state)
+def clamped(state: State, table: Mapping[str, Slot]) -> State:
+    """The state with float fields within their range, and zero for NaN and magnitudes below SNAP."""
+    result = dict(state)
     for name, slot in table.items():
         if slot.is_real:
             value = np.where(np.isnan(state[name]), np.float32(0), state[name])
             value = np.clip(value, np.float32(slot.kind.lo), np.float32(slot.kind.hi))
-            settled[name] = np.where(np.abs(value) < np.float32(SNAP), np.float32(0), value)
-    return settled
+            result[name] = np.where(np.abs(value) < np.float32(SNAP), np.float32(0), value)
+    return result
 
 
 Seen = Callable[[Pass, Moment, Context, State], None]
@@ -422,9 +434,7 @@ Seen = Callable[[Pass, Moment, Context, State], None]
 def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | None = None) -> State:
     """The state after one pass."""
     scratch = scratch_slots(pass_)
-    shape = at.shape
-    for name, slot in scratch.items():
-        at.state = {**at.state, name: _fresh(slot, shape)}
+    at.state = {**at.state, **{name: _fresh(slot, at.shape) for name, slot in scratch.items()}}
     at.lets = {}
     everything = {**table, **scratch}
     for moment in pass_.moments:
@@ -432,24 +442,19 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | N
         if seen is not None:
             seen(pass_, moment, at, after)
         at.state = after
-    return settle({name: value for name, value in at.state.items() if name in table}, table)
+    return clamped({name: value for name, value in at.state.items() if name in table}, table)
 
 
 def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
     batch, height, width = shape
-    dtype = _WIDE.get(slot.kind.name, np.int64)
     whole = (batch, 2, height, width) if slot.planes == 2 else shape
-    return _default(slot, np.empty(whole, dtype)).copy()
-
-
-_WIDE = {"flag": np.bool_, "real": np.float32, "vec2": np.float32}
-_PARAMS = {"int": np.int64, "flag": np.bool_, "real": np.float32, "chance": np.float64}
+    return _default(slot, np.empty(whole, WIDE.get(slot.kind.name, np.int64))).copy()
 
 
 def widened(ruleset: Ruleset, state: Mapping[str, Array]) -> State:
     """The slots of a state in the dtypes that steps compute in."""
     kinds = {slot.name: slot.kind.name for slot in slots(ruleset)}
-    return {name: value.astype(_WIDE.get(kinds[name], np.int64)) for name, value in state.items()}
+    return {name: value.astype(WIDE.get(kinds[name], np.int64)) for name, value in state.items()}
 
 
 def parameters(ruleset: Ruleset, batch: int, given: Mapping[str, Any]) -> dict[str, Array]:
@@ -457,7 +462,7 @@ def parameters(ruleset: Ruleset, batch: int, given: Mapping[str, Any]) -> dict[s
     return {
         param.name: np.broadcast_to(
             np.asarray(given.get(param.name, float(param.default)), np.float64), (batch,)
-        ).astype(_PARAMS[param.kind.name])
+        ).astype(WIDE.get(param.kind.name, np.int64))
         for param in ruleset.params
     }
 

@@ -1,35 +1,29 @@
-"""What a world of a ruleset holds: one slot for the elements, each stored property, and each field."""
+"""What a world of a ruleset holds, a slot for the elements, each stored property, and each field; and its sides."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from powderdsl.model.types import ELEMENT, Field, Kind, Pass, Property, Ruleset
 
 SNAP = 2.0**-20
-"""Real fields are kept to multiples of nothing, but what is smaller than this is zero: motion dies out, and no
-backend ever meets denormal numbers."""
+"""Smaller magnitudes of float fields are flushed to zero: motion dies out, and no backend meets denormal numbers."""
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One array of a world's state.
-
-    `dtype` is the NumPy name of its storage: uint8 for elements, flags and directions, the smallest signed
-    integer type that holds the range of integers, float32 for floats. `planes` is 2 for vec2, else 1.
-    """
+    """One array of a world's state. `travels` says that it moves with the element; `own` are the defaults of single
+    elements, by id."""
 
     name: str
     kind: Kind
     default: Any
     travels: bool
-    resets: bool
-    of: frozenset[int] | None
-    dtype: str
-    planes: int
+    resets: bool = False
+    of: frozenset[int] | None = None
     own: tuple[tuple[int, Any], ...] = ()
-    """Defaults of single elements, by id."""
 
     def fresh(self, identity: int) -> Any:
         """The value of a fresh cell of an element, of a field."""
@@ -39,9 +33,20 @@ class Slot:
     def is_real(self) -> bool:
         return self.kind.name in ("real", "vec2")
 
+    @property
+    def planes(self) -> int:
+        """How many arrays of cells it has: 2 for vec2, else 1."""
+        return 2 if self.kind.name == "vec2" else 1
+
+    @cached_property
+    def dtype(self) -> str:
+        """The NumPy dtype of its storage."""
+        return storage(self.kind)
+
 
 def storage(kind: Kind) -> str:
-    """The NumPy dtype in which values of a kind are stored."""
+    """The NumPy dtype in which values of a kind are stored: the smallest signed integer type that holds a range of
+    integers, float32 for floats, uint8 for elements, flags and directions."""
     if kind.name in ("real", "vec2"):
         return "float32"
     if kind.name != "int":
@@ -50,6 +55,25 @@ def storage(kind: Kind) -> str:
         if -(1 << bits) <= kind.lo and kind.hi < 1 << bits:
             return dtype
     return "int32"
+
+
+def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
+    """All slots of a ruleset's worlds: the element, then stored properties and fields in the order of the ruleset."""
+    found = [Slot("element", ELEMENT, 0, travels=True)]
+    found += [Slot(prop.name, prop.kind, 0, travels=True) for prop in ruleset.properties if prop.stored]
+    found += [
+        Slot(one.name, one.kind, one.default, one.at == "element", one.resets, one.of, one.own)
+        for one in ruleset.fields
+    ]
+    place = {name: number for number, name in enumerate(ruleset.order)}
+    return tuple(sorted(found, key=lambda slot: place.get(slot.name, -1)))
+
+
+def scratch_slots(pass_: Pass) -> dict[str, Slot]:
+    """The slots of a pass's scratch fields by name. They live in the pass and are not stored."""
+    return {
+        one.name: Slot(one.name, one.kind, one.default, travels=False, resets=True) for one in pass_.scratch
+    }
 
 
 def qualified_slots(ruleset: Ruleset) -> dict[str, str]:
@@ -63,36 +87,23 @@ def slot_name(ruleset: Ruleset, name: str) -> str:
     return next((plain for plain, word in qualified_slots(ruleset).items() if word == name), name)
 
 
-def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
-    """All slots of a ruleset's worlds: the element, then stored properties and fields in the order of the ruleset."""
-    found = [Slot("element", ELEMENT, 0, True, False, None, "uint8", 1)]
-    for prop in ruleset.properties:
-        if prop.stored:
-            found.append(Slot(prop.name, prop.kind, 0, True, False, None, storage(prop.kind), 1))
-    for item in ruleset.fields:
-        planes = 2 if item.kind.name == "vec2" else 1
-        found.append(
-            Slot(
-                item.name,
-                item.kind,
-                item.default,
-                item.at == "element",
-                item.resets,
-                item.of,
-                storage(item.kind),
-                planes,
-                item.own,
-            )
-        )
-    place = {name: number for number, name in enumerate(ruleset.order)}
-    return tuple(sorted(found, key=lambda slot: place.get(slot.name, -1)))
+def fits(ruleset: Ruleset, size: tuple[int, ...]) -> bool:
+    """Whether worlds of this many rows and columns may follow these rules."""
+    return all(side % ruleset.side_multiple == 0 for side in size[-2:])
 
 
-def scratch_slots(pass_: Pass) -> dict[str, Slot]:
-    """The slots of a pass's scratch fields by name. They live in the pass and are not stored."""
-    return {
-        item.name: Slot(
-            item.name, item.kind, item.default, False, True, None, "", 2 if item.kind.name == "vec2" else 1
-        )
-        for item in pass_.scratch
-    }
+def size_problem(ruleset: Ruleset, size: tuple[int, ...]) -> str:
+    """What is wrong with a size that does not fit."""
+    sides = f"rows and columns must be a multiple of {ruleset.side_multiple} each"
+    return f"a world of {size[-2]}×{size[-1]} cells: with {ruleset.name}, {sides}"
+
+
+def check_sides(ruleset: Ruleset, size: tuple[int, int]) -> None:
+    """Raises ValueError for a size that does not fit."""
+    if not fits(ruleset, size):
+        raise ValueError(size_problem(ruleset, size))
+
+
+def fitting(ruleset: Ruleset, side: int) -> int:
+    """The smallest side, not smaller than this one, that fits."""
+    return -(-side // ruleset.side_multiple) * ruleset.side_multiple

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from powderdsl.compiler import BACKENDS, current_backend, load, starting_backend
 from powderdsl.diagnostics import suggest
-from powderdsl.model.state import Slot
+from powderdsl.model.state import Slot, check_sides
 from powderdsl.model.types import Ruleset
-from powderdsl.model.world_sides import check_sides
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.programs import find_device, make_program
 from powderdsl.simulation.state_checks import check_ids, checked_integers, checked_reals, looked_up

@@ -13,8 +13,8 @@ from powderdsl.model.check import resolve_names
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import Reader, first_line
+from powderdsl.model.state import fits, size_problem
 from powderdsl.model.types import Expr, Ruleset
-from powderdsl.model.world_sides import fits, size_problem
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.parse import reserved_words as rule_words

@@ -17,7 +17,7 @@ from powderdsl.experiments.bench.measure import measuring
 from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
 from powderdsl.experiments.bench.report import CellFigures, Report, make_report, report_data, report_text
-from powderdsl.model.world_sides import fitting
+from powderdsl.model.state import fitting
 from powderdsl.system.writing import write_text
 from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from powderdsl.analysis.reactions import moved_ids
 from powderdsl.compiler import BACKENDS, current_backend
 from powderdsl.diagnostics import suggest
+from powderdsl.model.state import check_sides
 from powderdsl.model.types import Field, Ruleset
-from powderdsl.model.world_sides import check_sides
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.strewn import check_cells, random_shape
 

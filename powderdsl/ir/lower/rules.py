@@ -23,8 +23,8 @@ from powderdsl.ir.ops import (
     integer,
 )
 from powderdsl.model.logic.satisfy import Budget, Facts, satisfiable
-from powderdsl.model.state import Slot, slots
-from powderdsl.model.types import Assign, Field, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
+from powderdsl.model.state import Slot, scratch_slots, slots
+from powderdsl.model.types import Assign, Kind, Moment, Move, Pass, Ruleset, Swap, Transform
 
 Mover = Transform | Swap | Move
 
@@ -116,9 +116,11 @@ def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> d
     """
     lowering = _PassLowering(ruleset, graph)
     build = lowering.build
-    for item in pass_.scratch:
-        for name in lowering.add_scratch(item):
-            lowering.state[name] = build.input(name, ir_type(item.kind, ruleset.slots))
+    scratch = scratch_slots(pass_)
+    lowering.slots |= scratch
+    for slot in scratch.values():
+        for name in slot_names(slot):
+            lowering.state[name] = build.input(name, ir_type(slot.kind, ruleset.slots))
     for moment in pass_.moments[:number]:
         for let in moment.lets:
             type = REAL if let.value.kind.name == "chance" else ir_type(let.value.kind, ruleset.slots)
@@ -151,21 +153,16 @@ class _PassLowering:
         self.state = {name: self.build.input(name, type) for name, type in types.items()}
         self.lets: dict[str, Node | Pair] = {}
 
-    def add_scratch(self, item: Field) -> tuple[str, ...]:
-        """Makes a slot of a scratch field; its names in the IR."""
-        components = 2 if item.kind.name == "vec2" else 1
-        slot = Slot(item.name, item.kind, item.default, False, True, None, "", components)
-        self.slots[item.name] = slot
-        return slot_names(slot)
-
     def lower(self, pass_: Pass) -> PassGraph:
         build = self.build
         found = dict(self.state)
-        for item in pass_.scratch:
+        scratch = scratch_slots(pass_)
+        self.slots |= scratch
+        for slot in scratch.values():
             # The number nearest to zero: the same in both components of a vector.
-            default = item.default[0] if isinstance(item.default, tuple) else item.default
-            for name in self.add_scratch(item):
-                self.state[name] = build.const(default, ir_type(item.kind, self.ruleset.slots))
+            default = slot.default[0] if isinstance(slot.default, tuple) else slot.default
+            for name in slot_names(slot):
+                self.state[name] = build.const(default, ir_type(slot.kind, self.ruleset.slots))
         substeps = tuple(self.substep(moment) for moment in pass_.moments)
         outputs = []
         for name, before in found.items():

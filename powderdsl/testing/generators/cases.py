@@ -12,9 +12,8 @@ from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.packs import read_file
-from powderdsl.model.state import SNAP, Slot, slots
+from powderdsl.model.state import SNAP, Slot, fitting, slots
 from powderdsl.model.types import Ruleset
-from powderdsl.model.world_sides import fitting
 from powderdsl.testing.generators.choices import Choices
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from powderdsl.analysis.reactions import unchanging_ids
+from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
-from powderdsl.model.world_sides import fitting
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.testing.properties.running import run_sample
 from powderdsl.testing.properties.samples import Array, Sample, State, random_samples
