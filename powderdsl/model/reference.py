@@ -59,14 +59,14 @@ class Clock:
 # Random numbers
 
 
-def mix(x: Array) -> Array:
-    """A 32-bit finaliser (xor-shift-multiply). Input and output: uint64 arrays below 2³²."""
+def mix(x: Array, key: Array | int = 0) -> Array:
+    """A 32-bit finaliser (xor-shift-multiply), with a key before its last round. uint64 arrays, of 32 bits each."""
     mask = np.uint64(0xFFFFFFFF)
     x = x & mask
     x = x ^ (x >> np.uint64(16))
     x = (x * np.uint64(0x7FEB352D)) & mask
     x = x ^ (x >> np.uint64(15))
-    x = (x * np.uint64(0x846CA68B)) & mask
+    x = ((x + key) * np.uint64(0x846CA68B)) & mask
     return x ^ (x >> np.uint64(16))
 
 
@@ -88,18 +88,12 @@ def draw(clock: Clock, stream: int, bits: int, height: int, width: int) -> Array
     """
     key0 = key(clock, stream, 0x243F6A88)[:, None, None]
     key1 = key(clock, stream, 0x85A308D3)[:, None, None]
-    mask = np.uint64(0xFFFFFFFF)
     y, x = np.mgrid[:height, :width].astype(np.uint64)
     word = y * np.uint64(-(-width // 32)) + x // np.uint64(32)
     value = np.zeros((len(clock.seed), height, width), np.float64)
     for j in range(bits):
         n = (word * np.uint64(32) + np.uint64(j)) * np.uint64(0x9E3779B1)
-        h = (n + key0) & mask
-        h = h ^ (h >> np.uint64(16))
-        h = (h * np.uint64(0x7FEB352D)) & mask
-        h = h ^ (h >> np.uint64(15))
-        h = ((h + key1) * np.uint64(0x846CA68B)) & mask
-        h = h ^ (h >> np.uint64(16))
+        h = mix(n + key0, key1)
         value += ((h >> (x % np.uint64(32))) & np.uint64(1)).astype(np.float64) * 2.0 ** (bits - 1 - j)
     return (value + 0.5) / 2.0**bits
 
