@@ -59,7 +59,7 @@ class Clock:
 # Random numbers
 
 
-def mix(x: Array, key: Array | int = 0) -> Array:
+def mix(x: Array, key: Any = 0) -> Array:
     """A 32-bit finaliser (xor-shift-multiply), with a key before its last round. uint64 arrays, of 32 bits each."""
     mask = np.uint64(0xFFFFFFFF)
     x = x & mask
