@@ -55,8 +55,7 @@ def count(rules: str, packs: Sequence[str], jobs: int, worlds: bool = False) -> 
     `worlds`: also look for worlds that show survivors, which takes longer.
     """
     from powderdsl.testing.mutation.original import Original
-    from powderdsl.testing.mutation.run import Outcome, run_campaign
-    from powderdsl.testing.mutation.tally import tally
+    from powderdsl.testing.mutation.run import Outcome, run_campaign, tally
 
     mutants = Original.of(rules).mutants(frozenset(packs))
     left = Counter(mutant.pack for mutant in mutants)

@@ -9,7 +9,7 @@ from powderdsl.moved import find_old_names
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from powderdsl.analysis.ledger.book import ledger
+    from powderdsl.analysis.ledger import ledger
     from powderdsl.compiler import load
     from powderdsl.diagnostics import CompileError
     from powderdsl.simulation.simulator import Simulator, World, compile
@@ -21,7 +21,7 @@ _HOMES = {
     "load": "powderdsl.compiler",
     "compile": "powderdsl.simulation.simulator",
     "CompileError": "powderdsl.diagnostics",
-    "ledger": "powderdsl.analysis.ledger.book",
+    "ledger": "powderdsl.analysis.ledger",
     "Simulator": "powderdsl.simulation.simulator",
     "World": "powderdsl.simulation.simulator",
     "save": "powderdsl.worlds.store",

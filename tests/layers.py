@@ -20,7 +20,6 @@ _WORLDS = ("worlds", "worlds.store")
 _SCREEN = (*_BACK, *_SIMULATION, *_WORLDS)
 _TESTING = (
     "testing.generators",
-    "testing.strategies",
     "testing.pack_tests",
     "testing.properties",
 )
@@ -74,9 +73,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "worlds": (*_FRONT, "analysis", "simulation.draw"),
     "worlds.store": (*_FRONT, "worlds", "simulation.simulator"),  # saved worlds are values of the simulator
     "testing.generators": _SCREEN,
-    "testing.strategies": (*_SCREEN, "testing.generators"),
-    "testing": ("testing.strategies",),  # the public names
-    "testing.pack_tests": _SCREEN,
+    "testing": ("testing.generators",),  # the public names
+    "testing.pack_tests": (*_SCREEN, "testing.generators"),
     "testing.properties": (*_SCREEN, *_TESTING[:-1]),
     "testing.mutation": (*_SCREEN, *_TESTING),
     "testing.pytest_plugin": (*_SCREEN, *_TESTING),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from powderdsl.analysis.ledger.book import Ledger, NotProven, Proven, Verdict
+from powderdsl.analysis.ledger import Ledger, NotProven, Proven, Verdict
 from powderdsl.analysis.reactions import facts_of
 from powderdsl.model.logic.satisfy import satisfiable
 from powderdsl.model.types import (

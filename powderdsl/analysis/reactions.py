@@ -30,18 +30,15 @@ def reactions(ruleset: Ruleset) -> tuple[Reaction, ...]:
     """Every line that turns elements into others, in the order they run."""
     facts = facts_of(ruleset)
     found: dict[Span, Reaction] = {}
-    for pass_ in ruleset.passes:
-        for moment in pass_.moments:
-            lets = {let.name: let.value for let in moment.lets}
-            for rule in moment.rules:
-                if not isinstance(rule, Transform):
-                    continue
+    for pass_, moment in ruleset.substeps():
+        lets = {let.name: let.value for let in moment.lets}
+        for rule in moment.rules:
+            if isinstance(rule, Transform):
                 known = found.get(rule.span)
                 before = set(known.before if known else ()) | _before(rule, facts, lets)
                 after = set(known.after if known else ()) | _after(rule, facts, lets)
-                found[rule.span] = Reaction(
-                    tuple(sorted(before)), tuple(sorted(after)), pass_.name, pass_.pack, rule.span
-                )
+                ids = tuple(sorted(before)), tuple(sorted(after))
+                found[rule.span] = Reaction(*ids, pass_.name, pass_.pack, rule.span)
     return tuple(found.values())
 
 
@@ -57,10 +54,6 @@ def facts_of(ruleset: Ruleset) -> Facts:
     )
 
 
-def _is_one_of(expr: Expr, number: int) -> Expr:
-    return member(expr, (number,))
-
-
 def _before(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
     """The elements that the rule may change; one that becomes itself is not changed."""
     same = rule.target.value if rule.target.op == "const" else None
@@ -70,40 +63,38 @@ def _before(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
 def _after(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
     if rule.target.op == "const":
         return {int(rule.target.value)}
-    conditions = [(rule.mask, HERE)]
     return {
         number
         for number in facts.ids
-        if satisfiable(facts, [*conditions, (_is_one_of(rule.target, number), HERE)], lets)
+        if satisfiable(facts, [(rule.mask, HERE), (member(rule.target, (number,)), HERE)], lets)
     }
 
 
 def _possible(rule: Rule, number: int, at: Offset, facts: Facts, lets: dict[str, Expr]) -> bool:
     """Whether the rule may happen while the cell `at` has this element."""
     assert rule.mask is not None
-    return satisfiable(facts, [(_is_one_of(ELEMENT_HERE, number), at), (rule.mask, HERE)], lets)
+    return satisfiable(facts, [(member(ELEMENT_HERE, (number,)), at), (rule.mask, HERE)], lets)
 
 
 def moved_ids(ruleset: Ruleset) -> frozenset[int]:
     """The elements that some rule may move or push aside."""
     facts = facts_of(ruleset)
     found: set[int] = set()
-    for pass_ in ruleset.passes:
-        for moment in pass_.moments:
-            lets = {let.name: let.value for let in moment.lets}
-            for rule in moment.rules:
-                if not isinstance(rule, (Swap, Move)):
-                    continue
-                for number in facts.ids:
-                    if number not in found and any(
-                        _possible(rule, number, at, facts, lets) for at in (HERE, rule.offset)
-                    ):
-                        found.add(number)
+    for _, moment in ruleset.substeps():
+        lets = {let.name: let.value for let in moment.lets}
+        for rule in moment.rules:
+            if isinstance(rule, (Swap, Move)):
+                found |= {
+                    number
+                    for number in facts.ids
+                    if number not in found
+                    and any(_possible(rule, number, at, facts, lets) for at in (HERE, rule.offset))
+                }
     return frozenset(found)
 
 
 def unchanging_ids(ruleset: Ruleset) -> frozenset[int]:
-    """The elements that no rule moves or turns into anything: what stands, stands permanently."""
+    """The elements that no rule moves or turns into anything: they stay in place permanently."""
     changed = {number for reaction in reactions(ruleset) for number in reaction.before}
     everything = frozenset(element.id for element in ruleset.elements)
     return everything - moved_ids(ruleset) - changed

@@ -25,6 +25,7 @@ class MutationPlan:
     """What is mutated: `packs` alone, up to `mutants`, in `jobs` processes; `write` adds tests to the packs' files."""
 
     packs: tuple[str, ...]
+    settings: dict[str, str]
     mutants: int | None
     seed: int
     jobs: int | None
@@ -50,7 +51,8 @@ def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
     from powderdsl.testing.mutation.run import run_campaign, sampled
 
     began = monotonic()
-    original = Original.of(name)
+    settings = tuple(plan.settings.items())
+    original = Original.of(name, settings)
     loaded = [pack.name.text for pack in original.packs]
     unknown = [pack for pack in plan.packs if pack not in loaded]
     if unknown:
@@ -58,7 +60,8 @@ def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
     mutants = original.mutants(frozenset(plan.packs))
     numbers = sampled(mutants, plan.mutants, plan.seed)
     outcomes: dict[int, Outcome] = {}
-    events = run_campaign(name, plan.packs, numbers, plan.jobs or os.cpu_count() or 1, plan.seed)
+    jobs = plan.jobs or os.cpu_count() or 1
+    events = run_campaign(name, plan.packs, numbers, jobs, plan.seed, settings=settings)
     interrupt: KeyboardInterrupt | None = None
     with progress(name, len(numbers), lines=True) as show:
         try:
@@ -103,7 +106,7 @@ def _tell(
 
 def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
     """The number of mutants, and what noticed them."""
-    from powderdsl.testing.mutation.tally import noticed_share, tally
+    from powderdsl.testing.mutation.run import noticed_share, tally
 
     counts = tally(outcome for _, outcome in found)
     by = ", ".join(f"{counts[key]} by {words}" for key, words in WORDS.items())
@@ -133,7 +136,7 @@ def _write(found: list[tuple[Mutant, Outcome]]) -> None:
 
 
 def _data(found: list[tuple[Mutant, Outcome]]) -> dict[str, Any]:
-    from powderdsl.testing.mutation.tally import tally
+    from powderdsl.testing.mutation.run import tally
 
     packs = dict.fromkeys(mutant.pack for mutant, _ in found)
     return {

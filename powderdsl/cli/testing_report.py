@@ -16,9 +16,8 @@ from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.media import write_png
 from powderdsl.testing.pack_tests.runner import ExampleResult, run_examples
+from powderdsl.testing.properties.blame import difference_of_test
 from powderdsl.testing.properties.breaks import breaks
-from powderdsl.testing.properties.differences import difference_of_test
-from powderdsl.testing.properties.drawn import has_hypothesis, try_drawn
 from powderdsl.testing.properties.keep import file_of, is_kept, kept_examples, read_example, write_example
 from powderdsl.testing.properties.outcomes import (
     Result,
@@ -34,7 +33,9 @@ from powderdsl.testing.properties.search import (
     SearchPlan,
     as_it_is,
     find_property,
+    has_hypothesis,
     told_apart,
+    try_drawn,
 )
 
 

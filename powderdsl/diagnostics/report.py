@@ -11,7 +11,7 @@ from powderdsl.diagnostics.render import render_text
 from powderdsl.diagnostics.span import Span
 
 MAX_ERRORS = 200
-"""A file with more mistakes than this is reported up to here: nobody reads further."""
+"""A file with more mistakes than this is reported up to here: more would not be read."""
 
 
 MAX_CANDIDATES = 500
@@ -88,7 +88,7 @@ class Reporter:
 
 def suggest(word: str, candidates: Iterable[str], kind: str = "") -> tuple[str, ...]:
     """Help lines for an unknown word: the close match, or the whole list when it is short."""
-    word = str(word)  # whoever calls the Python API may have given anything
+    word = str(word)  # callers of the Python API may pass anything
     known = sorted(set(candidates) - {word})
     if len(known) > MAX_CANDIDATES:
         known = [name for name in known if name[:1] == word[:1]][:MAX_CANDIDATES]

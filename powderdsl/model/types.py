@@ -452,6 +452,12 @@ class Ruleset:
     def field(self, name: str) -> Field | None:
         return next((f for f in self.fields if f.name == name), None)
 
+    def substeps(self) -> Iterator[tuple[Pass, Moment]]:
+        """Every substep with its pass, in the order in which they run."""
+        for pass_ in self.passes:
+            for moment in pass_.moments:
+                yield pass_, moment
+
     def with_params(self, values: dict[str, Value]) -> Ruleset:
         """The same ruleset with other defaults; the values are checked by `compiler.set_params`."""
         params = tuple(replace(p, default=values.get(p.name, p.default)) for p in self.params)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from powderdsl.testing.strategies import rulesets, worlds
+    from powderdsl.testing.generators.strategies import rulesets, worlds
 
 __all__ = ["rulesets", "worlds"]
 
@@ -19,4 +19,4 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'powderdsl.testing' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module("powderdsl.testing.strategies"), name)
+    return getattr(import_module("powderdsl.testing.generators.strategies"), name)

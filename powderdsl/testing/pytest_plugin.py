@@ -36,7 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> PackFile | None:
-    """YAML files that start as packs and rulesets do. Others are nobody's business."""
+    """YAML files that start as packs and rulesets do. Other files are ignored."""
     if file_path.suffix not in (".yaml", ".yml"):
         return None
     try:

@@ -95,7 +95,15 @@ def test_options_of_mutations_need_them(folder, arguments):
     assert "--mutate" in result.stderr
 
 
-def test_mutations_take_no_settings(folder):
-    result = mutate("core+water", "--set", "water.melt=5%")
+def test_mutants_run_with_other_parameters(folder):
+    text = PACK.replace("passes:", "params: {speed: 50%}\npasses:").replace(
+        "is wet  #", "is wet with chance speed  #"
+    )
+    sure = "  - it spreads for sure:\n      given: w .\n      after: 1 step\n      expect: w w\n"
+    (folder / "spread.yaml").write_text(text.replace("# the end", sure))
+    usual = json.loads(mutate("spread.yaml", "--json").stdout)["spread.yaml"]
+    set_ = json.loads(mutate("spread.yaml", "--json", "--set", "spread.speed=100%").stdout)["spread.yaml"]
+    assert set_["test"] > usual["test"], "by chance, the second test fails without any mistake"
+    result = mutate("spread.yaml", "--set", "spread.nothing=1")
     assert result.exit_code == 2
-    assert "--set" in result.stderr
+    assert "PD309" in result.stderr

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from powderdsl.model.declarations import PackDecl
-from powderdsl.testing.strategies import chosen
+from powderdsl.testing.generators.strategies import chosen
 from tests.fuzz import damage
 from tests.fuzz.damage import (
     KINDS,

@@ -25,7 +25,7 @@ import pytest
 from PIL import Image
 
 import powderdsl
-from powderdsl.analysis.ledger.book import ledger
+from powderdsl.analysis.ledger import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity

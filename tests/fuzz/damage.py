@@ -120,13 +120,13 @@ def damaged_random_rules(choices: Choices) -> str:
 
 
 def _damaged(choices: Choices, parts: list[str]) -> str:
-    for _ in range(choices.whole(1, 4)):
+    for _ in range(choices.integer(1, 4)):
         place = choices.below(max(len(parts), 1))
         match choices.pick(("delete", "repeat", "swap", "word", "character", "indent")):
             case "delete":
-                del parts[place : place + choices.whole(1, 3)]
+                del parts[place : place + choices.integer(1, 3)]
             case "repeat":
-                parts[place:place] = parts[place : place + 1] * choices.whole(1, 3)
+                parts[place:place] = parts[place : place + 1] * choices.integer(1, 3)
             case "swap" if len(parts) > 1:
                 other = choices.below(len(parts))
                 parts[place], parts[other] = parts[other], parts[place]
@@ -135,7 +135,7 @@ def _damaged(choices: Choices, parts: list[str]) -> str:
             case "character":
                 parts.insert(place, _character(choices))
             case "indent":
-                parts.insert(place, " " * choices.whole(1, 3))
+                parts.insert(place, " " * choices.integer(1, 3))
     return "".join(parts)
 
 

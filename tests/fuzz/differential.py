@@ -76,13 +76,13 @@ def seeded_starts(ruleset: Ruleset, seed: int, worlds: int) -> Iterator[Start]:
     """The start worlds of a seed: all but one of them tiny, one wide; now and then more than a register holds."""
     choices = Choices.seeded(seed * 2 + 1)
     batch = max(1, worlds - 1)
-    yield random_start(ruleset, choices, (batch, choices.whole(1, 5), choices.whole(1, 5)))
+    yield random_start(ruleset, choices, (batch, choices.integer(1, 5), choices.integer(1, 5)))
     if worlds > 1:
-        sides = [choices.whole(1, 3), choices.pick(WIDTHS)]
+        sides = [choices.integer(1, 3), choices.pick(WIDTHS)]
         yield random_start(ruleset, choices, (1, *(sides if choices.maybe(80) else sides[::-1])))
     if seed % 8 == 0:
         yield random_start(
-            ruleset, choices, (MANY + choices.below(MANY), choices.whole(1, 3), choices.whole(1, 9))
+            ruleset, choices, (MANY + choices.below(MANY), choices.integer(1, 3), choices.integer(1, 9))
         )
 
 

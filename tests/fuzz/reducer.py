@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 
-import numpy as np
-
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_text
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.generators.rulemaker import write_yaml
-from powderdsl.testing.generators.vocabulary import Tree
-from powderdsl.testing.generators.written_arrays import to_tree
+from powderdsl.testing.generators.trees import Tree, to_tree, write_yaml
+from powderdsl.testing.properties.shrink import smallest
 from tests.fuzz.cases import Case
 
 PLAIN = ("yes", "no", "0", "1", "here", "0.5")
@@ -79,13 +76,9 @@ def _with_text(case: Case, fails: Callable[[Case], bool]) -> Case:
 
 def reduce_start(start: Start, fails: Callable[[Start], bool]) -> Start:
     """The smallest start worlds found that still fail: one world, fewer rows and columns, fewer fields."""
-    while True:
-        for smaller in _smaller_starts(start):
-            if fails(smaller):
-                start = smaller
-                break
-        else:
-            return start
+    small = smallest(start, lambda starts: next(filter(fails, starts), None))
+    plain = Start.fresh(small.ids, 0, int(small.step[0]), small.fields, small.params)
+    return plain if small.seed.any() and fails(plain) else small
 
 
 def _smaller_trees(tree: Tree) -> Iterator[Tree]:
@@ -156,35 +149,3 @@ def _nodes(syntax: Syntax) -> Iterator[Syntax]:
     yield syntax
     for child in syntax.children:
         yield from _nodes(child)
-
-
-def _smaller_starts(start: Start) -> Iterator[Start]:
-    batch, height, width = start.ids.shape
-    for i in range(batch) if batch > 1 else ():
-        yield _cut(start, np.s_[i : i + 1, :, :], i)
-    for axis, size in ((1, height), (2, width)):
-        for keep in (
-            (slice(size // 2), slice(size // 2, None), slice(size - 1), slice(1, None)) if size > 1 else ()
-        ):
-            yield _cut(start, np.s_[:, keep, :] if axis == 1 else np.s_[:, :, keep], None)
-    for name in start.fields:
-        yield replace(start, fields={k: v for k, v in start.fields.items() if k != name})
-    if start.params:
-        yield replace(start, params={})
-    if start.seed:
-        yield replace(start, seed=0)
-    if start.step:
-        yield replace(start, step=0)
-    if start.ids.max() > start.ids.min():
-        yield replace(start, ids=np.where(start.ids == start.ids.max(), start.ids.min(), start.ids))
-
-
-def _cut(start: Start, where: tuple[slice, slice, slice], world: int | None) -> Start:
-    fields = {
-        name: values[where[0], :, where[1], where[2]] if values.ndim == 4 else values[where]
-        for name, values in start.fields.items()
-    }
-    params = (
-        start.params if world is None else {name: [values[world]] for name, values in start.params.items()}
-    )
-    return replace(start, ids=start.ids[where], fields=fields, params=params)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from powderdsl.analysis.ledger.book import Ledger, RuleEntry
-from powderdsl.analysis.ledger.changes import RuleLine, footprint, rule_line
-from powderdsl.analysis.ledger.overlaps import order_matters
+from powderdsl.analysis.changes import RuleLine, footprint, rule_line
+from powderdsl.analysis.ledger import Ledger, RuleEntry
+from powderdsl.analysis.overlaps import order_matters
 from powderdsl.model import reference
 from powderdsl.model.types import ELEMENT, Assign, Moment, Move, Pass, Ruleset, Swap, Transform
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 import powderdsl
-from powderdsl.analysis.ledger.book import ledger
+from powderdsl.analysis.ledger import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.model.text import one_line

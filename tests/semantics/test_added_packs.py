@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 import powderdsl as library
-from powderdsl.analysis.ledger.book import ledger
+from powderdsl.analysis.ledger import ledger
 from powderdsl.diagnostics import Severity
 from powderdsl.model.restrict import restricted
 from powderdsl.model.text import place_of
+from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.outcomes import Result
 from powderdsl.testing.properties.refute import refuted
 from powderdsl.testing.properties.running import Runner
-from powderdsl.testing.properties.samples import single
 from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 from tests.cli.commands import ROOT, powderdsl
 
@@ -256,7 +256,7 @@ def test_of_two_added_packs_the_one_that_matters_is_named() -> None:
 def tried(ruleset: library.Ruleset, cells: list[list[int]]) -> list[Result]:
     """What comes of a world of these elements with many seeds."""
     search = InvariantSearch.of(Runner(ruleset, "reference"), SearchPlan(0), declared_only=True)
-    search.try_sample(replace(single(cells).repeated(512), seeds=np.arange(512)), 3)
+    search.try_sample(replace(Start.fresh(cells).repeated(512), seed=np.arange(512)), 3)
     return search.finish()
 
 

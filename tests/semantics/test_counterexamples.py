@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.analysis.ledger.book import ledger
+from powderdsl.analysis.ledger import ledger
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.properties.refute import refuted
 

@@ -27,7 +27,7 @@ from powderdsl.targets.cpp.build import Building
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from powderdsl.testing.strategies import rulesets, worlds
+from powderdsl.testing.generators.strategies import rulesets, worlds
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
 from tests.fuzz.compare import assert_same, find_difference

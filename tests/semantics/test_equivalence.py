@@ -8,9 +8,8 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.mutation.equivalence import proven_equal
-from powderdsl.testing.mutation.judging import differing
 from powderdsl.testing.mutation.original import Invalid, Original, meaning
-from powderdsl.testing.properties.running import run_sample
+from powderdsl.testing.properties.running import first_difference, run_sample
 
 HEAD = """\
 pack: two
@@ -138,7 +137,7 @@ def claimed(rules: str, most: int):
         if meaning(ruleset) != original.meaning and proven_equal(original.ruleset, ruleset):
             sim = compile(ruleset, backend="arrays")
             wrong = any(
-                differing(batch.states, run_sample(sim, batch.sample, batch.steps)[0]).any()
+                first_difference(batch.states, run_sample(sim, batch.sample, batch.steps)[0]).any()
                 for batch in original.batches()
             )
             yield mutant, wrong

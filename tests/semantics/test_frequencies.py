@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.generators.cases import Start, load_text
 from powderdsl.testing.properties.breaks import Alike, breaks
 from powderdsl.testing.properties.running import Runner
-from powderdsl.testing.properties.samples import Sample, single
 from powderdsl.testing.properties.search import COPIES, InvariantSearch, SearchPlan
 from tests.compilers import skip_without_compiler
 from tests.fuzz import TARGETS
@@ -56,7 +55,7 @@ def test_a_coin_that_prefers_a_side_is_noticed(backend: str) -> None:
 @pytest.mark.parametrize(("left", "differs"), [("50%", False), ("49%", False), ("35%", True)])
 def test_backends_see_the_same_frequencies(left: str, differs: bool) -> None:
     """The worlds are the same bit for bit, so the verdict on each cell is; one in a hundred is too little to tell."""
-    start: Sample = single([[0, 0, 1, 0, 0], [0, 1, 0, 0, 0]], seed=3)
+    start: Start = Start.fresh([[0, 0, 1, 0, 0], [0, 1, 0, 0, 0]], seed=3)
     found = []
     for backend in ("reference", "torch", "arrays"):
         verdict = breaks(Alike("mirrored", COPIES), Runner(drift(left), backend), start, 1)

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from powderdsl.testing.mutation.tally import COUNTED, by_hand_share, noticed_share
+from powderdsl.testing.mutation.run import COUNTED, by_hand_share, noticed_share
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 

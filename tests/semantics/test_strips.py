@@ -50,7 +50,7 @@ def test_random_rulesets_in_strips(tmp_path: Path) -> None:
             simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("torch", "native")]
         choices = Choices.seeded(seed)
         for height in (8, 16):
-            shape = (choices.whole(1, 4), height, choices.pick((1, 5, 33, 64, 70, 130)))
+            shape = (choices.integer(1, 4), height, choices.pick((1, 5, 33, 64, 70, 130)))
             assert_same(ruleset, random_start(ruleset, choices, shape), steps=3, simulators=simulators)
         compared += 1
     assert compared >= 4

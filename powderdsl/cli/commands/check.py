@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.analysis.ledger.account import ledger_data, ledger_text
-from powderdsl.analysis.ledger.book import Ledger
-from powderdsl.analysis.ledger.book import ledger as make_ledger
+from powderdsl.analysis.account import ledger_data, ledger_text
+from powderdsl.analysis.ledger import Ledger
+from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
 from powderdsl.cli.output import counted, print_json, table, write_diagnostics

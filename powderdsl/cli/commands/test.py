@@ -73,14 +73,14 @@ def command(
     Exit code: 0 if all holds, 1 if something fails, 2 for bad rules.
     """
     only_mutate = {"--pack": packs, "--mutants": mutants, "--write": write, "--jobs": jobs}
-    never_mutate = {"--set": settings, "--replay": replay, "--picture": picture}
+    never_mutate = {"--replay": replay, "--picture": picture}
     for option, value in (never_mutate if mutate else only_mutate).items():
         if value:
             raise BadInput(f"{option} goes {'without' if mutate else 'with'} --mutate")
     if mutate:
         from powderdsl.cli.mutation_report import MutationPlan, report_mutants
 
-        chosen = MutationPlan(packs, mutants, seed, jobs, write, as_json)
+        chosen = MutationPlan(packs, settings, mutants, seed, jobs, write, as_json)
         return report_mutants(rules or tuple(shipped_tests()), chosen)
     if picture is not None:
         if picture.suffix.lower() != ".png":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +13,13 @@ from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.packs import read_file
 from powderdsl.model.state import SNAP, Slot, fitting, slots
-from powderdsl.model.types import Ruleset
+from powderdsl.model.types import Kind, Property, Ruleset
 from powderdsl.testing.generators.choices import Choices
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
+
+Array = np.ndarray[Any, Any]
 
 SIDES = (1, 2, 3, 4, 5, 7, 9, 16, 31, 32, 33, 63, 64, 65, 97)
 """Lengths of sides: tiny ones, where neighbors coincide, and the borders of words of 32 and 64 columns."""
@@ -26,7 +28,7 @@ CLOCKS = (0, 0, 0, 1, 6, 1 << 20, (1 << 32) - 1, 1 << 40)
 """Steps at which worlds start: the clock runs on beyond 32 bits."""
 
 FEW_CELLS = 12
-"""Worlds of so few cells are chosen cell by cell, so that Hypothesis can shrink them; others are filled by a seed."""
+"""Worlds of at most this many cells are chosen cell by cell, so that Hypothesis can shrink them; others are filled by a seed."""
 
 
 def load_text(text: str, name: str = "random.yaml") -> Ruleset:
@@ -35,39 +37,128 @@ def load_text(text: str, name: str = "random.yaml") -> Ruleset:
     pack = read_file(Source(name, text), reporter)
     reporter.raise_if_errors()
     if not isinstance(pack, PackDecl):
-        raise ValueError("the text is no pack")
+        raise ValueError("the text is not a pack")
     return check([pack], None, reporter)
 
 
 @dataclass(frozen=True)
 class Start:
-    """A batch of start worlds, free of any backend.
+    """A batch of start worlds of one shape, free of any backend. Slots that `fields` lacks are fresh.
 
-    `ids` is uint8 [B, H, W]; `fields` are arrays by slot name, [B, H, W] or [B, 2, H, W]; `params` are values for
-    all of a ruleset's parameters, one a world, or none; `step` is what the clock says.
+    `ids` is uint8 [B, H, W]. `seed`, `index` and `step`, int64 [B], are what random numbers depend on, as those of a
+    `World`. `fields` are arrays by slot name, [B, H, W] or [B, 2, H, W]; `params` are float64 [B] by name, for all of
+    a ruleset's parameters or none.
     """
 
-    ids: np.ndarray
-    fields: dict[str, np.ndarray] = field(default_factory=dict)
-    seed: int = 0
-    params: dict[str, list[float]] = field(default_factory=dict)
-    step: int = 0
+    ids: Array
+    seed: Array
+    index: Array
+    step: Array
+    fields: Mapping[str, Array] = field(default_factory=dict)
+    params: Mapping[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def fresh(
+        cls,
+        ids: Any,
+        seed: int = 0,
+        step: int = 0,
+        fields: Mapping[str, Array] | None = None,
+        params: Mapping[str, Array] | None = None,
+    ) -> Start:
+        """Worlds [B, H, W], or one world [H, W], that share a seed: each has an index of its own."""
+        grid = np.asarray(ids, np.uint8)
+        grid = grid[None] if grid.ndim == 2 else grid
+        batch = len(grid)
+        seeds, steps = np.full(batch, seed, np.int64), np.full(batch, step, np.int64)
+        return cls(grid, seeds, np.arange(batch, dtype=np.int64), steps, fields or {}, params or {})
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.ids.shape[1], self.ids.shape[2]
+
+    def select(self, worlds: Any) -> Start:
+        """Some worlds of the batch, by anything that indexes an array."""
+        return Start(
+            self.ids[worlds],
+            self.seed[worlds],
+            self.index[worlds],
+            self.step[worlds],
+            {name: values[worlds] for name, values in self.fields.items()},
+            {name: values[worlds] for name, values in self.params.items()},
+        )
+
+    def one(self, world: int) -> Start:
+        return self.select(slice(world, world + 1))
+
+    def repeated(self, count: int) -> Start:
+        """One world, many times over."""
+        return self.select(np.zeros(count, np.int64))
+
+    def seeded(self) -> Start:
+        """The same worlds with a seed of their own each, counting up, instead of an index."""
+        return replace(self, seed=self.seed + self.index, index=np.zeros_like(self.index))
+
+    def without(self, gone: frozenset[int], ruleset: Ruleset) -> Start:
+        """The same worlds with the first other element where one of these is, in cells and in fields."""
+        if not gone:
+            return self
+        other = min(element.id for element in ruleset.elements if element.id not in gone)
+        names = {slot.name for slot in slots(ruleset) if slot.kind.name == "element"}
+
+        def kept(values: Array) -> Array:
+            return np.where(np.isin(values, sorted(gone)), values.dtype.type(other), values)
+
+        fields = {name: kept(values) if name in names else values for name, values in self.fields.items()}
+        return replace(self, ids=kept(self.ids), fields=fields)
 
     def world(self, simulator: Simulator) -> World:
         """The same worlds for any simulator of the ruleset."""
-        world = simulator.world(self.ids.astype(np.int64), seed=self.seed)
-        world = replace(world, step=world.step + self.step)
+        world = simulator.world(self.ids, self.seed, index=self.index)
+        world = replace(world, step=world.step.new_tensor(self.step))
         return simulator.replace(world, **self.fields) if self.fields else world
 
     def __str__(self) -> str:
-        shape = "×".join(map(str, self.ids.shape))
-        told = [
-            f"worlds {shape}, seed {self.seed}, step {self.step}, ids {self.ids.tolist() if self.ids.size <= 80 else '…'}"
-        ]
-        told += [
-            f"{name} {values.tolist() if values.size <= 160 else '…'}" for name, values in self.fields.items()
-        ]
-        return "\n".join([*told, *(f"{name} = {values}" for name, values in self.params.items())])
+        parts = {"ids": self.ids, **self.fields, "seed": self.seed, "index": self.index, "step": self.step, **self.params}  # fmt: skip
+        shown = (f"{name} {values.tolist() if values.size <= 160 else '…'}" for name, values in parts.items())
+        return "\n".join([f"worlds {'×'.join(map(str, self.ids.shape))}", *shown])
+
+
+def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
+    """A slot's values in fresh cells of these elements."""
+    prop = ruleset.property(slot.name)
+    if prop is not None:
+        return property_table(ruleset, prop, slot.dtype)[ids]
+    values = np.array([slot.fresh(identity) for identity in range(256)], slot.dtype)[ids]
+    return np.moveaxis(values, -1, 1) if slot.planes == 2 else values
+
+
+def property_table(ruleset: Ruleset, prop: Property, dtype: str = "float64") -> Array:
+    """The values [256] of a property by element id, with the parameters' defaults."""
+    defaults = {param.name: param.default for param in ruleset.params}
+    table = np.zeros(256, dtype)
+    table[: len(prop.values)] = [defaults[v] if isinstance(v, str) else v for v in prop.values]
+    return table
+
+
+def holding(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
+    """bool, as `ids`: the cells whose element may hold a value of its own in a slot."""
+    prop = ruleset.property(slot.name)
+    holders = slot.of if prop is None else prop.stored
+    return np.ones(ids.shape, bool) if holders is None else np.isin(ids, sorted(holders))
+
+
+def clamped_to_holders(ruleset: Ruleset, slot: Slot, values: Array, ids: Array) -> Array:
+    """A slot's values, with those of fresh cells where the element cannot hold one of its own."""
+    may = holding(ruleset, slot, ids)
+    if may.all():
+        return values
+    kept = np.where(may[:, None] if slot.planes == 2 else may, values, fresh(ruleset, slot, ids))
+    return kept.astype(slot.dtype)
 
 
 def random_start(
@@ -79,7 +170,7 @@ def random_start(
 ) -> Start:
     """Random worlds: any shape up to the bounds, any ids, and any values that the ruleset's fields can hold."""
     if shape is None:
-        shape = (choices.whole(1, max_batch), *_sides(choices, max_side))
+        shape = (choices.integer(1, max_batch), *_sides(choices, max_side))
     palette = [e.id for e in ruleset.elements]
     palette = choices.some(palette, 1, len(palette)) if choices.maybe(40) else palette
     shape = (shape[0], *(fitting(ruleset, side) for side in shape[1:]))
@@ -89,12 +180,13 @@ def random_start(
     for slot in slots(ruleset)[1:]:
         if not choices.maybe(15):  # else it stays fresh
             fields[slot.name] = _values(ruleset, slot, ids, fill)
-    params = (
-        {p.name: [_param(p.kind, choices) for _ in range(shape[0])] for p in ruleset.params}
-        if choices.maybe(25)
-        else {}
-    )
-    return Start(ids, fields, choices.below(1 << 31), params, choices.pick(CLOCKS))
+    params = {}
+    if choices.maybe(25):
+        params = {
+            p.name: np.array([_param(p.kind, choices) for _ in range(shape[0])], float)
+            for p in ruleset.params
+        }
+    return Start.fresh(ids, choices.below(1 << 31), choices.pick(CLOCKS), fields, params)
 
 
 def _sides(choices: Choices, max_side: int) -> tuple[int, int]:
@@ -114,7 +206,7 @@ class _Fill:
         )
 
     def choose(self, options: Sequence[Any], planes: int = 1) -> np.ndarray:
-        """An array of the shape (with an axis of planes, if there are two) whose cells are options."""
+        """An array of the shape (with an axis of components, if there are two) whose cells are options."""
         shape = self.shape if planes == 1 else (self.shape[0], planes, *self.shape[1:])
         if self.generator is not None:
             return np.asarray(options)[self.generator.integers(0, len(options), shape)]
@@ -125,31 +217,18 @@ class _Fill:
 def _values(ruleset: Ruleset, slot: Slot, ids: np.ndarray, fill: _Fill) -> np.ndarray:
     """Values for a slot: extremes are frequent; where the element cannot hold one, its usual value."""
     kind, choices = slot.kind, fill.choices
-    prop = ruleset.property(slot.name)
     if slot.is_real:
         values = fill.choose(_reals(kind.lo, kind.hi, choices), slot.planes).astype(np.float32)
     else:
         lo, hi = {"flag": (0, 1), "direction": (0, 7)}.get(kind.name, (int(kind.lo), int(kind.hi)))
-        options = [e.id for e in ruleset.elements] if kind.name == "element" else _wholes(lo, hi, choices)
+        options = [e.id for e in ruleset.elements] if kind.name == "element" else _integers(lo, hi, choices)
         values = fill.choose(options).astype(slot.dtype)
-    limited = prop.stored if prop is not None else slot.of
-    if limited is None:
-        return values
-    holders = np.isin(ids, sorted(limited))
-    if prop is not None:
-        defaults = {p.name: p.default for p in ruleset.params}
-        table = np.zeros(256, values.dtype)
-        table[: len(prop.values)] = [defaults[v] if isinstance(v, str) else v for v in prop.values]
-        return np.where(holders, values, table[ids])
-    if slot.planes == 2:
-        usual = np.asarray(slot.default, np.float32)[None, :, None, None]
-        return np.where(holders[:, None], values, usual)
-    return np.where(holders, values, np.asarray(slot.default, values.dtype))
+    return clamped_to_holders(ruleset, slot, values, ids)
 
 
-def _wholes(lo: int, hi: int, choices: Choices) -> list[int]:
+def _integers(lo: int, hi: int, choices: Choices) -> list[int]:
     near = {min(max(v, lo), hi) for v in (0, 1, -1, 2, lo, hi, lo + 1, hi - 1)}
-    return sorted(sorted({*near, *(choices.whole(lo, hi) for _ in range(3))}), key=abs)
+    return sorted(sorted({*near, *(choices.integer(lo, hi) for _ in range(3))}), key=abs)
 
 
 def _reals(lo: float, hi: float, choices: Choices) -> list[float]:
@@ -159,12 +238,12 @@ def _reals(lo: float, hi: float, choices: Choices) -> list[float]:
     return [value for value in wanted if lo <= value <= hi]
 
 
-def _param(kind: Any, choices: Choices) -> float:
+def _param(kind: Kind, choices: Choices) -> float:
     match kind.name:
         case "flag":
             return choices.below(2)
         case "int":
-            return choices.pick([int(kind.lo), int(kind.hi), choices.whole(int(kind.lo), int(kind.hi))])
+            return choices.pick([int(kind.lo), int(kind.hi), choices.integer(int(kind.lo), int(kind.hi))])
         case "chance":
             return choices.pick([0.5, 0.0, 1.0, 2.0**-16, 0.3])
     return choices.pick(

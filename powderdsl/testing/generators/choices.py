@@ -1,4 +1,4 @@
-"""Where random rulesets and worlds take their decisions from: a seed, or Hypothesis, which can shrink them."""
+"""Decisions behind random rulesets and worlds: from a seed, or from Hypothesis, which can shrink them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 class Choices:
-    """Decisions, all made of one: `below(n)`, a whole number of 0..n-1. Plain options stand first, at 0."""
+    """Decisions, all made of one: `below(n)`, an integer of 0..n-1. Plain options stand first, at 0."""
 
     def __init__(self, below: Callable[[int], int]):
         self.below = below
@@ -23,18 +23,18 @@ class Choices:
     def pick(self, options: Sequence[T]) -> T:
         return options[self.below(len(options))]
 
-    def whole(self, lo: int, hi: int) -> int:
-        """A whole number of lo..hi."""
+    def integer(self, lo: int, hi: int) -> int:
+        """An integer of lo..hi."""
         return lo + self.below(hi - lo + 1)
 
     def maybe(self, percent: int) -> bool:
-        """True in so many cases of a hundred; False is the plain one."""
+        """True in `percent` cases of a hundred; False is the plain option."""
         return self.below(100) >= 100 - percent
 
     def some(self, options: Sequence[T], least: int, most: int) -> list[T]:
-        """So many different ones, in the order of the options."""
+        """From `least` to `most` different options, in their order."""
         most = min(most, len(options))
-        wanted = self.whole(min(least, most), most)
+        wanted = self.integer(min(least, most), most)
         kept: list[T] = []
         for i, option in enumerate(options):
             left = len(options) - i

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from powderdsl.model.types import DIRECTION, ELEMENT, FLAG, VEC2, Kind
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.phrases import Phrases
-from powderdsl.testing.generators.vocabulary import Manner, Tree, Words, declare, some_range
+from powderdsl.testing.generators.trees import Tree, write_yaml
+from powderdsl.testing.generators.vocabulary import Manner, Words, declare, some_range
 
 MOVER_PLACES = (
     "below",
@@ -23,7 +24,7 @@ MOVER_PLACES = (
 """Where swaps and moves may go: never here."""
 
 MAX_ROUNDS = 8
-"""How often a moment may be unrolled: the oracle is slow."""
+"""How often a substep may be unrolled: the oracle is slow."""
 
 
 def random_ruleset_text(seed: int, manner: Manner | None = None) -> str:
@@ -40,31 +41,6 @@ def ruleset_text(choices: Choices, manner: Manner) -> str:
     return write_yaml({"pack": "random", **sections, "passes": passes})
 
 
-def write_yaml(tree: Tree, indent: str = "") -> str:
-    """Block-style YAML of nested mappings, lists and texts."""
-    if isinstance(tree, str):
-        plain = (
-            tree
-            and tree[0] not in "#-%?@`\"'[]{}&*!|>,:"
-            and ": " not in tree
-            and " #" not in tree
-            and not tree.endswith(":")
-        )
-        return (
-            f" {tree}\n" if plain or (len(tree) > 1 and tree[0] == "-" and tree[1] != " ") else f" '{tree}'\n"
-        )
-    lines = []
-    pairs = (
-        [(f"{key}:", value) for key, value in tree.items()]
-        if isinstance(tree, dict)
-        else [("-", value) for value in tree]
-    )
-    for head, value in pairs:
-        body = write_yaml(value, indent + "  ")
-        lines.append(f"{indent}{head}" + (body if isinstance(value, str) else "\n" + body))
-    return "".join(lines) if lines else f"{indent}{{}}\n"
-
-
 @dataclass
 class PassMaker:
     """Makes the blocks and rules of one pass."""
@@ -75,18 +51,19 @@ class PassMaker:
     number: int
     names: int = 0
     taken: dict[bool, set[str]] = field(default_factory=dict)
-    """Fields that this moment's assignments (False) and effects (True) set already: a second `:=` could clash."""
+    """Fields that this substep's assignments (False) and effects (True) set already: a second `:=` could clash."""
     proven: bool = True
-    """Whether this moment has no policy, so that it must be free of conflicts."""
+    """Whether this substep has no policy, so that it must be free of conflicts."""
     steady: bool = False
-    """Whether it has a symmetry as well, so that a `:=` must not hang on the orientation."""
+    """Whether it has a symmetry as well, so that a `:=` must not depend on the orientation."""
 
     def tree(self, earlier: list[str]) -> Tree:
         """The pass as YAML."""
         tree: dict[str, Tree] = {}
         if earlier and self.choices.maybe(30):
             order = self.choices.pick(["after", "after", "before"])
-            tree[order] = self.choices.pick([earlier[-1], [earlier[0], "nowhere?"]])
+            options: list[Tree] = [earlier[-1], [earlier[0], "nowhere?"]]
+            tree[order] = self.choices.pick(options)
         scratch = {
             self._name("x"): self._scratch_kind()
             for _ in range(self.choices.weighted([(4, 0), (2, 1), (1, 2)]))
@@ -134,17 +111,17 @@ class PassMaker:
         if depth > 0 and choices.maybe(20):
             body: Tree = [
                 self.block(inner, depth - 1, rounds_inside, policy, symmetric)
-                for _ in range(choices.whole(1, 2))
+                for _ in range(choices.integer(1, 2))
             ]
         else:
-            rules = self.moment(inner, policy, symmetric)
+            rules = self.substep(inner, policy, symmetric)
             body = rules[0] if len(rules) == 1 and choices.maybe(50) else [*rules]
         tree[header] = body
         if depth > 0 and choices.maybe(25):
             if choices.maybe(50):
                 tree["then"] = [self.block(phrases, depth - 1, rounds, policy, symmetric)]
             else:
-                tree["then"] = [*self.moment(phrases, policy, symmetric)]
+                tree["then"] = [*self.substep(phrases, policy, symmetric)]
         return tree
 
     def _header(self, phrases: Phrases, rounds: int) -> tuple[str, Phrases, int]:
@@ -152,7 +129,7 @@ class PassMaker:
         choices = self.choices
         form = choices.weighted([(6, "do"), (4, "for"), (1, "repeat")])
         if form == "repeat" and rounds >= 3:
-            times = choices.whole(1, 3)
+            times = choices.integer(1, 3)
             return f"repeat {times}", phrases, rounds // times
         if form != "for" or rounds < 4:
             return "do", phrases, rounds
@@ -172,25 +149,22 @@ class PassMaker:
         return self.choices.weighted(kinds)
 
     def _let(self, phrases: Phrases, kind: Kind) -> str:
-        """A value of exactly this kind; whole numbers are held in their range."""
+        """A value of exactly this kind; integers are clamped to their range."""
         if kind.name == "int":
-            return f"clamp({phrases.whole(2).text}, {kind.lo:g}, {kind.hi:g})"
+            return phrases.integer(2).clamped(kind.lo, kind.hi).text
         if kind.name == "real":
-            return (
-                f"({phrases.real(2).text} + 0.0 * {phrases.real(1).text})"
-                if self.choices.maybe(10)
-                else phrases.real(2).text
-            )
+            more = self.choices.maybe(10)
+            return f"({phrases.real(2)} + 0.0 * {phrases.real(1)})" if more else phrases.real(2).text
         if kind.name == "element":
-            return phrases.element(1).text
+            return phrases.element(1)
         if kind.name == "direction":
-            return phrases.runtime_direction(1).text
-        return phrases.vector(2).text if kind.name == "vec2" else phrases.flag(3).text
+            return phrases.runtime_direction(1)
+        return phrases.vector(2) if kind.name == "vec2" else phrases.flag(3)
 
     # Rules
 
-    def moment(self, phrases: Phrases, policy: str | None, symmetric: bool) -> list[str]:
-        """The rules of one moment: anything under a policy, else what can be shown to be free of conflicts."""
+    def substep(self, phrases: Phrases, policy: str | None, symmetric: bool) -> list[str]:
+        """The rules of one substep: anything under a policy, else what can be shown to be free of conflicts."""
         choices = self.choices
         self.taken = {False: set(), True: set()}
         self.proven, self.steady = policy is None, policy is None and symmetric
@@ -221,22 +195,22 @@ class PassMaker:
                 "move": self._lone_move,
             }[choices.pick(movers)](phrases)
         if "assign" in forms and (not rules or choices.maybe(40)):
-            rules += [self._assign(phrases) for _ in range(choices.whole(1, 2))]
+            rules += [self._assign(phrases) for _ in range(choices.integer(1, 2))]
         if "push" in forms and choices.maybe(15):
             rules.append(self._push(phrases))
         return [rule for rule in rules if rule] or [self._fallback(phrases)]
 
     def _fallback(self, phrases: Phrases) -> str:
-        """A rule that is right in any moment."""
+        """A rule that is valid in any substep."""
         one = self.words.elements[0]
         if "transform" in self.manner.forms:
             return f"{phrases.group()} -> {one}"
-        return f"{one} swaps below if below is not {one} and {phrases.flag(1).text} and no"
+        return f"{one} swaps below if below is not {one} and {phrases.flag(1)} and no"
 
     def _tail(self, phrases: Phrases, word: str = "if", effects: bool = True) -> str:
         """The rest of a rule: a condition, a chance, effects; any of them may be missing."""
         choices = self.choices
-        text = f" {word} {phrases.flag(choices.whole(1, 3), bare=True).text}" if choices.maybe(80) else ""
+        text = f" {word} {phrases.flag(choices.integer(1, 3), bare=True)}" if choices.maybe(80) else ""
         return text + self._chance(phrases) + (self._effects(phrases) if effects else "")
 
     def _chance(self, phrases: Phrases) -> str:
@@ -248,11 +222,11 @@ class PassMaker:
         if "assign" not in self.manner.forms or not self.choices.maybe(25):
             return ""
         updates = [self._update(phrases, effect=True) for _ in range(self.choices.weighted([(3, 1), (1, 2)]))]
-        told = [update for update in updates if update]
-        return f"{self.choices.pick([',', ''])} then {', '.join(told)}" if told else ""
+        found = [update for update in updates if update]
+        return f"{self.choices.pick([',', ''])} then {', '.join(found)}" if found else ""
 
     def _subject(self, phrases: Phrases) -> str:
-        return phrases.group() if self.choices.maybe(60) else phrases.flag(1, bare=True).text
+        return phrases.group() if self.choices.maybe(60) else phrases.flag(1, bare=True)
 
     def _mover_place(self, phrases: Phrases) -> str:
         loops = phrases.sides()
@@ -261,7 +235,7 @@ class PassMaker:
         )
 
     def _transform(self, phrases: Phrases) -> str:
-        return f"{self._subject(phrases)} -> {phrases.element(1).text}{self._tail(phrases)}"
+        return f"{self._subject(phrases)} -> {phrases.element(1)}{self._tail(phrases)}"
 
     def _swap(self, phrases: Phrases) -> str:
         place = self._mover_place(phrases)
@@ -269,7 +243,7 @@ class PassMaker:
         return head + self._tail(phrases)
 
     def _move(self, phrases: Phrases) -> str:
-        leaving = self.choices.pick([*self.words.elements, *phrases.ones()])
+        leaving = self.choices.pick([*self.words.elements, *phrases.local("one")])
         return f"{self._subject(phrases)} moves {self._mover_place(phrases)} leaving {leaving}{self._tail(phrases)}"
 
     def _assign(self, phrases: Phrases) -> str | None:
@@ -282,8 +256,8 @@ class PassMaker:
         ]
         if not vectors:
             return None
-        amount = self.choices.weighted([(2, phrases.whole), (2, phrases.real)])(1).text
-        return f"push {self.choices.pick(vectors)} by {amount} away from {phrases.flag(1, bare=True).text}{self._chance(phrases)}"
+        amount = self.choices.weighted([(2, phrases.integer), (2, phrases.real)])(1)
+        return f"push {self.choices.pick(vectors)} by {amount} away from {phrases.flag(1, bare=True)}{self._chance(phrases)}"
 
     def _update(self, phrases: Phrases, effect: bool) -> str | None:
         """`field := value`, or `+=`, `-=`, here or at a neighbor."""
@@ -310,12 +284,12 @@ class PassMaker:
         if (
             kind.name in ("int", "real") and kind.lo > kind.hi - 3
         ):  # constants out of the range would be errors
-            value = f"clamp({phrases.whole(2).text}, {kind.lo:g}, {kind.hi:g})"
+            value = phrases.integer(2).clamped(kind.lo, kind.hi).text
         else:
-            value = phrases.fitting(kind, choices.whole(0, 2))
+            value = phrases.fitting(kind, choices.integer(0, 2))
         return f"{place}{name} := {value}"
 
-    # Moments that the checker accepts without a policy
+    # Substeps that the checker accepts without a policy
 
     def _exclusive_transforms(self, phrases: Phrases) -> list[str | None]:
         choices, elements = self.choices, self.words.elements
@@ -324,7 +298,7 @@ class PassMaker:
                 target = choices.pick(elements)
                 return [
                     f"{self._subject(phrases)} -> {target}{self._tail(phrases)}"
-                    for _ in range(choices.whole(1, 2))
+                    for _ in range(choices.integer(1, 2))
                 ]
             case 1:
                 subjects = choices.some(elements, 1, 3)
@@ -337,17 +311,19 @@ class PassMaker:
         place = self._mover_place(phrases)
         numbers = [name for name, kind in self.words.properties.items() if kind.name == "int"]
         flags = [*self.words.of_kind("flag"), *phrases.lets("flag")]
-        one = choices.pick([*self.words.elements, *phrases.ones()])
+        one = choices.pick([*self.words.elements, *phrases.local("one")])
         options = [f"{one} swaps {place} if {place} is not {one}"]
         if numbers:
             name = choices.pick(numbers)
-            options.append(f"swap {place} if {name} == {phrases.a_number()} > {place}.{name}")
+            options.append(
+                f"swap {place} if {name} == {phrases.pick(*phrases.local('number'), '1', '2', '4')} > {place}.{name}"
+            )
         if flags:
             name = choices.pick(flags)
             options.append(f"swap {place} if {name} and not {place}.{name}")
         group = phrases.group()
         options.append(f"{group} swaps {place} if {place} is not {group}")
-        more = f" and {phrases.flag(2).text}" if choices.maybe(60) else ""
+        more = f" and {phrases.flag(2)}" if choices.maybe(60) else ""
         return [choices.pick(options) + more + self._chance(phrases) + self._effects(phrases)]
 
     def _separate_movers(self, phrases: Phrases) -> list[str | None]:
@@ -356,9 +332,9 @@ class PassMaker:
         one, two, three = choices.some(self.words.elements, 3, 3)
         place = self._mover_place(phrases)
         verb = choices.pick([f"swaps {place}", f"moves {place} leaving {choices.pick(self.words.elements)}"])
-        condition = f"{place} is {three} and {phrases.flag(2).text}"
+        condition = f"{place} is {three} and {phrases.flag(2)}"
         mover = f"{two} {verb} if {condition}{self._chance(phrases)}{self._effects(phrases)}"
-        rules: list[str | None] = [f"{one} -> {phrases.element(1).text}{self._tail(phrases)}", mover]
+        rules: list[str | None] = [f"{one} -> {phrases.element(1)}{self._tail(phrases)}", mover]
         return rules if choices.maybe(50) else rules[::-1]
 
     def _lone_move(self, phrases: Phrases) -> list[str | None]:

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
 from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, Kind, integer
 from powderdsl.testing.generators.choices import Choices
-
-Tree = str | list["Tree"] | dict[str, "Tree"]
-"""YAML as Python values; every scalar is text."""
+from powderdsl.testing.generators.trees import Tree
 
 RANGES = (
     (0, 1), (0, 3), (-2, 2), (0, 7), (-1, 1), (0, 0), (-5, -2), (3, 9), (-128, 127), (0, 127), (-129, 5), (0, 128),
     (0, 255), (0, 256), (-32768, 32767), (0, 65535), (-100000, 100000),
 )  # fmt: skip
-"""Ranges of whole numbers: small ones that saturate, and the borders of storage types and of the checker's search."""
+"""Ranges of integers: small ones that saturate, and the borders of storage types and of the checker's search."""
 
 CHANCES = ("50%", "0%", "100%", "20%", "0.001%", "99.99%", "0.1", "33.3%", "0.0000152587890625")
 """The last one is 1/65536, one step of a draw of 16 bits."""
@@ -65,7 +63,7 @@ def declare(choices: Choices, manner: Manner) -> tuple[Words, dict[str, Tree]]:
     count = choices.weighted([(4, 2), (2, 1), (3, 3), (3, 4), (1, 6), (1, 9)])
     words.elements = [f"e{i}" for i in range(count)]
     words.ids = _ids(choices, count)
-    tags = [f"t{i}" for i in range(choices.whole(0, 2))]
+    tags = [f"t{i}" for i in range(choices.integer(0, 2))]
     sections["params"] = _params(choices, words, manner)
     sections["properties"] = _properties(choices, words, manner)
     sections["fields"] = _fields(choices, words, manner)
@@ -234,7 +232,7 @@ def _sets(choices: Choices, words: Words) -> dict[str, Tree]:
 
 
 def some_range(choices: Choices) -> Kind:
-    """A range of whole numbers."""
+    """A range of integers."""
     return integer(*choices.pick(RANGES))
 
 
@@ -247,7 +245,7 @@ def _constant(choices: Choices, kind: Kind) -> str:
             return choices.pick(CHANCES)
         case "int":
             lo, hi = int(kind.lo), int(kind.hi)
-            return str(choices.pick([min(max(0, lo), hi), lo, hi, choices.whole(lo, hi)]))
+            return str(choices.pick([min(max(0, lo), hi), lo, hi, choices.integer(lo, hi)]))
         case "real":
             options = [
                 text

@@ -14,8 +14,9 @@ from powderdsl.analysis.reactions import unchanging_ids
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator
-from powderdsl.testing.properties.running import run_sample
-from powderdsl.testing.properties.samples import Array, Sample, State, random_samples
+from powderdsl.testing.generators.cases import Array, Start
+from powderdsl.testing.properties.running import first_difference, run_sample
+from powderdsl.testing.properties.samples import State, random_samples
 from powderdsl.testing.properties.shrink import Work, shrink_while
 
 ROUNDS = (
@@ -54,7 +55,7 @@ class Distinction:
     `first` and `second` are the states after the last step.
     """
 
-    sample: Sample
+    sample: Start
     steps: int
     slot: str
     first: State
@@ -71,13 +72,13 @@ def distinguish(
         seed: other worlds for another seed, the same for the same.
     """
     names = _shared(first, second)
-    only_fields: tuple[Sample, int] | None = None
+    only_fields: tuple[Start, int] | None = None
     for sample, steps in fresh_samples(first.ruleset, focus, seed):
         one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
-        found = _soonest(_differs(one, other, ("element",)))
+        found = _soonest(first_difference(one, other, ("element",)))
         if found is not None:
             return _small(first, second, sample.one(found[0]), found[1], ("element",))
-        found = _soonest(_differs(one, other, names))
+        found = _soonest(first_difference(one, other, names))
         if found is not None and only_fields is None:
             only_fields = sample.one(found[0]), found[1]
     if only_fields is None and len(names) > 1 and set(first.slots) == set(second.slots):
@@ -102,7 +103,7 @@ def _soonest(when: Array) -> tuple[int, int] | None:
 
 def _with_fields(
     first: Simulator, second: Simulator, names: tuple[str, ...], seed: int
-) -> tuple[Sample, int] | None:
+) -> tuple[Start, int] | None:
     """A world that differs, of those whose fields hold anything that they can."""
     for sample, steps in _fielded_samples(first.ruleset, seed):
         found = _soonest(differs_after(first, second, sample, steps, names))
@@ -111,45 +112,36 @@ def _with_fields(
     return None
 
 
-def _fielded_samples(ruleset: Ruleset, seed: int) -> Iterator[tuple[Sample, int]]:
+def _fielded_samples(ruleset: Ruleset, seed: int) -> Iterator[tuple[Start, int]]:
     """Worlds whose fields hold anything that they can, at the first step, with the usual parameters."""
     for sample in random_samples(ruleset, seed, FIELDED):
-        yield replace(sample, params={}, clock=np.zeros_like(sample.clock)), 2
+        yield replace(sample, params={}, step=np.zeros_like(sample.step)), 2
 
 
 def _small(
-    first: Simulator, second: Simulator, sample: Sample, steps: int, names: tuple[str, ...]
+    first: Simulator, second: Simulator, sample: Start, steps: int, names: tuple[str, ...]
 ) -> Distinction:
-    def judge(some: Sample, most: int) -> Array:
+    def judge(some: Start, most: int) -> Array:
         return differs_after(first, second, some, most, names)
 
     tries = SEEDS if first.ruleset.streams or second.ruleset.streams else 1
-    small, steps = shrink_while(judge, sample, steps, tries, Work.of(first.ruleset, WORK))
+    small, steps = shrink_while(judge, sample, steps, tries, Work(first.ruleset, WORK))
     if tries == 1:
-        small = replace(small, seeds=np.zeros_like(small.seeds))
+        small = replace(small, seed=np.zeros_like(small.seed))
     one, other = (run_sample(sim, small, steps)[0][-1] for sim in (first, second))
     slot = next(name for name in names if (one[name] != other[name]).any())
     return Distinction(small, steps, slot, one, other)
 
 
 def differs_after(
-    first: Simulator, second: Simulator, sample: Sample, steps: int, names: Sequence[str]
+    first: Simulator, second: Simulator, sample: Start, steps: int, names: Sequence[str]
 ) -> Array:
     """After which step each world differs in one of these slots, 0 if it does not: int [B]."""
     one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
-    return _differs(one, other, names)
+    return first_difference(one, other, names)
 
 
-def _differs(first: list[State], second: list[State], names: Sequence[str]) -> Array:
-    when = np.zeros(len(first[0]["element"]), np.int64)
-    for step in range(len(first) - 1, 0, -1):
-        for name in names:
-            wrong = (first[step][name] != second[step][name]).reshape(len(when), -1).any(1)
-            when[wrong] = step
-    return when
-
-
-def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator[tuple[Sample, int]]:
+def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator[tuple[Start, int]]:
     """Worlds and how many steps they run, small ones first."""
     known = [element.id for element in ruleset.elements]
     frames = sorted(unchanging_ids(ruleset))
@@ -164,7 +156,7 @@ def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator
             framed = ids[worlds // 2 :]
             framed[:, [0, -1], :] = frames[0]
             framed[:, :, [0, -1]] = frames[0]
-        yield Sample(ids, np.arange(worlds, dtype=np.int64), np.zeros(worlds, np.int64)), steps
+        yield Start.fresh(ids).seeded(), steps
 
 
 def _palette(known: list[int], focus: Sequence[int], kinds: int, random: np.random.Generator) -> list[int]:

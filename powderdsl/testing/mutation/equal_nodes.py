@@ -1,6 +1,6 @@
 """Whether two nodes of the IR have the same value in every cell of every world: a proof, or not decided.
 
-Nodes of one graph that look alike are one object. Others are compared part by part, and where that does not do, by
+Nodes of one graph that look alike are one object. Others are compared part by part, and where that is not enough, by
 trying everything that the cells around can hold: each input at each place is a variable, and so is whatever cannot be
 enumerated, such as a comparison of floats. Variables that a small world makes equal, because its grid wraps, are
 tried as if they were free, so that equality here is equality everywhere.
@@ -8,7 +8,7 @@ tried as if they were free, so that equality here is equality everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import lcm, prod
 from typing import Any
@@ -29,7 +29,8 @@ MAX_WORK = 1_000_000_000
 VISIT = 200
 """Work for a node that is looked at to find the variables, whether the question is decided or not."""
 
-MAX_DEPTH = 600
+MAX_VALUES = 301
+"""Values of one variable."""
 
 
 class Undecided(Exception):
@@ -61,12 +62,12 @@ class Comparison:
     _known: dict[tuple[int, int], bool] = field(default_factory=dict)
 
     def equal(self, a: Node, b: Node) -> bool:
-        """True is a proof; False says that it is not so, or could not be decided."""
+        """True is a proof; False means that they differ, or that it could not be decided."""
         if a is b:
             return True
         key = (a.index, b.index) if a.index < b.index else (b.index, a.index)
         if key not in self._known:
-            self._known[key] = False  # until it is known better
+            self._known[key] = False  # for questions that lead back to this one
             self._known[key] = (
                 self._alike(a, b) or self._simpler(a, b) or self._simpler(b, a) or self._tried(a, b)
             )
@@ -93,11 +94,11 @@ class Comparison:
         return False
 
     def never(self, flag: Node) -> bool:
-        """Whether a flag is no everywhere."""
+        """Whether a flag is false everywhere."""
         return self._holds(flag, lambda value: not value.any())
 
     def always(self, flag: Node) -> bool:
-        """Whether a flag is yes everywhere."""
+        """Whether a flag is true everywhere."""
         return self._holds(flag, lambda value: bool(value.all()))
 
     def _holds(self, flag: Node, question: Callable[[Array], bool]) -> bool:
@@ -112,10 +113,10 @@ class Comparison:
         )
 
     def _decided(self, roots: tuple[Node, ...], question: Callable[[_Cases], bool]) -> bool:
-        """What holds in every case. Where there are too many, what others around are counted is any number."""
+        """Whether something holds in every case. If there are too many, counts of other cells may be any number."""
         for counted in (False, True):
             try:
-                return question(_Cases.of(roots, self.cells, self, counted))
+                return question(_Cases(roots, self.cells, self, counted))
             except (Undecided, RecursionError):
                 continue
         return False
@@ -161,93 +162,137 @@ def _is_free(node: Node) -> bool:
     return any(arg.type == REAL for arg in node.args)
 
 
-@dataclass
 class _Cases:
-    """All assignments to the variables that some nodes depend on, and the nodes' values in each."""
+    """All assignments to the variables that some nodes depend on, and the nodes' values in each.
 
-    variables: dict[Variable, Array]
-    """For each, its value in each case."""
-    thresholds: Mapping[str, list[int]]
-    moduli: Mapping[str, int]
-    valid: Array
-    work: Comparison
-    size: int
-    counted: bool
-    _values: dict[tuple[int, Offset], Array] = field(default_factory=dict)
+    Args:
+        counted: take what a count finds in other cells for a variable of its own. More cases than there are can only
+            refute.
 
-    @classmethod
-    def of(cls, roots: tuple[Node, ...], cells: Cells, work: Comparison, counted: bool) -> _Cases:
-        """Find the variables and lay out the cases. Raises Undecided if there are too many.
+    Raises:
+        Undecided: there are too many.
+    """
 
-        Args:
-            counted: take what a count finds in other cells for a variable of its own. More cases than there are can
-                only refute.
-        """
+    def __init__(self, roots: tuple[Node, ...], cells: Cells, work: Comparison, counted: bool):
+        self.cells, self.work, self.counted = cells, work, counted
+        self.inputs: dict[Variable, Node] = {}
+        self.uses: dict[Variable, set[Hashable]] = {}
+        """What is asked of each input: its value, or only whether it is in a set."""
+        self.thresholds: dict[str, list[int]] = {}
+        self.moduli: dict[str, int] = {}
+        nodes = self._find_inputs(roots)
+        domains = {name: self._domain(name, node) for name, node in self.inputs.items()}
+        self.size = prod(len(values) for values in domains.values())
+        if self.size > MAX_CASES:
+            raise Undecided
+        work.spend(self.size * max(nodes, 1))
+        self.variables: dict[Variable, Array] = {}
+        """For each, its value in each case."""
+        stride = 1
+        number = np.arange(self.size)
+        for name, values in domains.items():
+            self.variables[name] = np.asarray(values, np.int32)[number // stride % len(values)]
+            stride *= len(values)
+        self.valid = self._valid()
+        self._values: dict[tuple[int, Offset], Array] = {}
+
+    def _find_inputs(self, roots: tuple[Node, ...]) -> int:
+        """Find the variables; the number of nodes that were looked at."""
         seen: set[tuple[int, Offset]] = set()
-        uses: dict[Variable, set[Hashable]] = {}
-        inputs: dict[Variable, Node] = {}
-        thresholds: dict[str, set[int]] = {}
-        moduli: dict[str, int] = {}
         stack: list[tuple[Node, Offset, Hashable]] = [(root, (0, 0), "value") for root in roots]
         while stack:
             node, at, use = stack.pop()
             if node.op == "input" and node.type != REAL:
                 name: Variable = ("input", node.attr, at)
-                inputs[name] = node
-                uses.setdefault(name, set()).add(use)
+                self.inputs[name] = node
+                self.uses.setdefault(name, set()).add(use)
                 continue
             if (node.index, at) in seen:
                 continue
             seen.add((node.index, at))
-            work.spend(VISIT)
-            if len(seen) > 20_000:
+            self.work.spend(VISIT)
+            if len(seen) > 20_000 or node.type == REAL:  # floats only through a comparison, which is free
                 raise Undecided
-            if node.type == REAL:
-                raise Undecided  # only through a comparison, which is free
+            self.inputs.update(dict.fromkeys(self._own_variables(node, at), node))
             if _is_free(node):
-                inputs[("free", node.index, _at(node, at))] = node
                 continue
-            match node.op:
-                case "coordinate":
-                    moduli[node.attr[0]] = lcm(moduli.get(node.attr[0], 1), node.attr[1])
-                    inputs[("coordinate", node.attr[0], _at(node, at))] = node
-                case "inside":
-                    inputs[("inside", at, node.attr)] = node
-                case "below":
-                    thresholds.setdefault(node.attr[0], set()).add(node.args[0].attr)
-                    inputs[("draw", node.attr[0], at)] = node
-                case "shift" if not node.attr[2]:
-                    inputs[("inside", at, node.attr[:2])] = node
-                case "count" if counted:
-                    inputs[_others(node, at)] = node
-                case "count" if not node.attr[1]:
-                    for dy, dx, _ in node.attr[0]:
-                        if (dy, dx) != (0, 0):
-                            inputs[("inside", at, (dy, dx))] = node
             if node.op == "below":
+                cuts = self.thresholds.get(node.attr[0], [])
+                self.thresholds[node.attr[0]] = sorted({*cuts, node.args[0].attr})
                 continue
+            if node.op == "coordinate":
+                self.moduli[node.attr[0]] = lcm(self.moduli.get(node.attr[0], 1), node.attr[1])
+            asked: Hashable = (node.op, node.attr) if node.op in ("in_set", "table") else "value"
             for part, place in _reads(node, at):
-                if counted and node.op == "count" and place != at:
-                    continue
-                asked: Hashable = "value"
-                if node.op in ("in_set", "table"):
-                    asked = (node.op, node.attr)
-                stack.append((part, place, asked))
-        domains: dict[Variable, list[int]] = {}
-        ordered = {stream: sorted(cuts) for stream, cuts in thresholds.items()}
-        for name, node in inputs.items():
-            domains[name] = _domain(name, node, uses.get(name, set()), uses, cells, ordered, moduli)
-        size = prod(len(values) for values in domains.values())
-        if size > MAX_CASES:
+                if not (self.counted and node.op == "count" and place != at):
+                    stack.append((part, place, asked))
+        return len(seen)
+
+    def _own_variables(self, node: Node, at: Offset) -> list[Variable]:
+        """The variables that a node reads itself, besides those of its parts."""
+        if _is_free(node):
+            return [("free", node.index, _at(node, at))]
+        match node.op:
+            case "coordinate":
+                return [("coordinate", node.attr[0], _at(node, at))]
+            case "inside":
+                return [("inside", at, node.attr)]
+            case "below":
+                return [("draw", node.attr[0], at)]
+            case "shift" if not node.attr[2]:
+                return [("inside", at, node.attr[:2])]
+            case "count" if self.counted:
+                return [_others(node, at)]
+            case "count" if not node.attr[1]:
+                return [("inside", at, (dy, dx)) for dy, dx, _ in node.attr[0] if (dy, dx) != (0, 0)]
+        return []
+
+    def _domain(self, name: Variable, node: Node) -> list[int]:
+        """The values of a variable that can make a difference."""
+        low, high = node.type.lo, node.type.hi
+        match name[0]:
+            case "inside":
+                return [0, 1]
+            case "coordinate":
+                return list(range(self.moduli[str(name[1])]))
+            case "draw":
+                return list(range(len(self.thresholds[str(name[1])]) + 1))
+            case "counted":
+                held = node.args[0].type
+                ends = [(0, w * held.lo, w * held.hi) for dy, dx, w in node.attr[0] if (dy, dx) != (0, 0)]
+                low, high = sum(map(min, ends)), sum(map(max, ends))
+        values: Sequence[int] = range(low, high + 1)
+        if name[0] == "input":
+            values = self.cells.domains.get(str(name[1])) or values
+        if len(values) > MAX_VALUES:
             raise Undecided
-        work.spend(size * max(len(seen), 1))
-        table: dict[Variable, Array] = {}
-        stride = 1
-        number = np.arange(size)
-        for name, values in domains.items():
-            table[name] = np.asarray(values, np.int32)[number // stride % len(values)]
-            stride *= len(values)
-        return cls(table, ordered, moduli, _valid(table, cells, size), work, size, counted)
+        return self._told_apart(name, values) if name[0] == "input" else list(values)
+
+    def _told_apart(self, name: Variable, values: Sequence[int]) -> list[int]:
+        """One of each kind of values that the questions about an input tell apart."""
+        asked = set(self.uses[name])
+        if name[1] == "element":
+            for other, holders in self.cells.holders.items():
+                if ("input", other, name[2]) in self.uses:
+                    asked |= {("in_set", holders.ids), ("table", holders.usual)}
+        if "value" in asked:
+            return list(values)
+        kinds: dict[tuple[object, ...], int] = {}
+        questions: list[Any] = sorted(asked, key=repr)
+        for value in values:
+            kinds.setdefault(tuple(_answer(value, *question) for question in questions), value)
+        return list(kinds.values())
+
+    def _valid(self) -> Array:
+        """The cases that can be: where an element is not free to hold a value, there is the usual one."""
+        valid = np.ones(self.size, bool)
+        for name, values in self.variables.items():
+            element = self.variables.get(("input", "element", name[2])) if name[0] == "input" else None
+            if element is not None and name[1] in self.cells.holders:
+                holders = self.cells.holders[str(name[1])]
+                usual = np.asarray(holders.usual, np.int32)[element]
+                valid &= np.isin(element, sorted(holders.ids)) | (values == usual)
+        return valid
 
     def value(self, node: Node, at: Offset) -> Array:
         """The node's value at a place, in each case."""
@@ -259,30 +304,29 @@ class _Cases:
     def _value(self, node: Node, at: Offset) -> Array:
         if node.op == "input":
             return self.variables[("input", node.attr, at)]
+        own = [self.variables[name] for name in self._own_variables(node, at)]
         if _is_free(node):
-            return self.variables[("free", node.index, _at(node, at))]
+            return own[0]
         match node.op:
             case "const":
                 return np.full(self.size, int(node.attr), np.int32)
             case "coordinate":
-                which, modulus = node.attr[:2]
-                number = self.variables[("coordinate", which, _at(node, at))] % modulus
+                number = own[0] % node.attr[1]
                 return number >> node.attr[2] & 1 if len(node.attr) > 2 else number
             case "inside":
-                return self.variables[("inside", at, node.attr)]
+                return own[0]
             case "below":
                 place = self.thresholds[node.attr[0]].index(node.args[0].attr)
-                return (self.variables[("draw", node.attr[0], at)] <= place).astype(np.int32)
+                return (own[0] <= place).astype(np.int32)
             case "count":
                 return self._count(node, at)
         parts = [self.value(part, place) for part, place in _reads(node, at)]
-        own, shared = _EVALUATE.get(node.op), OPS[node.op].evaluate
-        if own is not None:
-            found: Array = own(node, self, at, *parts)
-        elif shared is not None:
-            found = shared(node.attr, *parts)
-        else:
+        if node.op == "shift":  # nothing beyond the edge, unless it wraps
+            return parts[0] * own[0] if own else parts[0]
+        evaluate = _EVALUATE.get(node.op, OPS[node.op].evaluate)
+        if evaluate is None:
             raise Undecided
+        found: Array = evaluate(node.attr, *parts)
         return found.astype(np.int32)
 
     def _count(self, node: Node, at: Offset) -> Array:
@@ -298,10 +342,6 @@ class _Cases:
             total += weight * held
         return total
 
-    def shifted(self, node: Node, at: Offset, value: Array) -> Array:
-        """What is seen at a neighbor: nothing beyond the edge, unless it wraps."""
-        return value if node.attr[2] else value * self.variables[("inside", at, node.attr[:2])]
-
 
 def _others(node: Node, at: Offset) -> Variable:
     """What a count finds in other cells, as a variable: the same one where only the cell itself makes a difference."""
@@ -315,53 +355,6 @@ def _at(node: Node, at: Offset) -> Offset:
     return (0, 0) if everywhere else at
 
 
-def _domain(
-    name: Variable,
-    node: Node,
-    uses: set[Hashable],
-    all_uses: Mapping[Variable, set[Hashable]],
-    cells: Cells,
-    thresholds: Mapping[str, list[int]],
-    moduli: Mapping[str, int],
-) -> list[int]:
-    """The values of a variable that can make a difference."""
-    match name[0]:
-        case "inside":
-            return [0, 1]
-        case "coordinate":
-            return list(range(moduli[str(name[1])]))
-        case "draw":
-            return list(range(len(thresholds[str(name[1])]) + 1))
-        case "counted":
-            low, high = node.args[0].type.lo, node.args[0].type.hi
-            weights = [weight for dy, dx, weight in node.attr[0] if (dy, dx) != (0, 0)]
-            ends = [(min(0, w * low, w * high), max(0, w * low, w * high)) for w in weights]
-            least, most = sum(end[0] for end in ends), sum(end[1] for end in ends)
-            if most - least > 300:
-                raise Undecided
-            return list(range(least, most + 1))
-        case "free":
-            if node.type.hi - node.type.lo > 300:
-                raise Undecided
-            return list(range(node.type.lo, node.type.hi + 1))
-    slot = str(name[1])
-    values = list(cells.domains.get(slot) or range(node.type.lo, node.type.hi + 1))
-    if len(values) > 300:
-        raise Undecided
-    asked = set(uses)
-    if slot == "element":
-        for other, holders in cells.holders.items():
-            if ("input", other, name[2]) in all_uses:
-                asked |= {("in_set", holders.ids), ("table", holders.usual)}
-    if "value" in asked:
-        return values
-    kinds: dict[tuple[object, ...], int] = {}
-    questions: list[Any] = sorted(asked, key=repr)
-    for value in values:
-        kinds.setdefault(tuple(_answer(value, *question) for question in questions), value)
-    return list(kinds.values())
-
-
 def _answer(value: int, op: str, attr: Any) -> object:
     """What `in_set` or `table` say of a value."""
     if op == "in_set":
@@ -369,30 +362,17 @@ def _answer(value: int, op: str, attr: Any) -> object:
     return attr[value] if 0 <= value < len(attr) else None
 
 
-def _valid(table: Mapping[Variable, Array], cells: Cells, size: int) -> Array:
-    """The cases that can be: where an element is not free to hold a value, there is the usual one."""
-    valid = np.ones(size, bool)
-    for name, values in table.items():
-        element = table.get(("input", "element", name[2])) if name[0] == "input" else None
-        if element is not None and name[1] in cells.holders:
-            holders = cells.holders[str(name[1])]
-            usual = np.asarray(holders.usual, np.int32)[element]
-            valid &= np.isin(element, sorted(holders.ids)) | (values == usual)
-    return valid
-
-
 _EVALUATE: dict[str, Callable[..., Any]] = {
-    "shift": lambda node, cases, at, a: cases.shifted(node, at, a),
-    "not": lambda node, cases, at, a: 1 - a,
-    "and": lambda node, cases, at, a, b: a & b,
-    "or": lambda node, cases, at, a, b: a | b,
-    "xor": lambda node, cases, at, a, b: a ^ b,
-    "in_set": lambda node, cases, at, a: np.isin(a, sorted(node.attr)),
-    "table": lambda node, cases, at, a: np.asarray(node.attr, np.int32)[np.clip(a, 0, len(node.attr) - 1)],
-    "select": lambda node, cases, at, c, a, b: np.where(c != 0, a, b),
-    "swap": lambda node, cases, at, moves, there, target, back, rest: np.where(
+    "not": lambda attr, a: 1 - a,
+    "and": lambda attr, a, b: a & b,
+    "or": lambda attr, a, b: a | b,
+    "xor": lambda attr, a, b: a ^ b,
+    "in_set": lambda attr, a: np.isin(a, sorted(attr)),
+    "table": lambda attr, a: np.asarray(attr, np.int32)[np.clip(a, 0, len(attr) - 1)],
+    "select": lambda attr, c, a, b: np.where(c != 0, a, b),
+    "swap": lambda attr, moves, there, target, back, rest: np.where(
         moves != 0, there, np.where(target != 0, back, rest)
     ),
-    "arrive": lambda node, cases, at, target, back, rest: np.where(target != 0, back, rest),
+    "arrive": lambda attr, target, back, rest: np.where(target != 0, back, rest),
 }
 """Exact evaluation of the operations that read cells, look up values, or work on flags; `OPS` has the arithmetic."""

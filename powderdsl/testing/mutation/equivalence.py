@@ -10,7 +10,7 @@ from powderdsl.testing.mutation.equal_nodes import Cells, Comparison, Holders
 
 
 def proven_equal(first: Ruleset, second: Ruleset) -> bool:
-    """Whether two compositions turn every world into the same one. False says nothing.
+    """Whether two compositions turn every world into the same one. False proves nothing.
 
     Worlds must hold the same, so that a changed range, default or kind of a field is a difference by itself.
     """
@@ -87,7 +87,7 @@ def _same_writes(first: dict[str, Node], second: dict[str, Node], graph: Graph, 
         written = one or other
         assert written is not None
         if name.startswith("let ") and (one is None or other is None):
-            continue  # nobody else reads a value that the other does not have
+            continue  # no other rule reads a value that the other does not have
         kept = graph.node("input", written.type, (), name)
         if not compare.equal(one or kept, other or kept):
             return False

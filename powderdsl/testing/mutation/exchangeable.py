@@ -10,7 +10,7 @@ from powderdsl.model.builtins import KERNELS
 from powderdsl.model.declarations import PackDecl, TypedDecl
 
 MOST = 2
-"""How many other names take the place of one."""
+"""The number of names that are tried in place of one."""
 
 
 @dataclass(frozen=True)

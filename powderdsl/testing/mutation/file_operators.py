@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass
 
-from powderdsl.diagnostics import Reporter, Source
+from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.model.declarations import PackDecl
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
@@ -16,12 +16,19 @@ from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_ya
 from powderdsl.testing.mutation.exchangeable import Names, names_of
 from powderdsl.testing.mutation.line_operators import chance_changes, kind_changes, line_changes
 from powderdsl.testing.mutation.mutants import Change, Edit, Mutant
-from powderdsl.testing.mutation.removal import Path, inserted, lines_of, removed, without_action
 
-SYMMETRIES = ("mirror", "rotations", "all")
-POLICIES = ("drop_both", "first_wins")
+Container = Mapping | Sequence
+Path = tuple[tuple[Container, int], ...]
+"""From the file's root to an entry: each container, and which of its entries leads on."""
+
+OPTIONS = {
+    "symmetry": ("side", ("mirror", "rotations", "all")),
+    "conflicts": ("conflicts", ("drop_both", "first_wins")),
+}
+"""Keys of a block with a word as their value: the kind of mistake, and the words."""
+
 UNCHANGED = ("id", "color", "color_by", "glyph", "about")
-"""Keys of an element that say nothing of what it does."""
+"""Keys of an element that do not change what it does."""
 
 
 def mutants_of(pack: PackDecl, packs: Sequence_[PackDecl]) -> list[Mutant]:
@@ -59,12 +66,11 @@ class _FileChanges:
             "also": self._also,
             "passes": self._pass,
         }
-        for number, (key, node) in enumerate(root.entries):
+        for key, node, path in entries_of(root):
             part = parts.get(key.text)
-            if part is None or not isinstance(node, Mapping):
-                continue
-            for place, (name, value) in enumerate(node.entries):
-                yield from part(name.text, value, ((root, number), (node, place)))
+            if part is not None and isinstance(node, Mapping):
+                for name, value, entry in entries_of(node, path):
+                    yield from part(name.text, value, entry)
 
     # Lines
 
@@ -95,8 +101,7 @@ class _FileChanges:
         if not isinstance(node, Mapping):
             yield from self._kind(node)
             return
-        for number, (key, value) in enumerate(node.entries):
-            entry = (*path, (node, number))
+        for key, value, entry in entries_of(node, path):
             if key.text == "type":
                 yield from self._kind(value)
             elif key.text != "about":
@@ -127,8 +132,7 @@ class _FileChanges:
     def _field(self, name: str, node: Node, path: Path) -> Iterator[Change]:
         if not isinstance(node, Mapping):
             return
-        keys = {key.text for key, _ in node.entries}
-        for number, (key, value) in enumerate(node.entries):
+        for key, value, entry in entries_of(node, path):
             if not isinstance(value, Scalar):
                 continue
             match key.text:
@@ -136,18 +140,15 @@ class _FileChanges:
                     yield from self._kind(value)
                 case "at":
                     yield self._replaced("field", value, "place" if value.text == "element" else "element")
-                    if "resets" not in keys:
-                        yield Change("field", (inserted(node, number, "resets: step"),))
-                case "default" | "of":
-                    yield from self._line(value)
-                    yield from self._lost("field", (*path, (node, number)))
+                    if node.get("resets") is None:
+                        yield Change("field", (inserted(entry, "resets: step"),))
                 case "resets":
-                    yield from self._lost("field", (*path, (node, number)))
+                    yield from self._lost("field", entry)
                 case "about":
                     continue
-                case _:  # the default of an element
+                case _:  # `default`, `of`, the default of an element
                     yield from self._line(value)
-                    yield from self._lost("field", (*path, (node, number)))
+                    yield from self._lost("field", entry)
 
     def _param(self, name: str, node: Node, path: Path) -> Iterator[Change]:
         yield from self._line(node.get("default") if isinstance(node, Mapping) else node)
@@ -174,7 +175,8 @@ class _FileChanges:
         if isinstance(edges, Scalar):
             yield self._replaced("kernel", edges, "nothing" if edges.text == "wrap" else "wrap")
         else:
-            yield Change("kernel", (inserted(node, len(node.entries) - 1, "edges: wrap"),))
+            last = (*path, (node, len(node.entries) - 1))
+            yield Change("kernel", (inserted(last, "edges: wrap"),))
 
     def _set(self, name: str, node: Node, path: Path) -> Iterator[Change]:
         yield from self._line(node)
@@ -182,35 +184,25 @@ class _FileChanges:
     def _element(self, name: str, node: Node, path: Path) -> Iterator[Change]:
         if not isinstance(node, Mapping):
             return
-        said = {key.text.removesuffix("?") for key, _ in node.entries}
-        for number, (key, value) in enumerate(node.entries):
-            entry = (*path, (node, number))
-            if key.text == "tags":
-                yield from self._tags(value, entry)
-            elif key.text == "override" and isinstance(value, Scalar):
-                yield self._replaced("override", value, "no" if value.text in ("yes", "true") else "yes")
-            elif key.text not in UNCHANGED:
-                yield from self._value(key.text.removesuffix("?"), value, entry)
-        last = len(node.entries) - 1
+        yield from self._also(name, node, path)
+        said = {key.word for key, _ in node.entries}
+        last = (*path, (node, len(node.entries) - 1))
         for flag in sorted(self.names.flags - said):
-            yield Change("property", (inserted(node, last, f"{flag}: yes"),))
+            yield Change("property", (inserted(last, f"{flag}: yes"),))
         if "tags" not in said:
             tag = next((n for n, kind in self.names.kinds.items() if kind == "tag"), None)
             if tag is not None:
-                yield Change("tag", (inserted(node, last, f"tags: {tag}?"),))
+                yield Change("tag", (inserted(last, f"tags: {tag}?"),))
 
     def _tags(self, node: Node, path: Path) -> Iterator[Change]:
         """A word of a list of tags gone, another one, one more."""
         words = node.items if isinstance(node, Sequence) else (node,)
-        here = [word.text.removesuffix("?") for word in words if isinstance(word, Scalar)]
+        here = [word.word for word in words if isinstance(word, Scalar)]
         for number, word in enumerate(words):
-            if not isinstance(word, Scalar) or self.names.kind(word.text.removesuffix("?")) != "tag":
+            if not isinstance(word, Scalar) or self.names.kind(word.word) != "tag":
                 continue
-            if isinstance(node, Sequence):
-                yield from self._lost("tag", (*path, (node, number)))
-            else:
-                yield from self._lost("tag", path)
-            other = next((n for n in self.names.others(here[number]) if n not in here), None)
+            yield from self._lost("tag", (*path, (node, number)) if isinstance(node, Sequence) else path)
+            other = next((n for n in self.names.others(word.word) if n not in here), None)
             if other is not None:
                 yield self._replaced("tag", word, f"{other}?")
                 start, end = node.span.start, node.span.end
@@ -223,12 +215,13 @@ class _FileChanges:
         if not isinstance(node, Mapping):
             yield from self._tags(node, path)
             return
-        for number, (key, value) in enumerate(node.entries):
-            entry = (*path, (node, number))
+        for key, value, entry in entries_of(node, path):
             if key.text == "tags":
                 yield from self._tags(value, entry)
+            elif key.text == "override" and isinstance(value, Scalar):
+                yield self._replaced("override", value, "no" if value.text in ("yes", "true") else "yes")
             elif key.text not in UNCHANGED:
-                yield from self._value(key.text.removesuffix("?"), value, entry)
+                yield from self._value(key.word, value, entry)
 
     # Passes
 
@@ -238,8 +231,7 @@ class _FileChanges:
         lets: dict[str, str] = {}
         _collect_lets(node, lets)
         names = self.names.with_lets(lets)
-        for number, (key, value) in enumerate(node.entries):
-            entry = (*path, (node, number))
+        for key, value, entry in entries_of(node, path):
             if key.text in ("after", "before"):
                 yield from self._order(key, value, entry, node)
             elif key.text == "scratch" and isinstance(value, Mapping):
@@ -259,32 +251,25 @@ class _FileChanges:
 
     def _block(self, node: Mapping, path: Path, names: Names) -> Iterator[Change]:
         """A pass or block: its values, its action, what comes then."""
-        keys = {key.text for key, _ in node.entries}
-        for number, (key, value) in enumerate(node.entries):
-            entry = (*path, (node, number))
+        for key, value, entry in entries_of(node, path):
             if key.text == "let" and isinstance(value, Mapping):
                 for _, line in value.entries:
                     yield from self._line(line, "expression", names)
-            elif key.text == "symmetry" and isinstance(value, Scalar):
-                for other in SYMMETRIES:
+            elif key.text in OPTIONS and isinstance(value, Scalar):
+                operator, options = OPTIONS[key.text]
+                for other in options:
                     if other != value.text:
-                        yield self._replaced("side", value, other)
-                yield from self._lost("side", entry)
-            elif key.text == "conflicts" and isinstance(value, Scalar):
-                for other in POLICIES:
-                    if other != value.text:
-                        yield self._replaced("conflicts", value, other)
-                yield from self._lost("conflicts", entry)
+                        yield self._replaced(operator, value, other)
+                yield from self._lost(operator, entry)
             elif key.text == "do" or key.text.startswith(("for ", "repeat ")):
                 if key.text != "do":
                     yield from self._line(key, "header", names)
-                yield Change("rule", without_action(self.source, (*path, (node, number))))
+                yield Change("rule", without_action(self.source, entry))
                 yield from self._body(value, entry, names)
             elif key.text == "then":
                 yield from self._lost("rule", entry)
                 yield from self._body(value, entry, names)
-        if "do" in keys and "then" in keys:
-            yield from self._merged(node)
+        yield from self._merged(node)
 
     def _body(self, node: Node, path: Path, names: Names) -> Iterator[Change]:
         """A rule, a list of rules, or blocks."""
@@ -315,22 +300,13 @@ class _FileChanges:
 
     def _merged(self, node: Mapping) -> Iterator[Change]:
         """`do` and `then` at once: one substep where there were two."""
-        entries = {key.text: (key, value) for key, value in node.entries}
-        _, first = entries["do"]
-        key, second = entries["then"]
-        rules = [*lines_of(first), *lines_of(second)]
-        if not rules or not lines_of(first) or not lines_of(second):
-            return
-        start = next(k.span.start for k, _ in node.entries if k.text == "do")
-        end = second.span.end
-        if not start < key.span.start:
-            return
-        indent = " " * (self.source.position(start)[1] - 1)
-        between = [k for k, _ in node.entries if start < k.span.start < key.span.start]
-        if between:
-            return
-        listed = "".join(f"\n{indent}  - {' '.join(rule.span.text.split())}" for rule in rules)
-        yield Change("order", (Edit(start, end, f"do:{listed}"),))
+        for (first_key, first), (second_key, second) in itertools.pairwise(node.entries):
+            if (first_key.text, second_key.text) == ("do", "then") and lines_of(first) and lines_of(second):
+                start = first_key.span.start
+                indent = " " * (self.source.position(start)[1] - 1)
+                rules = [" ".join(rule.span.text.split()) for rule in (*lines_of(first), *lines_of(second))]
+                listed = "".join(f"\n{indent}  - {rule}" for rule in rules)
+                yield Change("order", (Edit(start, second.span.end, f"do:{listed}"),))
 
 
 def _collect_lets(node: Node, found: dict[str, str]) -> None:
@@ -345,3 +321,82 @@ def _collect_lets(node: Node, found: dict[str, str]) -> None:
     elif isinstance(node, Sequence):
         for item in node.items:
             _collect_lets(item, found)
+
+
+# Cutting entries out of located YAML, and putting some in: the rest of the file stays as it is
+
+
+def entries_of(node: Mapping, path: Path = ()) -> Iterator[tuple[Scalar, Node, Path]]:
+    """Keys and values of a mapping, and the path to each."""
+    for number, (key, value) in enumerate(node.entries):
+        yield key, value, (*path, (node, number))
+
+
+def removed(source: Source, path: Path) -> Edit:
+    """The entry at the end of a path cut out; the whole container where it was the only one."""
+    container, number = path[-1]
+    spans = entry_spans(container)
+    if len(spans) == 1 and len(path) > 1:
+        return removed(source, path[:-1])
+    text = source.text
+    start, end = spans[number].start, spans[number].end
+    if text[container.span.start] in "[{":
+        if number + 1 < len(spans):
+            return Edit(start, spans[number + 1].start, "")
+        return Edit(spans[number - 1].end, end, "")
+    line = text.rfind("\n", 0, start) + 1
+    stop = text.find("\n", end)
+    stop = len(text) if stop < 0 else stop + 1
+    before = text[line:start]
+    if isinstance(container, Mapping) and before.strip():
+        # The first key of a list's item stands beside the dash, which stays.
+        return Edit(start, spans[number + 1].start, "") if number + 1 < len(spans) else Edit(start, end, "")
+    return Edit(line, stop, "")
+
+
+def without_action(source: Source, path: Path) -> tuple[Edit, ...]:
+    """A block without its action: what stood under `then` comes at once, or the block goes."""
+    block = path[-1][0]
+    assert isinstance(block, Mapping)
+    then = next((key for key, _ in block.entries if key.text == "then"), None)
+    if then is None:
+        return (removed(source, path[:-1]),)
+    return (removed(source, path), Edit(then.span.start, then.span.end, "do"))
+
+
+def inserted(path: Path, entry: str) -> Edit:
+    """A new entry after one of a mapping's, written as the mapping is: with a comma, or on a line of its own."""
+    node, number = path[-1]
+    assert isinstance(node, Mapping)
+    end = entry_spans(node)[number].end
+    source = node.span.source
+    if source.text[node.span.start] == "{":
+        return Edit(end, end, f", {entry}")
+    column = source.position(node.entries[0][0].span.start)[1]
+    return Edit(end, end, "\n" + " " * (column - 1) + entry)
+
+
+def entry_spans(container: Container) -> list[Span]:
+    """Where each entry stands, key and value."""
+    if isinstance(container, Sequence):
+        return [_whole(item) for item in container.items]
+    return [key.span.to(_whole(value)) for key, value in container.entries]
+
+
+def _whole(node: Node) -> Span:
+    """A node with all of its text: a block scalar's own span is its sign alone."""
+    span = node.span
+    if isinstance(node, Scalar) and node.style == "block":
+        text = node.content.source.text
+        end = node.content.end
+        while end > span.start and text[end - 1].isspace():
+            end -= 1
+        return Span(span.source, span.start, end)
+    return span
+
+
+def lines_of(node: Node) -> list[Scalar]:
+    """The rules of a body: itself or the items of a list; none where there are blocks."""
+    items = node.items if isinstance(node, Sequence) else (node,)
+    scalars = [item for item in items if isinstance(item, Scalar)]
+    return scalars if len(scalars) == len(items) else []

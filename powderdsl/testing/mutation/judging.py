@@ -10,22 +10,24 @@ import numpy as np
 
 from powderdsl.analysis.proofs import horizon
 from powderdsl.diagnostics import CompileError
+from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
 from powderdsl.simulation.simulator import Simulator, compile
+from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.equivalence import proven_equal
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.mutation.original import Batch, Invalid, Original, is_generated, lowered, meaning
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.breaks import breaks, is_paired, look, steps_for
-from powderdsl.testing.properties.running import run_sample
-from powderdsl.testing.properties.samples import Array, Sample, State
+from powderdsl.testing.properties.running import first_difference, run_sample
+from powderdsl.testing.properties.samples import State
 
 NOTICED = ("check", "invariant", "test", "generated")
 """What may notice a mutant. `test` are those written by hand; the quick ones of them are asked before invariants."""
 
 FEW_STEPS = 20
-"""Tests of so many steps run before longer ones."""
+"""Tests of at most this many steps run before longer ones."""
 
 PAIRED = 6
 """Batches on which invariants are tried that need more than one run of a world."""
@@ -122,7 +124,7 @@ class _Mutated:
     def ruleset(self) -> Ruleset:
         return self.sim.ruleset
 
-    def states(self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
+    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         return run_sample(self.sim, sample, steps, random)[0]
 
 
@@ -140,7 +142,7 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
     if same_state(original.ruleset, ruleset):
         for batch in original.batches():
             states, _ = run_sample(sim, batch.sample, batch.steps)
-            differs = differing(batch.states, states)
+            differs = first_difference(batch.states, states) > 0
             any_differs |= bool(differs.any())
             asked = differs if alike else np.ones_like(differs)
             found = _broken_in(batch, original, sim, single, states, asked)
@@ -213,15 +215,4 @@ def _broken_in(
 
 def same_state(first: Ruleset, second: Ruleset) -> bool:
     """Whether worlds of one composition hold what worlds of the other hold."""
-    from powderdsl.model.state import slots
-
     return slots(first) == slots(second) and [p.name for p in first.params] == [p.name for p in second.params]
-
-
-def differing(first: list[State], second: list[State]) -> np.ndarray:
-    """bool [B]: worlds that differ after some step."""
-    wrong = np.zeros(len(first[0]["element"]), bool)
-    for one, other in zip(first[1:], second[1:], strict=True):
-        for name, values in one.items():
-            wrong |= (values != other[name]).reshape(len(wrong), -1).any(1)
-    return wrong

@@ -4,26 +4,31 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from powderdsl.compiler import read
+from powderdsl.compiler import lower, read, set_params
 from powderdsl.diagnostics import Diagnostic, Reporter, Severity
 from powderdsl.diagnostics.span import Source
+from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.packs import read_file
 from powderdsl.model.types import Example, Ruleset
 from powderdsl.simulation.simulator import Simulator, compile
+from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.mutation.file_operators import mutants_of
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.running import run_sample
-from powderdsl.testing.properties.samples import Sample, State, joined, random_samples
+from powderdsl.testing.properties.samples import State, joined, random_samples
 from powderdsl.testing.properties.search import STEPS
+
+Settings = tuple[tuple[str, str], ...]
+"""Parameters and their values as text."""
 
 WORLDS = 1000
 """Random worlds that invariants are tried on, as many as `powderdsl test` tries."""
@@ -48,7 +53,7 @@ class Batch:
     `states` are the original's, at the start and after each step; `group` [B] says which set is left out.
     """
 
-    sample: Sample
+    sample: Start
     steps: int
     group: np.ndarray
     states: list[State]
@@ -59,6 +64,7 @@ class Original:
     """A composition, loaded once for all its mutants."""
 
     rules: str
+    settings: Settings
     packs: list[PackDecl]
     declaration: RulesetDecl | None
     ruleset: Ruleset
@@ -66,13 +72,14 @@ class Original:
     _batches: list[Batch] = field(default_factory=list)
 
     @classmethod
-    def of(cls, rules: str) -> Original:
-        """Load it. Raises CompileError."""
+    def of(cls, rules: str, settings: Settings = ()) -> Original:
+        """Load it, with other values for parameters. Raises CompileError."""
         reporter = Reporter()
         packs, declaration = read([rules], reporter)
         reporter.raise_if_errors()
-        ruleset = check(packs, declaration, reporter)
-        return cls(rules, packs, declaration, ruleset, warnings_of(reporter.diagnostics))
+        ruleset = set_params(check(packs, declaration, reporter), dict(settings), reporter)
+        reporter.raise_if_errors()
+        return cls(rules, settings, packs, declaration, ruleset, warnings_of(reporter.diagnostics))
 
     def mutants(self, only: frozenset[str] = frozenset()) -> list[Mutant]:
         """The mutants of all packs, or of some, in the order of the packs and their files."""
@@ -90,7 +97,7 @@ class Original:
         if reporter.has_errors or not isinstance(decl, PackDecl):
             raise Invalid
         packs = [decl if pack.name.text == mutant.pack else pack for pack in self.packs]
-        ruleset = check(packs, self.declaration, reporter)
+        ruleset = set_params(check(packs, self.declaration, reporter), dict(self.settings), reporter)
         reporter.raise_if_errors()
         return ruleset, warnings_of(reporter.diagnostics)
 
@@ -119,7 +126,7 @@ class Original:
         return tuple(dict.fromkeys([frozenset[int](), *(one.without for one in self.ruleset.invariants)]))
 
     @cached_property
-    def samples(self) -> list[Sample]:
+    def samples(self) -> list[Start]:
         """The worlds that `powderdsl test` tries first."""
         return list(random_samples(self.ruleset, 0, WORLDS))
 
@@ -143,16 +150,11 @@ def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
 
 def meaning(ruleset: Ruleset) -> str:
     """What two compositions have in common if no world can tell them apart by their model."""
-    from dataclasses import replace
-
     return fingerprint(replace(ruleset, tests=(), invariants=(), about=""))
 
 
 def lowered(ruleset: Ruleset) -> str:
     """The optimized program as text, with all that it reads: equal texts compute equal worlds."""
-    from powderdsl.compiler import lower
-    from powderdsl.ir.text import print_program
-
     lines = [line.partition("#")[0] for line in print_program(lower(ruleset)).splitlines()]
     fixed = (
         [(e.name, e.id) for e in ruleset.elements],

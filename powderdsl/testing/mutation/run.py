@@ -1,9 +1,10 @@
-"""Judges the mutants of a composition in several processes, and looks for a world that shows each survivor."""
+"""Judges the mutants of a composition in several processes, looks for a world that shows each survivor, and counts."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Generator
+import re
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -13,10 +14,13 @@ import numpy as np
 from powderdsl.simulation.simulator import compile
 from powderdsl.system.crew import Done, work_through
 from powderdsl.testing.mutation.distinguishing import distinguish
-from powderdsl.testing.mutation.judging import Verdict, judge
+from powderdsl.testing.mutation.judging import NOTICED, Verdict, judge
 from powderdsl.testing.mutation.mutants import Mutant
-from powderdsl.testing.mutation.original import Original
+from powderdsl.testing.mutation.original import Original, Settings
 from powderdsl.testing.mutation.written import GeneratedTest, written_test
+
+COUNTED = ("mutants", "equivalent", "killed", *NOTICED, "survived")
+"""Keys of a tally. `killed` is the sum of what noticed them; texts that are not rule files are not counted."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,7 @@ class Task:
     """A mutant by its place among all of a composition."""
 
     rules: str
+    settings: Settings
     packs: tuple[str, ...]
     number: int
     seed: int
@@ -42,7 +47,7 @@ class Outcome:
 
 
 def sampled(mutants: list[Mutant], most: int | None, seed: int) -> list[int]:
-    """Places of at most so many mutants, each pack and kind of mistake in proportion, the same for the same seed."""
+    """Places of at most `most` mutants, each pack and kind of mistake in proportion, the same for the same seed."""
     everything = list(range(len(mutants)))
     if most is None or most >= len(mutants):
         return everything
@@ -61,7 +66,13 @@ def sampled(mutants: list[Mutant], most: int | None, seed: int) -> list[int]:
 
 
 def run_campaign(
-    rules: str, packs: tuple[str, ...], numbers: list[int], jobs: int, seed: int, worlds: bool = True
+    rules: str,
+    packs: tuple[str, ...],
+    numbers: list[int],
+    jobs: int,
+    seed: int,
+    worlds: bool = True,
+    settings: Settings = (),
 ) -> Generator[Outcome]:
     """Outcomes of mutants in the order in which they come.
 
@@ -71,9 +82,10 @@ def run_campaign(
     Args:
         numbers: places of the mutants among those of `Original.mutants`.
         worlds: look for a world that shows each survivor.
+        settings: other values for parameters.
     """
     _loaded.cache_clear()  # files may have changed since
-    tasks = deque(Task(rules, packs, number, seed, worlds) for number in numbers)
+    tasks = deque(Task(rules, settings, packs, number, seed, worlds) for number in numbers)
     if jobs == 1:
         for task in tasks:
             yield work(task, lambda value: None)
@@ -86,14 +98,14 @@ def run_campaign(
 
 
 @lru_cache(maxsize=1)
-def _loaded(rules: str, packs: tuple[str, ...]) -> tuple[Original, list[Mutant]]:
-    original = Original.of(rules)
+def _loaded(rules: str, settings: Settings, packs: tuple[str, ...]) -> tuple[Original, list[Mutant]]:
+    original = Original.of(rules, settings)
     return original, original.mutants(frozenset(packs))
 
 
 def work(task: Task, tell: Callable[[Any], None]) -> Outcome:
     """Judge one mutant."""
-    original, mutants = _loaded(task.rules, task.packs)
+    original, mutants = _loaded(task.rules, task.settings, task.packs)
     mutant = mutants[task.number]
     verdict = judge(original, mutant)
     if verdict.status != "survived" or not task.worlds:
@@ -110,8 +122,6 @@ def work(task: Task, tell: Callable[[Any], None]) -> Outcome:
 
 def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
     """Elements that a mutant is likely to be about: those that its lines name, by themselves, a tag or a set."""
-    import re
-
     words = set(re.findall(r"\w+", mutant.diff))
     tags = words & {tag.name.text for pack in original.packs for tag in pack.tags}
     own = {element.name for element in original.ruleset.elements if element.pack == mutant.pack}
@@ -120,3 +130,27 @@ def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
         for element in original.ruleset.elements
         if element.name in words or element.tags & tags or element.name in own
     )
+
+
+def tally(outcomes: Iterable[Outcome]) -> dict[str, int]:
+    """Numbers of mutants by COUNTED."""
+    counts: Counter[str] = Counter()
+    for outcome in outcomes:
+        verdict = outcome.verdict
+        if verdict.status != "invalid":
+            counts["mutants"] += 1
+            counts[verdict.status] += 1
+            counts[verdict.by if verdict.status == "killed" else ""] += 1
+    return {key: counts[key] for key in COUNTED}
+
+
+def noticed_share(counts: dict[str, int]) -> float:
+    """The part of the mutants that are not proven equivalent which something notices; 1 if there are none."""
+    real = counts["mutants"] - counts["equivalent"]
+    return counts["killed"] / real if real else 1.0
+
+
+def by_hand_share(counts: dict[str, int]) -> float:
+    """Of the mutants that invariants and tests notice, the part that those written by hand notice; 1 if there are none."""
+    tested = counts["invariant"] + counts["test"] + counts["generated"]
+    return (tested - counts["generated"]) / tested if tested else 1.0

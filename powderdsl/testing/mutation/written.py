@@ -44,8 +44,8 @@ def written_test(
     A test names no seed if the original does the same with all that a test runs with by itself.
     """
     ruleset = sim.ruleset
-    seed: int | None = int(found.sample.seeds[0])
-    others = replace(found.sample.repeated(len(SEEDS)), seeds=np.array(SEEDS, np.int64))
+    seed: int | None = int(found.sample.seed[0])
+    others = replace(found.sample.repeated(len(SEEDS)), seed=np.array(SEEDS, np.int64))
     after = run_sample(sim, others, found.steps)[0][-1][found.slot]
     if seed in SEEDS and (after == found.first[found.slot]).all():
         seed = None
@@ -55,8 +55,8 @@ def written_test(
     name = f"{GENERATED}{_digest(mutant.key)} against {mutant.operator} in {_where(mutant)}"
     lines = [f"- {name}:"]
     if legend:
-        said = ", ".join(f"{_quoted(glyph)}: {element}" for glyph, element in legend)
-        lines.append(f"    legend: {{{said}}}")
+        items = ", ".join(f"{_quoted(glyph)}: {element}" for glyph, element in legend)
+        lines.append(f"    legend: {{{items}}}")
     lines += ["    given: |", *_drawn(before, glyphs)]
     needed = _closure(packs, mutant.pack)
     start = run_sample(sim, found.sample, 0)[1]
@@ -87,12 +87,12 @@ def _unequal(first: World, second: World, field: str) -> np.ndarray:
 
 
 def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]:
-    """A drawing of a field, with a filler for cells that need not be told; none if that is all of them."""
+    """A drawing of a field, with a filler for cells that do not matter; empty if no cell matters."""
     if same.all():
         return []
     rows = [row.split() for row in field_rows(field, world, 0)]
-    told = [[filler if same[y, x] else word for x, word in enumerate(words)] for y, words in enumerate(rows)]
-    return ["        " + " ".join(words) for words in told]
+    rows_ = [[filler if same[y, x] else word for x, word in enumerate(words)] for y, words in enumerate(rows)]
+    return ["        " + " ".join(words) for words in rows_]
 
 
 def _known(field: str, ruleset: Ruleset, needed: frozenset[str]) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.model import reference
-from powderdsl.model.state import slots
 from powderdsl.model.types import Often
 from powderdsl.simulation.draw import to_numpy
 
@@ -125,9 +124,6 @@ def _copies(start: World, first: int, count: int, seed: int) -> World:
 def world_context(world: World) -> reference.Context:
     """What a condition reads of a world: its state as the oracle holds it, parameters, the clock."""
     ruleset = world.sim.ruleset
-    state = reference.widened(
-        ruleset, {slot.name: to_numpy(world.state[slot.name]) for slot in slots(ruleset)}
-    )
-    params = reference.parameters(ruleset, len(world), {})
+    state = reference.widened(ruleset, {name: to_numpy(values) for name, values in world.state.items()})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
-    return reference.Context(ruleset, state, params, {}, clock)
+    return reference.Context(ruleset, state, reference.parameters(ruleset, len(world), {}), {}, clock)

@@ -8,18 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.model.fields.grids import ANYTHING, DEFAULT
 from powderdsl.model.fields.words import direction_word
-from powderdsl.model.state import Slot
 from powderdsl.model.text import show_number, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset
 from powderdsl.simulation.draw import to_numpy
+from powderdsl.testing.generators.cases import holding
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import World
-
-Place = tuple[int, int, int]
-"""World, row, column."""
 
 
 def with_fields(world: World, examples: Sequence[Example]) -> World:
@@ -29,7 +25,7 @@ def with_fields(world: World, examples: Sequence[Example]) -> World:
     changed = {}
     for name in names:
         values = to_numpy(world.state[name]).copy()
-        may_hold = _holders(world, slots[name])
+        may_hold = holding(world.sim.ruleset, slots[name], to_numpy(world.ids))
         for index, example in enumerate(examples):
             for grid in example.fields:
                 if grid.name == name:
@@ -46,54 +42,37 @@ def _draw(grid: FieldGrid, values: NDArray[Any], may_hold: NDArray[np.bool_]) ->
                 values[..., row, column] = [low for low, _ in cell] if values.ndim == 3 else cell[0][0]
 
 
-def _holders(world: World, slot: Slot) -> NDArray[np.bool_]:
-    """The cells [B, H, W] whose element can have the slot's field."""
-    prop = world.sim.ruleset.property(slot.name)
-    limited = slot.of if prop is None else prop.stored
-    ids = to_numpy(world.ids)
-    return np.ones(ids.shape, np.bool_) if limited is None else np.isin(ids, sorted(limited))
-
-
-def unlike(grid: FieldGrid, world: World) -> Place | None:
-    """The first cell of the first world that is not as the grid says."""
+def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
+    """The first of some worlds that is not as the grid says: its number, and `row 1, column 2 is 3, not 4`."""
     slot = next(slot for slot in world.sim.slots if slot.name == grid.name)
-    found = to_numpy(world.state[grid.name])
-    found = found if slot.planes == 2 else found[:, None]
-    low, high = np.empty_like(found), np.empty_like(found)
-    fresh = to_numpy(world.sim.world(world.ids).state[grid.name])
-    fresh = fresh if slot.planes == 2 else fresh[:, None]
-    counts = np.ones(found[:, 0].shape, np.bool_)
+    found, fresh = (to_numpy(one.state[grid.name]) for one in (world, world.sim.world(world.ids)))
+    low, high = fresh.copy(), fresh.copy()
+    counts = holding(world.sim.ruleset, slot, to_numpy(world.ids))
+    if not grid.everywhere:
+        counts = np.ones_like(counts)
     for row, cells in enumerate(grid.cells):
         for column, cell in enumerate(cells):
             if cell is None:
                 counts[:, row, column] = False
-            elif cell == ():
-                low[..., row, column] = high[..., row, column] = fresh[..., row, column]
-            else:
-                low[..., row, column] = [bounds[0] for bounds in cell]
-                high[..., row, column] = [bounds[1] for bounds in cell]
-    if grid.everywhere:
-        counts &= _holders(world, slot)
-    wrong = ((found < low) | (found > high)).any(axis=1) & counts
+            elif cell:
+                low[..., row, column], high[..., row, column] = _ends(cell, found.ndim == 4)
+    wrong = (found < low) | (found > high)
+    wrong = (wrong.any(axis=1) if wrong.ndim == 4 else wrong) & counts
     if not wrong.any():
         return None
     index, row, column = (int(part[0]) for part in np.nonzero(wrong))
-    return index, row, column
+    here = np.s_[index, ..., row, column]
+    wanted = _wanted(world.sim.ruleset, slot.kind, grid.cells[row][column], fresh[here])
+    return (
+        index,
+        f"row {row}, column {column} is {_word(world.sim.ruleset, slot.kind, found[here])}, not {wanted}",
+    )
 
 
-def described(grid: FieldGrid, world: World, place: Place) -> str:
-    """What a cell holds, and what it should: `row 1, column 2 is 3, not 4`."""
-    index, row, column = place
-    kind = next(slot.kind for slot in world.sim.slots if slot.name == grid.name)
-    rules = world.sim.ruleset
-    cell = grid.cells[row][column]
-    if cell == ():
-        fresh = to_numpy(world.sim.world(world.ids).state[grid.name])
-        wanted = f"{_word(rules, kind, fresh[index][..., row, column])}, its default"
-    else:
-        wanted = _wanted(rules, kind, cell)
-    found = _word(rules, kind, to_numpy(world.state[grid.name])[index][..., row, column])
-    return f"row {row}, column {column} is {found}, not {wanted}"
+def _ends(cell: Cell, vector: bool) -> NDArray[Any]:
+    """The lowest and the highest value that a cell allows, [2], or [2, components] of a vector."""
+    ends = np.array(cell, float).T
+    return ends if vector else ends[:, 0]
 
 
 def field_rows(name: str, world: World, index: int) -> tuple[str, ...]:
@@ -113,20 +92,15 @@ def _word(rules: Ruleset, kind: Kind, value: NDArray[Any]) -> str:
     """A value of a cell, as a drawing has it."""
     if kind.name in ("real", "vec2"):
         return ",".join(str(part) for part in np.atleast_1d(value))
-    return _name(rules, kind, int(value))
+    return direction_word(int(value)) if kind.name == "direction" else show_value(rules, kind, int(value))
 
 
-def _name(rules: Ruleset, kind: Kind, value: int) -> str:
-    return direction_word(value) if kind.name == "direction" else show_value(rules, kind, value)
-
-
-def _wanted(rules: Ruleset, kind: Kind, cell: Cell) -> str:
-    if cell is None:
-        return ANYTHING
+def _wanted(rules: Ruleset, kind: Kind, cell: Cell, fresh: NDArray[Any]) -> str:
+    """What a cell should hold: a value, a range, or its default."""
     if not cell:
-        return DEFAULT
+        return f"{_word(rules, kind, fresh)}, its default"
     if kind.name not in ("int", "real", "vec2"):
-        return _name(rules, kind, int(cell[0][0]))
+        return _word(rules, kind, np.asarray(cell[0][0]))
     return ",".join(
         show_number(low) if low == high else f"{show_number(low)}..{show_number(high)}" for low, high in cell
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from powderdsl.model.types import Example, Ruleset
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.pack_tests.chances import chance_problem, world_context
-from powderdsl.testing.pack_tests.fields import described, field_rows, unlike, with_fields
+from powderdsl.testing.pack_tests.fields import field_problem, field_rows, with_fields
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
@@ -152,32 +152,43 @@ class _Running:
 
     def look(self, world: World, step: int) -> ExampleResult | None:
         """What is wrong after a step; `world` holds this test's worlds alone."""
-        example, sim = self.example, world.sim
-        for condition in example.always if step else ():
-            holds = reference.evaluate(condition, world_context(world))
-            if not holds.all():
-                index, row, column = (int(part[0]) for part in np.nonzero(~holds))
-                words = one_line(condition.span) if condition.span else "a condition"
-                problem = f"`{words}` does not hold at row {row}, column {column}"
-                return _failure(example, self.seeds, index, step, world, self.ids, problem)
-        if step < example.steps:
-            return None
-        wanted = _wanted(example, self.ids)
-        differs = None if wanted is None else (to_numpy(world.ids) != wanted) & (wanted >= 0)
-        if wanted is not None and differs is not None and differs.any():
-            index, row, column = (int(part[0]) for part in np.nonzero(differs))
-            found = _name(sim.ruleset, int(world.ids[index, row, column]))
-            asked = _name(sim.ruleset, int(wanted[row, column]))
-            problem = f"row {row}, column {column} is `{found}`, not `{asked}`"
-            return _failure(example, self.seeds, index, step, world, self.ids, problem)
-        for grid in example.expect_fields:
-            place = unlike(grid, world)
-            if place is not None:
-                index, row, column = place
-                problem = f"`{grid.name}` in {described(grid, world, place)}"
-                failure = _failure(example, self.seeds, index, step, world, self.ids, problem)
-                return replace(failure, field=grid.name, field_after=field_rows(grid.name, world, index))
+        for index, problem, field in self._problems(world, step):
+            after = _rows(to_numpy(world.ids)[index], self.ids, self.example)
+            drawn = field_rows(field, world, index) if field else ()
+            return ExampleResult(
+                self.example, self.seeds, problem, self.seeds[index], step, after, field, drawn
+            )
         return None
+
+    def _problems(self, world: World, step: int) -> Iterator[tuple[int, str, str]]:
+        """The world that is wrong, how, and the field that is not as expected, if one is."""
+        example = self.example
+        for condition in example.always if step else ():
+            fails = ~reference.evaluate(condition, world_context(world))
+            if fails.any():
+                index, row, column = (int(part[0]) for part in np.nonzero(fails))
+                words = one_line(condition.span) if condition.span else "a condition"
+                yield index, f"`{words}` does not hold at row {row}, column {column}", ""
+        if step < example.steps:
+            return
+        wanted = self._wanted()
+        differs = (to_numpy(world.ids) != wanted) & (wanted >= 0)
+        if differs.any():
+            index, row, column = (int(part[0]) for part in np.nonzero(differs))
+            found, asked = int(world.ids[index, row, column]), int(wanted[row, column])
+            names = {element.id: element.name for element in world.sim.ruleset.elements}
+            yield index, f"row {row}, column {column} is `{names[found]}`, not `{names[asked]}`", ""
+        for grid in example.expect_fields:
+            problem = field_problem(grid, world)
+            if problem is not None:
+                yield problem[0], f"`{grid.name}` in {problem[1]}", grid.name
+
+    def _wanted(self) -> NDArray[np.int16]:
+        """The ids that `expect` asks for, int16 [H, W]; −1 where anything will do."""
+        rows = self.example.expect or [ANYTHING * len(row) for row in self.example.given]
+        return np.array(
+            [[-1 if char == ANYTHING else self.ids[char] for char in row] for row in rows], np.int16
+        )
 
 
 def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | None) -> list[ExampleResult]:
@@ -214,27 +225,6 @@ def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | 
     return [results.get(number, ExampleResult(one.example, one.seeds)) for number, one in enumerate(batch)]
 
 
-def _failure(
-    example: Example,
-    seeds: tuple[int, ...],
-    index: int,
-    step: int,
-    world: World,
-    ids: Mapping[str, int],
-    problem: str,
-) -> ExampleResult:
-    after = _rows(to_numpy(world.ids)[index], ids, example)
-    return ExampleResult(example, seeds, problem, seeds[index], step, after)
-
-
-def _wanted(example: Example, ids: Mapping[str, int]) -> NDArray[np.int16] | None:
-    """The ids that `expect` asks for, int16 [H, W]; −1 where anything will do."""
-    if example.expect is None:
-        return None
-    rows = [[-1 if char == ANYTHING else ids[char] for char in row] for row in example.expect]
-    return np.array(rows, dtype=np.int16)
-
-
 def _rows(world: NDArray[np.uint8], ids: Mapping[str, int], example: Example) -> tuple[str, ...]:
     """A world in characters, those that the test itself uses first: two may mean the same element."""
     used = "".join([*example.given, *(example.expect or ())])
@@ -248,7 +238,3 @@ def _id(ruleset: Ruleset, name: str) -> int:
     element = ruleset.element(name)
     assert element is not None, f"the checked model has a test with the unknown element {name}"
     return element.id
-
-
-def _name(ruleset: Ruleset, number: int) -> str:
-    return next(element.name for element in ruleset.elements if element.id == number)

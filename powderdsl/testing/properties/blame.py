@@ -1,15 +1,37 @@
-"""Which rule broke a claim: the last step is run by the oracle, pass by pass and substep by substep."""
+"""Who broke a claim: the rules of the last step, and where packs were added that it does not speak of, those packs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from powderdsl.diagnostics import Span
+from powderdsl.model.declarations import PackDecl
+from powderdsl.model.restrict import Cause, Difference, without
+from powderdsl.model.state import slots
+from powderdsl.model.text import one_line
 from powderdsl.model.types import Pass, Ruleset
+from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired, look
-from powderdsl.testing.properties.running import reference_states, reference_step
-from powderdsl.testing.properties.samples import Array, Sample, State
+from powderdsl.testing.properties.outcomes import Counterexample, Property
+from powderdsl.testing.properties.running import (
+    MARK,
+    Runner,
+    marked,
+    reference_states,
+    reference_step,
+    rule_spans,
+)
+from powderdsl.testing.properties.samples import State
+
+if TYPE_CHECKING:
+    from powderdsl.testing.pack_tests.runner import ExampleResult
+
+MOST = 8
+"""Added packs that are left out in turn, to see which of them matter."""
 
 
 @dataclass(frozen=True)
@@ -19,16 +41,16 @@ class Oracle:
     ruleset: Ruleset
     last: tuple[Pass, ...]
 
-    def states(self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
+    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         states = reference_states(self.ruleset, sample, steps - 1, random)
         cut = replace(self.ruleset, passes=self.last)
         return [*states, reference_step(cut, states[-1], sample, steps - 1, random)]
 
 
-def culprits(claim: Tested, ruleset: Ruleset, sample: Sample, steps: int) -> tuple[Span, ...]:
+def culprits(claim: Tested, ruleset: Ruleset, sample: Start, steps: int) -> tuple[Span, ...]:
     """The lines of rules without which the claim would not have been broken there; several if only together.
 
-    Empty if no rule can be named: the backends disagree, or it shows only in many worlds.
+    Empty if no rule can be named: the backends disagree, or only many worlds show it.
     """
     if isinstance(claim, Agreement | Alike):
         return ()
@@ -55,7 +77,9 @@ def culprits(claim: Tested, ruleset: Ruleset, sample: Sample, steps: int) -> tup
     return ()
 
 
-def _turning(passes: tuple[Pass, ...], broken) -> Iterator[tuple[Pass, ...]]:  # type: ignore[no-untyped-def]
+def _turning(
+    passes: tuple[Pass, ...], broken: Callable[[tuple[Pass, ...]], bool]
+) -> Iterator[tuple[Pass, ...]]:
     """The beginnings of the step, each up to a substep, after which the claim is broken and was not before; last first."""
     was = [broken(passes[:count]) for count in range(len(passes) + 1)]
     for count in range(len(passes), 0, -1):
@@ -68,3 +92,162 @@ def _turning(passes: tuple[Pass, ...], broken) -> Iterator[tuple[Pass, ...]]:  #
                 (*passes[: count - 1], replace(part, moments=part.moments[:-1]))
             ):
                 yield (*passes[: count - 1], part)
+
+
+# Added packs
+
+
+def translated(sample: Start, ruleset: Ruleset, target: Ruleset) -> Start | None:
+    """The same worlds under rules with other packs; None if those lack an element. Fields that they lack are left out."""
+    numbers = {element.qualified: element.id for element in target.elements}
+    table = np.full(256, -1, np.int64)
+    for element in ruleset.elements:
+        table[element.id] = numbers.get(element.qualified, -1)
+
+    def renamed(values: Array) -> Array:
+        return np.asarray(table[values])
+
+    kinds = {slot.name: slot.kind for slot in slots(target)}
+    ids = renamed(sample.ids)
+    fields = {}
+    for name, values in sample.fields.items():
+        if name in kinds:
+            fields[name] = renamed(values) if kinds[name].name == "element" else values
+    named = [ids, *(values for name, values in fields.items() if kinds[name].name == "element")]
+    if any((values < 0).any() for values in named):
+        return None
+    there = {param.name for param in target.params}
+    params = {name: values for name, values in sample.params.items() if name in there}
+    dtypes = {name: sample.fields[name].dtype for name in fields}
+    kept = {name: values.astype(dtypes[name]) for name, values in fields.items()}
+    return replace(sample, ids=ids.astype(np.uint8), fields=kept, params=params)
+
+
+def same_claim(prop: Property, ruleset: Ruleset) -> Property | None:
+    """The invariant of the same line as other rules have it: their elements may have other ids."""
+    for one in ruleset.invariants:
+        if one.span == prop.span:
+            return Property(one.claim, prop.text, one.pack, one.span, one.without, one.scope)
+    return None
+
+
+def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Difference:
+    """Which added packs break an invariant that holds in its scope, and by what."""
+    added = ruleset.added_to(prop.scope)
+    owners = pack_of_line(ruleset)
+    lines = [span for span in found.culprits if owners.get(span) in added]
+    if not lines and not is_paired(prop.claim):
+        lines = _happened(ruleset, found.sample, found.steps, added)
+    causes = [Cause(owners[span], span, one_line(span), True) for span in lines]
+    causes = causes or list(_elements(found, ruleset, added))
+    if causes:
+        return Difference(_in_order(added, causes), tuple(causes))
+    guilty = [pack for pack in added[:MOST] if not _still(prop, ruleset, found, pack)]
+    packs = tuple(guilty) or added
+    names = {element.id: element.name for element in ruleset.elements}
+    near = frozenset(
+        names[number] for ids in (found.before, found.after) for number in np.unique(ids).tolist()
+    )
+    return Difference(packs, tuple(cause for pack in packs for cause in doings(pack, ruleset, near)[:3]))
+
+
+def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | None:
+    """What the added packs that change a test do in it: their rules that happen, else what they do to other packs."""
+    if not result.added:
+        return None
+    from powderdsl.testing.pack_tests.runner import (
+        start_of,  # brings torch, which `powderdsl check` does without
+    )
+
+    ruleset, example, sim = runner.ruleset, result.example, runner.sim
+    world = sim.step(start_of(example, sim, result.seed), steps=max(result.step, 1))
+    owners = pack_of_line(ruleset)
+    causes = [
+        Cause(owners[span], span, one_line(span), True)
+        for number, span in enumerate(rule_spans(ruleset))
+        if owners[span] in result.added and bool(world.state[f"{MARK}{number}"].any())
+    ]
+    drawn = {char for rows in (example.given, example.expect or (), result.after) for char in "".join(rows)}
+    near = frozenset(name for char, name in example.legend if char in drawn)
+    for pack in result.added:
+        if pack not in {cause.pack for cause in causes}:
+            causes += doings(pack, ruleset, near)[:3]
+    return Difference(result.added, tuple(causes))
+
+
+def _happened(ruleset: Ruleset, sample: Start, steps: int, packs: tuple[str, ...]) -> list[Span]:
+    """The lines of some packs that happen in a world, as the oracle runs it."""
+    owners = pack_of_line(ruleset)
+    last = reference_states(marked(ruleset), sample, steps)[-1]
+    return [
+        span
+        for number, span in enumerate(rule_spans(ruleset))
+        if owners[span] in packs and last[f"{MARK}{number}"].any()
+    ]
+
+
+def pack_of_line(ruleset: Ruleset) -> dict[Span, str]:
+    """The pack of each line of rules."""
+    return {
+        rule.span: pass_.pack for pass_ in ruleset.passes for moment in pass_.moments for rule in moment.rules
+    }
+
+
+def _in_order(added: tuple[str, ...], causes: list[Cause]) -> tuple[str, ...]:
+    named = {cause.pack for cause in causes}
+    return tuple(pack for pack in added if pack in named)
+
+
+def _elements(found: Counterexample, ruleset: Ruleset, added: tuple[str, ...]) -> Iterator[Cause]:
+    """The elements of added packs that the world holds."""
+    names = {slot.name for slot in slots(ruleset) if slot.kind.name == "element"}
+    arrays = [found.before, found.after]
+    arrays += [values for name, values in found.sample.fields.items() if name in names]
+    there = {int(number) for values in arrays for number in np.unique(values)}
+    for element in ruleset.elements:
+        if element.id in there and element.pack in added:
+            yield Cause(element.pack, element.span, f"brings `{element.name}`")
+
+
+def _still(prop: Property, ruleset: Ruleset, found: Counterexample, pack: str) -> bool:
+    """Whether the world still breaks the invariant without a pack."""
+    fewer = without(ruleset, pack)
+    if fewer is None:
+        return True
+    claim, sample = same_claim(prop, fewer), translated(found.sample, ruleset, fewer)
+    if claim is None or sample is None:
+        return False
+    return bool(breaks(claim.claim, Oracle(fewer, fewer.passes), sample, found.steps).first.any())
+
+
+def doings(pack: str, ruleset: Ruleset, near: frozenset[str] = frozenset()) -> list[Cause]:
+    """What a pack does to others besides what its rules do: what concerns some elements, else everything."""
+    found = list(_doings(pack, ruleset))
+    close = [cause for name, cause in found if name in near]
+    return close or [cause for name, cause in found if name] or [cause for _, cause in found]
+
+
+def _doings(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
+    """The other pack's element that it does something to, or nothing; and what it does."""
+    assert ruleset.declared is not None
+    decl: PackDecl = next(one for one in ruleset.declared.packs if one.name.text == pack)
+    for also in decl.also:
+        name = also.name.word
+        if ruleset.element(name) is not None:
+            given = [
+                *(f"the tag `{tag.text.removesuffix('?')}`" for tag in also.tags),
+                *(f"`{key.text.removesuffix('?')}`" for key, _ in also.values),
+            ]
+            yield name, Cause(pack, also.name.span, f"gives `{name}` {' and '.join(given)}")
+    for element in decl.elements:
+        if element.override:
+            name = element.name.text
+            yield name, Cause(pack, element.name.span, f"replaces `{name}`")
+    for prop in decl.properties:
+        for key, _ in prop.values:
+            name = key.text.removesuffix("?")
+            yield name, Cause(pack, key.span, f"gives `{name}` a value of `{prop.name.text}`")
+    for pass_ in decl.passes:
+        yield "", Cause(pack, pass_.name.span, f"has the pass `{pass_.name.text}`")
+    for element in decl.elements:
+        yield "", Cause(pack, element.name.span, f"brings `{element.name.text}`")

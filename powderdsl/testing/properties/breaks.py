@@ -12,9 +12,9 @@ import numpy as np
 from powderdsl.model import reference
 from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
+from powderdsl.testing.generators.cases import Array, Start, fresh, property_table
 from powderdsl.testing.properties.running import context, reference_states
-from powderdsl.testing.properties.samples import Array, Sample, State, fresh
-from powderdsl.testing.properties.turns import turned_cells, turned_sample, turned_state
+from powderdsl.testing.properties.samples import State, turned_cells, turned_sample, turned_state
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Alike:
-    """A turned world turns into the same things, as often. Each world runs `copies` times, with other seeds."""
+    """A turned world gives the same results, equally often. Each world runs `copies` times, with other seeds."""
 
     turn: str
     copies: int
@@ -38,7 +38,7 @@ class Alike:
 Tested = Claim | KnownIds | Agreement | Alike
 
 SIGMAS = 6.0
-"""How far two frequencies may lie apart: chance alone does that once in five hundred million times."""
+"""How many standard deviations two frequencies may differ: by chance, more happens once in 500 million times."""
 
 
 class Runs(Protocol):
@@ -47,16 +47,14 @@ class Runs(Protocol):
     @property
     def ruleset(self) -> Ruleset: ...
 
-    def states(
-        self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None
-    ) -> list[State]: ...
+    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]: ...
 
 
 @dataclass(frozen=True)
 class Breaks:
     """`first` [B]: the step after which a world breaks the claim, 0 if it does not; `cell` [B, 2]: where.
 
-    `counts` [B]: whether the world was a test at all: one that starts as the claim forbids is none.
+    `counts` [B]: whether the world tests the claim: one that already starts as it forbids does not.
     """
 
     first: Array
@@ -74,7 +72,7 @@ def steps_for(claim: Tested, usual: int) -> int:
     return usual
 
 
-def breaks(claim: Tested, runs: Runs, sample: Sample, steps: int) -> Breaks:
+def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
     """Run the worlds and look."""
     match claim:
         case Local():
@@ -93,7 +91,7 @@ def is_paired(claim: Tested) -> bool:
     return isinstance(claim, Local | Symmetric | Alike | Agreement)
 
 
-def look(claim: Tested, ruleset: Ruleset, sample: Sample, states: list[State]) -> Breaks:
+def look(claim: Tested, ruleset: Ruleset, sample: Start, states: list[State]) -> Breaks:
     """Whether worlds, of which these are the states, break a claim that needs one run only."""
     ids = [state["element"] for state in states]
     match claim:
@@ -111,11 +109,7 @@ def look(claim: Tested, ruleset: Ruleset, sample: Sample, states: list[State]) -
             ]
             return _never(claim.steps, held)
         case Bounded():
-            outside = [
-                _outside(_field(ruleset, claim.field, state, sample, step), claim)
-                for step, state in enumerate(states)
-            ]
-            return _never(1, outside)
+            return _never(1, [_outside(_field(ruleset, claim.field, state), claim) for state in states])
         case KnownIds():
             return _breaks_of(np.stack([_unknown(ruleset, state) for state in states[1:]]))
     raise TypeError(f"{type(claim).__name__} needs more than one run")
@@ -134,7 +128,7 @@ def _breaks_of(masks: Array, counts: Array | None = None) -> Breaks:
     return Breaks(first, cell, np.ones(batch, bool) if counts is None else counts)
 
 
-def _total(claim: Total, ruleset: Ruleset, sample: Sample, states: list[State]) -> Breaks:
+def _total(claim: Total, ruleset: Ruleset, sample: Start, states: list[State]) -> Breaks:
     values = [
         reference.evaluate(claim.value, context(ruleset, state, sample, step)).astype(np.int64)
         for step, state in enumerate(states)
@@ -150,7 +144,7 @@ def _total(claim: Total, ruleset: Ruleset, sample: Sample, states: list[State]) 
 
 
 def _never(steps: int, held: list[Array]) -> Breaks:
-    """A condition by step, from the start on: it must not hold for so many steps in a row."""
+    """A condition by step, from the start on: it must not hold for `steps` steps in a row."""
     if steps == 1:
         return _breaks_of(np.stack(held[1:]), np.asarray(~held[0].any((1, 2))))
     run = np.zeros(held[0].shape, np.int64)
@@ -161,15 +155,12 @@ def _never(steps: int, held: list[Array]) -> Breaks:
     return _breaks_of(np.stack(masks))
 
 
-def _field(ruleset: Ruleset, name: str, state: State, sample: Sample, step: int) -> Array:
+def _field(ruleset: Ruleset, name: str, state: State) -> Array:
     if name in state:
         return state[name]
     prop = ruleset.property(name)
     assert prop is not None
-    table = np.zeros(256)
-    params = {param.name: float(param.default) for param in ruleset.params}
-    table[: len(prop.values)] = [params[v] if isinstance(v, str) else float(v) for v in prop.values]  # type: ignore[arg-type]
-    return table[state["element"]]
+    return property_table(ruleset, prop)[state["element"]]
 
 
 def _outside(values: Array, claim: Bounded) -> Array:
@@ -189,16 +180,16 @@ def _unknown(ruleset: Ruleset, state: State) -> Array:
 # Claims about two runs
 
 
-def touched(ruleset: Ruleset, sample: Sample) -> tuple[Sample, Array]:
+def touched(ruleset: Ruleset, sample: Start) -> tuple[Start, Array]:
     """The same worlds with another fresh element in one cell each, by their seeds; and which cells: bool [B, H, W]."""
     height, width = sample.shape
     known = np.array([element.id for element in ruleset.elements])
     worlds = np.arange(len(sample))
-    row, column = sample.seeds % height, sample.seeds // 7 % width
+    row, column = sample.seed % height, sample.seed // 7 % width
     mask = np.zeros(sample.ids.shape, bool)
     mask[worlds, row, column] = True
     old = np.searchsorted(known, sample.ids[worlds, row, column])
-    other = known[(old + 1 + sample.seeds // 3 % max(len(known) - 1, 1)) % len(known)]
+    other = known[(old + 1 + sample.seed // 3 % max(len(known) - 1, 1)) % len(known)]
     ids = sample.ids.copy()
     ids[worlds, row, column] = other
     table = {slot.name: slot for slot in slots(ruleset)}
@@ -219,30 +210,30 @@ def differences(first: State, second: State) -> Array:
 
 
 def near(mask: Array, radius: int) -> Array:
-    """Cells within so many rows and columns of a mask [B, H, W], around the edges too."""
+    """Cells within `radius` rows and columns of a mask [B, H, W], across the edges too."""
     for axis in (1, 2):
         reach = min(radius, mask.shape[axis] // 2)
         mask = np.logical_or.reduce([np.roll(mask, shift, axis) for shift in range(-reach, reach + 1)])
     return mask
 
 
-def _local(claim: Local, runs: Runs, sample: Sample) -> Array:
+def _local(claim: Local, runs: Runs, sample: Start) -> Array:
     other, mask = touched(runs.ruleset, sample)
     first, second = (runs.states(one, 1)[-1] for one in (sample, other))
     return differences(first, second) & ~near(mask, claim.radius)
 
 
-def draws_for(ruleset: Ruleset, sample: Sample) -> dict[str, Array]:
+def draws_for(ruleset: Ruleset, sample: Start) -> dict[str, Array]:
     """Draws for all streams, by the worlds' seeds: float64 [B, H, W]."""
     height, width = sample.shape
     found = {}
     for number, stream in enumerate(ruleset.streams):
-        rows = [np.random.default_rng([int(seed), number]).random((height, width)) for seed in sample.seeds]
+        rows = [np.random.default_rng([int(seed), number]).random((height, width)) for seed in sample.seed]
         found[stream.name] = np.stack(rows)
     return found
 
 
-def _symmetric(claim: Symmetric, runs: Runs, sample: Sample) -> Array:
+def _symmetric(claim: Symmetric, runs: Runs, sample: Start) -> Array:
     draws = draws_for(runs.ruleset, sample)
     turned_draws = {name: turned_cells(values, claim.turn) for name, values in draws.items()}
     first = runs.states(sample, 1, draws)[-1]
@@ -253,13 +244,13 @@ def _symmetric(claim: Symmetric, runs: Runs, sample: Sample) -> Array:
     return wrong
 
 
-def _alike(claim: Alike, runs: Runs, sample: Sample) -> Array:
+def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
     masks = []
     for world in range(len(sample)):
         one = sample.one(world).repeated(claim.copies)
-        seeds = int(sample.seeds[world]) + np.arange(claim.copies)
-        first = runs.states(replace(one, seeds=seeds), 1)[-1]["element"]
-        turned = turned_sample(runs.ruleset, replace(one, seeds=seeds + claim.copies), claim.turn)
+        seeds = int(sample.seed[world]) + np.arange(claim.copies)
+        first = runs.states(replace(one, seed=seeds), 1)[-1]["element"]
+        turned = turned_sample(runs.ruleset, replace(one, seed=seeds + claim.copies), claim.turn)
         second = runs.states(turned, 1)[-1]["element"]
         mask = np.zeros(second.shape[1:], bool)
         for element in runs.ruleset.elements:
@@ -273,7 +264,7 @@ def _alike(claim: Alike, runs: Runs, sample: Sample) -> Array:
     return np.stack(masks)
 
 
-def _agreement(runs: Runs, sample: Sample, steps: int) -> Breaks:
+def _agreement(runs: Runs, sample: Start, steps: int) -> Breaks:
     found = runs.states(sample, steps)
     wanted = reference_states(runs.ruleset, sample, steps)
     return _breaks_of(np.stack([differences(a, b) for a, b in zip(found[1:], wanted[1:], strict=True)]))

@@ -10,17 +10,22 @@ from pathlib import Path
 
 import numpy as np
 
-from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
-from powderdsl.syntax.sources import read_source
-from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.writing import failure, replacing
-from powderdsl.testing.generators.rulemaker import write_yaml
-from powderdsl.testing.generators.vocabulary import Tree
-from powderdsl.testing.generators.written_arrays import entries_of, line_of, read_array, to_tree, write_array
+from powderdsl.testing.generators.cases import Start
+from powderdsl.testing.generators.trees import (
+    Tree,
+    entries_of,
+    line_of,
+    read_array,
+    read_yaml,
+    reading,
+    write_array,
+    write_yaml,
+)
 from powderdsl.testing.properties.outcomes import Counterexample, Property
-from powderdsl.testing.properties.samples import Sample
 
 FOLDER = ".powderdsl"
 """Where counterexamples are kept, under the working directory."""
@@ -49,8 +54,8 @@ def write_example(path: Path, rules: str, prop: Property, found: Counterexample)
         "rules": rules,
         "property": prop.text,
         "steps": str(found.steps),
-        "seed": str(int(sample.seeds[0])),
-        "clock": str(int(sample.clock[0])),
+        "seed": str(int(sample.seed[0])),
+        "clock": str(int(sample.step[0])),
         "world": write_array(sample.ids[0]),
     }
     if sample.fields:
@@ -66,18 +71,15 @@ def write_example(path: Path, rules: str, prop: Property, found: Counterexample)
         temporary.write_text(head + write_yaml(tree), encoding="utf-8")
 
 
-def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Sample, int]:
+def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Start, int]:
     """A property's text, a world and a number of steps.
 
     Raises:
         CompileError: it cannot be read (PD1xx), or holds no counterexample for these rules (PD602).
     """
-    reporter = Reporter()
-    source = read_source(path, reporter)
-    root = parse_yaml(source, reporter) if source is not None else None
-    reporter.raise_if_errors()
-    tree = to_tree(root) if root is not None else None
-    try:
+    tree = read_yaml(path)
+    problem = f"{path} is not a counterexample for {ruleset.name}"
+    with reading(problem, "a counterexample is written by `powderdsl test`"):
         assert isinstance(tree, dict)
         dtypes = {slot.name: slot.dtype for slot in slots(ruleset)}
         ids = read_array(tree["world"], "uint8")
@@ -88,32 +90,17 @@ def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Sample, int]:
         if any(values.shape[-2:] != ids.shape for values in fields.values()):
             raise ValueError("a field of another size than the world")
         names = {param.name for param in ruleset.params}
-        params = {
-            name: np.array([float(line_of(text))])
-            for name, text in entries_of(tree.get("params"))
-            if name in names
-        }
-        numbers = [int(line_of(tree[key])) for key in ("steps", "seed", "clock")]
-        steps, seed, clock = numbers
+        given = [(name, text) for name, text in entries_of(tree.get("params")) if name in names]
+        params = {name: np.array([float(line_of(text))]) for name, text in given}
+        steps, seed, clock = (int(line_of(tree[key])) for key in ("steps", "seed", "clock"))
         if not 1 <= steps <= 100_000 or min(seed, clock) < 0:
             raise ValueError("a number of steps that no test has")
-        sample = Sample(ids[None], np.array([seed], np.int64), np.array([clock], np.int64), fields, params)
-        return line_of(tree["property"]), sample, steps
-    except CompileError:
-        raise
-    except (AssertionError, KeyError, ValueError, TypeError, OverflowError) as error:
-        note = (
-            f"{type(error).__name__}: {' '.join(str(error).split())}" if str(error) else "a part is missing"
-        )
-        helps = ("a counterexample is written by `powderdsl test`",)
-        raise failure(
-            "PD602", f"{path} is not a counterexample for {ruleset.name}", notes=(note,), helps=helps
-        ) from None
+        return line_of(tree["property"]), Start.fresh(ids, seed, clock, fields, params), steps
 
 
 def kept_examples(
     ruleset: Ruleset, properties: Mapping[str, Property], rules: str, folder: Path = Path(FOLDER)
-) -> Iterator[tuple[Property, Sample, int]]:
+) -> Iterator[tuple[Property, Start, int]]:
     """The counterexamples that were kept for these rules. Files that no longer fit are passed over."""
     for prop in properties.values():
         path = file_of(rules, prop, folder)

@@ -15,8 +15,8 @@ from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Kind, Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb, scale, to_numpy
+from powderdsl.testing.generators.cases import Array, Start, fresh
 from powderdsl.testing.properties.breaks import Tested
-from powderdsl.testing.properties.samples import Array, Sample, fresh
 
 STATUSES = ("proven", "tested", "untested", "differs", "broken")
 """``differs``: a world breaks it because packs are loaded that it does not speak of."""
@@ -56,7 +56,7 @@ class Counterexample:
     [H, W] that colors follow, by name, before and after.
     """
 
-    sample: Sample
+    sample: Start
     steps: int
     before: Array
     after: Array
@@ -67,7 +67,7 @@ class Counterexample:
 
 @dataclass(frozen=True)
 class Result:
-    """One of STATUSES, on how many worlds, and why. `reason` is a proof, or what stands in the way of one."""
+    """One of STATUSES, on how many worlds, and why. `reason` is a proof, or what prevents one."""
 
     prop: Property
     status: str
@@ -110,7 +110,7 @@ def difference_lines(found: Difference) -> Iterator[str]:
 def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[str]:
     """The rule that broke it, the world before and after, and what else the world holds."""
     steps = "1 step" if found.steps == 1 else f"{found.steps} steps"
-    yield f"broken at row {found.cell[0]}, column {found.cell[1]}, after {steps} with seed {int(found.sample.seeds[0])}"
+    yield f"broken at row {found.cell[0]}, column {found.cell[1]}, after {steps} with seed {int(found.sample.seed[0])}"
     for span in found.culprits:
         yield f"by {place_of(span)}: {one_line(span)}"
     glyphs = {element.id: element.glyph for element in ruleset.elements}
@@ -127,8 +127,8 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
     yield from _field_lines(found, ruleset, names)
     for name, values in found.sample.params.items():
         yield f"{name} = {float(values[0]):g}"
-    if found.sample.clock.any():
-        yield f"the clock says {int(found.sample.clock[0])}"
+    if found.sample.step.any():
+        yield f"the clock says {int(found.sample.step[0])}"
 
 
 def _field_lines(found: Counterexample, ruleset: Ruleset, names: Mapping[int, str]) -> Iterator[str]:
@@ -190,8 +190,8 @@ def result_data(result: Result) -> dict[str, Any]:
             "steps": found.steps,
             "row": found.cell[0],
             "column": found.cell[1],
-            "seed": int(found.sample.seeds[0]),
-            "clock": int(found.sample.clock[0]),
+            "seed": int(found.sample.seed[0]),
+            "clock": int(found.sample.step[0]),
             "fields": _plain(found.sample.fields),
             "params": _plain(found.sample.params),
             "rules": [{"place": place_of(span), "text": one_line(span)} for span in found.culprits],

@@ -1,7 +1,7 @@
-"""Which invariants are false: `powderdsl check` says so with the rule and a small world, before anything is trained.
+"""Finds false invariants: `powderdsl check` reports each with the rule and a small world, before anything is trained.
 
-The ledger proves what it can. For what is left, a few small worlds run on the oracle, without torch: a world that
-breaks an invariant refutes it. That none does says nothing; `powderdsl test` tries more and larger ones.
+The ledger proves what it can. For the rest, a few small worlds run on the oracle, without torch: a world that
+breaks an invariant refutes it. If no world does, nothing is proven; `powderdsl test` tries more and larger worlds.
 """
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from powderdsl.analysis.ledger.book import Ledger
-from powderdsl.analysis.ledger.changes import RuleLine
+from powderdsl.analysis.changes import RuleLine
+from powderdsl.analysis.ledger import Ledger
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
 from powderdsl.model.restrict import Cause, Difference
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Ruleset
+from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.blame import Oracle
 from powderdsl.testing.properties.breaks import Alike
 from powderdsl.testing.properties.outcomes import Result, counterexample_lines
-from powderdsl.testing.properties.samples import Sample, random_samples
+from powderdsl.testing.properties.samples import random_samples
 from powderdsl.testing.properties.search import (
     InvariantSearch,
     SearchPlan,
@@ -31,7 +32,7 @@ from powderdsl.testing.properties.search import (
 from powderdsl.testing.properties.shrink import Work
 
 WORLDS = 256
-"""Small worlds that are tried, and a few larger ones: enough for mistakes that happen often."""
+"""Small worlds that are tried, and a few larger ones: enough for frequent mistakes."""
 
 STEPS = 2
 
@@ -39,7 +40,7 @@ FOCUSED = 2
 """Batches that are tried once more with few elements."""
 
 FEW = 4
-"""More elements than these say nothing about what a line is about."""
+"""A set of this many elements or more does not show what a line is about."""
 
 WORK = 200_000_000
 """Work for making all the worlds that were found smaller: some seconds."""
@@ -102,7 +103,7 @@ def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
     found = []
     for trial in broken:
         assert trial.sample is not None
-        work, gone = Work.of(ruleset, WORK // len(broken)), trial.prop.without
+        work, gone = Work(ruleset, WORK // len(broken)), trial.prop.without
         small = counterexample(trial.claim, oracle, trial.sample, trial.steps, work, gone)
         found.append(Result(trial.prop, "broken", trial.worlds, "", small))
 
@@ -126,7 +127,7 @@ def _tried(search: InvariantSearch) -> InvariantSearch:
     return search
 
 
-def _try_focused(search: InvariantSearch, sample: Sample) -> None:
+def _try_focused(search: InvariantSearch, sample: Start) -> None:
     """Try the same worlds with only those elements that the lines in the way of a proof are about."""
     for trial in search.trials:
         kinds = _concerned(search, trial.doubts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,8 @@ from powderdsl.model.expressions.operands import TRUE
 from powderdsl.model.state import slots
 from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
 from powderdsl.simulation.draw import to_numpy
-from powderdsl.testing.properties.samples import Array, Sample, State, full_state
+from powderdsl.testing.generators.cases import Array, Start
+from powderdsl.testing.properties.samples import State, full_state
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
@@ -38,7 +39,7 @@ class Runner:
 
         self.sim = compile(marked(ruleset), backend=backend)
 
-    def states(self, sample: Sample, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
+    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         """The state at the start and after each step, in storage dtypes. `random`: draws for all streams."""
         found, end = run_sample(self.sim, sample, steps, random, self.ruleset)
         self.worlds_run += len(sample)
@@ -54,7 +55,7 @@ class Runner:
 
 def run_sample(
     sim: Simulator,
-    sample: Sample,
+    sample: Start,
     steps: int,
     random: Mapping[str, Array] | None = None,
     ruleset: Ruleset | None = None,
@@ -64,9 +65,9 @@ def run_sample(
     `ruleset`: whose slots are kept, if the simulator has more.
     """
     start = full_state(ruleset or sim.ruleset, sample)
-    world = sim.world(sample.ids, seed=sample.seeds)
+    world = sim.world(sample.ids, sample.seed, index=sample.index)
     given = {name: world.state[name].new_tensor(values) for name, values in start.items()}
-    clock = world.step.new_tensor(sample.clock)
+    clock = world.step.new_tensor(sample.step)
     world = replace(world, state={**world.state, **given}, step=clock)
     found = [start]
     for _ in range(steps):
@@ -75,8 +76,20 @@ def run_sample(
     return found, world
 
 
+def first_difference(
+    first: Sequence[State], second: Sequence[State], names: Iterable[str] | None = None
+) -> Array:
+    """After which step each world of two runs differs in one of these slots or in any, 0 if it does not: int [B]."""
+    when = np.zeros(len(first[0]["element"]), np.int64)
+    for step in range(len(first) - 1, 0, -1):
+        for name in first[step] if names is None else names:
+            wrong = (first[step][name] != second[step][name]).reshape(len(when), -1).any(1)
+            when[wrong] = step
+    return when
+
+
 def reference_states(
-    ruleset: Ruleset, sample: Sample, steps: int, random: Mapping[str, Array] | None = None
+    ruleset: Ruleset, sample: Start, steps: int, random: Mapping[str, Array] | None = None
 ) -> list[State]:
     """The same from the oracle."""
     found = [full_state(ruleset, sample)]
@@ -88,7 +101,7 @@ def reference_states(
 def reference_step(
     ruleset: Ruleset,
     state: State,
-    sample: Sample,
+    sample: Start,
     step: int,
     random: Mapping[str, Array] | None = None,
 ) -> State:
@@ -98,22 +111,19 @@ def reference_step(
         name: (np.floor(values * 2.0 ** bits[name]) + 0.5) / 2.0 ** bits[name]
         for name, values in (random or {}).items()
     }
-    return reference.step(ruleset, state, clock(sample, step), parameters(ruleset, sample), draws=draws)
+    params = reference.parameters(ruleset, len(sample), sample.params)
+    return reference.step(ruleset, state, _clock(sample, step), params, draws=draws)
 
 
-def clock(sample: Sample, step: int) -> reference.Clock:
-    return reference.Clock(sample.seeds, np.zeros(len(sample), np.int64), sample.clock + step)
+def _clock(sample: Start, step: int) -> reference.Clock:
+    return reference.Clock(sample.seed, sample.index, sample.step + step)
 
 
-def parameters(ruleset: Ruleset, sample: Sample) -> dict[str, Array]:
-    """All parameters, [B] each."""
-    return reference.parameters(ruleset, len(sample), sample.params)
-
-
-def context(ruleset: Ruleset, state: State, sample: Sample, step: int) -> reference.Context:
+def context(ruleset: Ruleset, state: State, sample: Start, step: int) -> reference.Context:
     """What a condition reads of worlds: their state, parameters, the clock."""
+    params = reference.parameters(ruleset, len(sample), sample.params)
     working = reference.widened(ruleset, {slot.name: state[slot.name] for slot in slots(ruleset)})
-    return reference.Context(ruleset, working, parameters(ruleset, sample), {}, clock(sample, step))
+    return reference.Context(ruleset, working, params, {}, _clock(sample, step))
 
 
 # Which lines happen

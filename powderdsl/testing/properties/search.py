@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from time import monotonic
 
 import numpy as np
 
-from powderdsl.analysis.ledger.book import Ledger, NotProven, Proven
-from powderdsl.analysis.ledger.book import ledger as make_ledger
-from powderdsl.analysis.ledger.changes import RuleLine
+from powderdsl.analysis.changes import RuleLine
+from powderdsl.analysis.ledger import Ledger, NotProven, Proven
+from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.model.expressions.operands import ELEMENT_HERE, member
 from powderdsl.model.restrict import restricted
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import ramps
-from powderdsl.testing.properties.blame import Oracle, culprits
+from powderdsl.system.user_cache import cache_folder
+from powderdsl.testing.generators.cases import Start
+from powderdsl.testing.properties.blame import Oracle, culprits, difference, translated
 from powderdsl.testing.properties.breaks import (
     Agreement,
     Alike,
@@ -30,10 +34,9 @@ from powderdsl.testing.properties.breaks import (
     look,
     steps_for,
 )
-from powderdsl.testing.properties.differences import difference, translated
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result
 from powderdsl.testing.properties.running import Runner
-from powderdsl.testing.properties.samples import LARGE, Sample, random_samples
+from powderdsl.testing.properties.samples import LARGE, random_samples
 from powderdsl.testing.properties.shrink import Work, shrink
 
 AUTOMATIC = "automatic"
@@ -44,13 +47,16 @@ STEPS = (3, 3, 3, 10)
 COPIES = 1024
 """How often a world runs where only frequencies can be compared."""
 
+DRAWN_STEPS = 3
+"""How many steps worlds run that Hypothesis draws."""
+
 FEW = {Agreement: 2, Alike: 2, Never: 8}
-"""Batches of a kind that is dear: of the oracle, of many copies, of many steps."""
+"""Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
 
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """How much is tested: so many random worlds, at most so many seconds, from this seed on."""
+    """How much is tested: the number of random worlds, the time limit in seconds, the first seed."""
 
     examples: int = 1000
     seconds: float = 60.0
@@ -67,7 +73,7 @@ class _Trial:
     """The lines that stand in the way of a proof."""
     worlds: int = 0
     batches: int = 0
-    sample: Sample | None = None
+    sample: Start | None = None
     steps: int = 0
 
     @property
@@ -89,7 +95,7 @@ class InvariantSearch:
     def of(
         cls, runner: Runs, plan: SearchPlan, declared_only: bool = False, ledger: Ledger | None = None
     ) -> InvariantSearch:
-        """Everything that can be proven is; the rest is to be tried. `declared_only`: nothing that no pack says.
+        """Prove what can be proven; the rest is to be tried. `declared_only`: leave out what no pack claims.
 
         `ledger`: that of the rules, if it is known already.
         """
@@ -113,7 +119,7 @@ class InvariantSearch:
         return InvariantSearch(self.runner, self.plan, self.ledger, {}, trials)
 
     def try_random(self) -> None:
-        """Random worlds, until there are enough of them, or time is over."""
+        """Try random worlds until there are enough of them, or time is up."""
         until = monotonic() + self.plan.seconds
         for number, sample in enumerate(
             random_samples(self.runner.ruleset, self.plan.seed, self.plan.examples)
@@ -122,8 +128,8 @@ class InvariantSearch:
                 return
             self.try_sample(sample, STEPS[number % len(STEPS)])
 
-    def try_sample(self, sample: Sample, steps: int) -> None:
-        """Hold all properties that are not broken yet against some worlds."""
+    def try_sample(self, sample: Start, steps: int) -> None:
+        """Check all properties that are not broken yet on some worlds."""
         waiting: dict[frozenset[int], list[_Trial]] = {}
         for trial in self.trials:
             if trial.sample is None:
@@ -131,7 +137,7 @@ class InvariantSearch:
         for without, trials in waiting.items():
             self._try_without(trials, sample.without(without, self.runner.ruleset), steps)
 
-    def _try_without(self, trials: list[_Trial], sample: Sample, steps: int) -> None:
+    def _try_without(self, trials: list[_Trial], sample: Start, steps: int) -> None:
         """Properties that demand the same of a start world: one run does for most of them."""
         shared = [t for t in trials if not is_paired(t.claim) and steps_for(t.claim, steps) == steps]
         if shared:
@@ -149,7 +155,7 @@ class InvariantSearch:
             ran = steps_for(trial.claim, min(steps, 3))
             self._note(trial, some, breaks(trial.claim, self.runner, some, ran))
 
-    def _note(self, trial: _Trial, sample: Sample, found: Breaks) -> None:
+    def _note(self, trial: _Trial, sample: Start, found: Breaks) -> None:
         trial.batches += 1
         trial.worlds += int(found.counts.sum())
         broken = np.nonzero(found.first)[0]
@@ -242,7 +248,7 @@ def trials_alone(
 def counterexample(
     claim: Tested,
     runner: Runs,
-    sample: Sample,
+    sample: Start,
     steps: int,
     work: Work | None = None,
     without: frozenset[int] = frozenset(),
@@ -251,7 +257,7 @@ def counterexample(
     return as_it_is(claim, runner, *shrink(claim, runner, sample, steps, work, without))
 
 
-def as_it_is(claim: Tested, runner: Runs, small: Sample, steps: int) -> Counterexample:
+def as_it_is(claim: Tested, runner: Runs, small: Start, steps: int) -> Counterexample:
     """A world that breaks a claim, and the rules that did it."""
     cell = breaks(claim, runner, small, steps).cell[0]
     states = runner.states(small, steps)
@@ -291,7 +297,7 @@ def find_property(ruleset: Ruleset, text: str) -> Property | None:
 
 
 def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, str]]:
-    """The sums that the ledger decides, as claims: worlds that break one show a mistake in powderdsl."""
+    """The sums that the ledger decides, as claims: a world that breaks one shows a bug in powderdsl."""
     ids = {element.name: element.id for element in ruleset.elements}
     tables: tuple[tuple[str, Sequence[tuple[str, ...]]], ...] = (
         ("constant", ledger.constant_sums),
@@ -308,3 +314,45 @@ def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, st
                 Total(member(ELEMENT_HERE, numbers), trend, frozenset(numbers)),
                 f"count({', '.join(names)}) {verb}",
             )
+
+
+# Worlds that Hypothesis draws: it looks for them where random numbers rarely go
+
+
+def has_hypothesis() -> bool:
+    return find_spec("hypothesis") is not None
+
+
+def try_drawn(search: InvariantSearch, examples: int) -> int:
+    """Check the properties on worlds that Hypothesis draws, the same for the same seed; the number of worlds.
+
+    It makes nothing small: `shrink` tries hundreds of smaller worlds in one batch.
+    """
+    if examples == 0:
+        return 0
+    if "hypothesis" not in sys.modules:  # it would put a folder of its own into the working directory
+        from hypothesis.configuration import set_hypothesis_home_dir
+
+        set_hypothesis_home_dir(cache_folder("hypothesis"))
+    from hypothesis import HealthCheck, Phase, given, seed, settings
+
+    from powderdsl.testing.generators.strategies import worlds
+
+    count = 0
+
+    @seed(search.plan.seed)
+    @settings(
+        max_examples=examples,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(worlds(search.runner.ruleset, max_batch=2, max_side=9))
+    def run(start: Start) -> None:
+        nonlocal count
+        count += 1
+        search.try_sample(start.seeded(), DRAWN_STEPS)
+
+    run()
+    return count

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from powderdsl.model.types import Ruleset
+from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.breaks import Agreement, Alike, Runs, Tested, breaks, is_paired, steps_for
-from powderdsl.testing.properties.samples import Array, Sample
+from powderdsl.testing.properties.samples import joined
 
 SEEDS = 24
 """How many seeds each smaller world is tried with, its own first."""
@@ -31,94 +32,98 @@ RULE = 15_000
 class Work:
     """Work that is left, counted in cells that rules look at: a limit in seconds would end elsewhere in each run."""
 
-    rules: int
-    left: int
-    side_multiple: int = 1
-    """Worlds whose sides are not multiples of it are not tried: the rules do not allow them."""
+    ruleset: Ruleset
+    left: int = WORK
 
-    @classmethod
-    def of(cls, ruleset: Ruleset, left: int = WORK) -> Work:
-        """So much work with the rules of a ruleset."""
-        rules = 1 + sum(len(moment.rules) for one in ruleset.passes for moment in one.moments)
-        return cls(rules, left, ruleset.side_multiple)
-
-    def allows(self, sample: Sample) -> bool:
-        return all(side % self.side_multiple == 0 for side in sample.shape)
-
-    def spend(self, batch: Sample, steps: int) -> None:
-        self.left -= self.rules * steps * (RULE + batch.ids.size)
+    def spend(self, batch: Start, steps: int) -> None:
+        rules = 1 + sum(len(moment.rules) for one in self.ruleset.passes for moment in one.moments)
+        self.left -= rules * steps * (RULE + batch.ids.size)
 
 
-Judge = Callable[[Sample, int], Array]
-"""After which step each world of a sample, run for so many steps, is what is looked for: int [B], 0 if it is not."""
+Judge = Callable[[Start, int], Array]
+"""After which step each world of a sample, run for that number of steps, is accepted: int [B], 0 if it is not."""
 
 
 def shrink(
     claim: Tested,
     runs: Runs,
-    sample: Sample,
+    sample: Start,
     steps: int,
     work: Work | None = None,
     without: frozenset[int] = frozenset(),
-) -> tuple[Sample, int]:
+) -> tuple[Start, int]:
     """The smallest world found that still breaks the claim, and after how many steps. `sample` is one world.
 
     It ends when no smaller world breaks the claim, or when the work is used up: a claim gives the same world each time.
     Worlds start without the elements `without`.
     """
-    work = Work.of(runs.ruleset) if work is None else work
     tries = 1 if isinstance(claim, Agreement | Alike) or not runs.ruleset.streams else SEEDS
     sample, steps = _later(claim, runs, sample, steps, without)
     sample, steps = shrink_while(
-        lambda some, most: breaks(claim, runs, some, most).first, sample, steps, tries, work
+        lambda some, most: breaks(claim, runs, some, most).first,
+        sample,
+        steps,
+        tries,
+        work or Work(runs.ruleset),
     )
     if not runs.ruleset.streams:
-        sample = replace(sample, seeds=np.zeros_like(sample.seeds))
+        sample = replace(sample, seed=np.zeros_like(sample.seed))
     return sample, steps
 
 
-def shrink_while(judge: Judge, sample: Sample, steps: int, tries: int, work: Work) -> tuple[Sample, int]:
+def shrink_while(judge: Judge, sample: Start, steps: int, tries: int, work: Work) -> tuple[Start, int]:
     """The smallest world found for which the judge still says yes, and after how many steps.
 
     Args:
         tries: with how many seeds each smaller world is tried, its own first.
         work: when it is used up, the search ends, even if something smaller might be found.
     """
-    while work.left > 0:
-        smaller = sample
-        for group in _GROUPS:
-            while work.left > 0:
-                candidates = [one for one in group(smaller) if work.allows(one)]
-                found = _first(judge, candidates, steps, tries, work)
-                if found is None:
-                    break
-                smaller, steps = found
-        for name in smaller.fields if work.left > 0 else ():  # without it, it is as in fresh cells
-            rest = {other: values for other, values in smaller.fields.items() if other != name}
-            found = _first(judge, [replace(smaller, fields=rest)], steps, tries, work)
-            if found is not None:
-                smaller, steps = found
-        if smaller is sample:
-            break
-        sample = smaller
+    multiple = work.ruleset.side_multiple
+
+    def find(candidates: list[Start]) -> Start | None:
+        nonlocal steps
+        allowed = [one for one in candidates if all(side % multiple == 0 for side in one.shape)]
+        found = _first(judge, allowed, steps, tries, work) if work.left > 0 else None
+        if found is None:
+            return None
+        smaller, steps = found
+        return smaller
+
+    sample = smallest(sample, find)
     found = _first(judge, _plain_seed(sample), steps, 1, work) if tries > 1 else None
     return found or (sample, steps)
 
 
+def smallest(start: Start, find: Callable[[list[Start]], Start | None]) -> Start:
+    """What is left of start worlds when nothing more can go.
+
+    Args:
+        find: one of some smaller starts that will do as well, or None.
+    """
+    while True:
+        smaller = start
+        for group in _GROUPS:
+            while (found := find(group(smaller))) is not None:
+                smaller = found
+        if smaller is start:
+            return start
+        start = smaller
+
+
 def _later(
-    claim: Tested, runs: Runs, sample: Sample, steps: int, without: frozenset[int]
-) -> tuple[Sample, int]:
+    claim: Tested, runs: Runs, sample: Start, steps: int, without: frozenset[int]
+) -> tuple[Start, int]:
     """The world as it was one step before it broke the claim, if it does so from there."""
     if is_paired(claim) or steps < 2 or steps_for(claim, steps) > steps:
         return sample, steps
     before = dict(runs.states(sample, steps - 1)[-1])
-    late = replace(sample, ids=before.pop("element"), clock=sample.clock + steps - 1, fields=before)
+    late = replace(sample, ids=before.pop("element"), step=sample.step + steps - 1, fields=before)
     if _holds(late, without, runs.ruleset):
         return sample, steps
     return (late, 1) if breaks(claim, runs, late, 1).first.any() else (sample, steps)
 
 
-def _holds(sample: Sample, elements: frozenset[int], ruleset: Ruleset) -> bool:
+def _holds(sample: Start, elements: frozenset[int], ruleset: Ruleset) -> bool:
     """Whether some of these elements are there, in cells or in fields."""
     other = sample.without(elements, ruleset)
     same = [np.array_equal(sample.ids, other.ids)]
@@ -127,57 +132,62 @@ def _holds(sample: Sample, elements: frozenset[int], ruleset: Ruleset) -> bool:
 
 
 def _first(
-    judge: Judge, candidates: list[Sample], steps: int, tries: int, work: Work
-) -> tuple[Sample, int] | None:
+    judge: Judge, candidates: list[Start], steps: int, tries: int, work: Work
+) -> tuple[Start, int] | None:
     """The first of these worlds of one shape that the judge accepts, with the seed that does it soonest."""
     most = max(MAX_BATCH // tries, 1)
-    for start in range(0, len(candidates), most):
-        some = candidates[start : start + most]
-        batch = _together([_seeded(one, number) for one in some for number in range(tries)])
+    for at in range(0, len(candidates), most):
+        some = [_seeded(one, number) for one in candidates[at : at + most] for number in range(tries)]
+        batch = joined(some, work.ruleset)
         work.spend(batch, steps)
         first = judge(batch, steps)
         broken = np.nonzero(first)[0]
         if len(broken):
             best = min(broken.tolist(), key=lambda i: (i // tries, first[i], i))
-            return batch.one(best), int(first[best])
+            return some[best], int(first[best])
     return None
 
 
-def _seeded(sample: Sample, number: int) -> Sample:
-    return replace(sample, seeds=np.array([number - 1])) if number else sample
-
-
-def _together(samples: list[Sample]) -> Sample:
-    """Worlds of one shape that have the same fields, as one batch."""
-    first = samples[0]
-    return Sample(
-        np.concatenate([one.ids for one in samples]),
-        np.concatenate([one.seeds for one in samples]),
-        np.concatenate([one.clock for one in samples]),
-        {name: np.concatenate([one.fields[name] for one in samples]) for name in first.fields},
-        {name: np.concatenate([one.params[name] for one in samples]) for name in first.params},
-    )
+def _seeded(sample: Start, number: int) -> Start:
+    return replace(sample, seed=np.array([number - 1])) if number else sample
 
 
 # Smaller worlds, in the order in which they are tried
 
 
-def _plain(sample: Sample) -> list[Sample]:
+def _single(sample: Start) -> list[Start]:
+    """One world of several."""
+    return [sample.one(world) for world in range(len(sample))] if len(sample) > 1 else []
+
+
+def _plain(sample: Start) -> list[Start]:
     """Without its fields and parameters, at the first step."""
-    if sample.fields or sample.params or sample.clock.any():
-        return [replace(sample, fields={}, params={}, clock=np.zeros(1, np.int64))]
+    if sample.fields or sample.params or sample.step.any():
+        return [replace(sample, fields={}, params={}, step=np.zeros_like(sample.step))]
     return []
 
 
-def _fresh(sample: Sample) -> list[Sample]:
+def _fresh(sample: Start) -> list[Start]:
     return [replace(sample, fields={})] if sample.fields else []
 
 
-def _usual(sample: Sample) -> list[Sample]:
+def _usual(sample: Start) -> list[Start]:
     return [replace(sample, params={})] if sample.params else []
 
 
-def _fewer_fields(sample: Sample) -> list[Sample]:
+def _early(sample: Start) -> list[Start]:
+    return [replace(sample, step=np.zeros_like(sample.step))] if sample.step.any() else []
+
+
+def _absent_fields(sample: Start) -> list[Start]:
+    """With one field as in fresh cells."""
+    return [
+        replace(sample, fields={name: values for name, values in sample.fields.items() if name != gone})
+        for gone in sample.fields
+    ]
+
+
+def _fewer_fields(sample: Start) -> list[Start]:
     """With one field that is 0 everywhere."""
     return [
         replace(sample, fields={**sample.fields, name: np.zeros_like(values)})
@@ -186,7 +196,7 @@ def _fewer_fields(sample: Sample) -> list[Sample]:
     ]
 
 
-def _fewer_values(sample: Sample) -> list[Sample]:
+def _fewer_values(sample: Start) -> list[Start]:
     """With one value of a field that is 0."""
     found = []
     for name, values in sample.fields.items():
@@ -197,21 +207,17 @@ def _fewer_values(sample: Sample) -> list[Sample]:
     return found
 
 
-def _plain_seed(sample: Sample) -> list[Sample]:
+def _plain_seed(sample: Start) -> list[Start]:
     """With a seed that is easy to write."""
-    if 0 <= int(sample.seeds[0]) < SEEDS:
+    if 0 <= int(sample.seed[0]) < SEEDS:
         return []
-    return [replace(sample, seeds=np.array([number])) for number in range(SEEDS)]
+    return [replace(sample, seed=np.array([number])) for number in range(SEEDS)]
 
 
-def _early(sample: Sample) -> list[Sample]:
-    return [replace(sample, clock=np.zeros(1, np.int64))] if sample.clock.any() else []
-
-
-def _parts(axis: int, halves: bool) -> Callable[[Sample], list[Sample]]:
+def _parts(axis: int, halves: bool) -> Callable[[Start], list[Start]]:
     """Worlds with half of the rows (axis 0) or columns (axis 1), or with one less."""
 
-    def group(sample: Sample) -> list[Sample]:
+    def group(sample: Start) -> list[Start]:
         size = sample.shape[axis]
         if size < 2 or (halves and size < 4):
             return []
@@ -226,7 +232,7 @@ def _parts(axis: int, halves: bool) -> Callable[[Sample], list[Sample]]:
     return group
 
 
-def _cut(sample: Sample, axis: int, keep: np.ndarray) -> Sample:
+def _cut(sample: Start, axis: int, keep: np.ndarray) -> Start:
     place = axis - 2  # rows and columns are the last axes of every array
     return replace(
         sample,
@@ -235,7 +241,7 @@ def _cut(sample: Sample, axis: int, keep: np.ndarray) -> Sample:
     )
 
 
-def _fewer_kinds(sample: Sample) -> list[Sample]:
+def _fewer_kinds(sample: Start) -> list[Start]:
     """All cells of one element replaced by the lowest that is there."""
     ground = sample.ids.min()
     return [
@@ -245,18 +251,19 @@ def _fewer_kinds(sample: Sample) -> list[Sample]:
     ]
 
 
-def _fewer_cells(sample: Sample) -> list[Sample]:
+def _fewer_cells(sample: Start) -> list[Start]:
     """One cell replaced by the lowest element that is there."""
     ground = sample.ids.min()
     found = []
-    for row, column in np.argwhere(sample.ids[0] != ground).tolist():
+    for place in np.argwhere(sample.ids != ground).tolist():
         ids = sample.ids.copy()
-        ids[0, row, column] = ground
+        ids[tuple(place)] = ground
         found.append(replace(sample, ids=ids))
     return found
 
 
-_GROUPS: tuple[Callable[[Sample], list[Sample]], ...] = (
+_GROUPS: tuple[Callable[[Start], list[Start]], ...] = (
+    _single,
     _plain,
     _parts(0, True),
     _parts(1, True),
@@ -269,4 +276,5 @@ _GROUPS: tuple[Callable[[Sample], list[Sample]], ...] = (
     _fewer_kinds,
     _fewer_cells,
     _fewer_values,
+    _absent_fields,
 )

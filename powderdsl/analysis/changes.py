@@ -131,14 +131,13 @@ def ledger_facts(ruleset: Ruleset) -> Facts:
 def find_changes(ruleset: Ruleset, facts: Facts) -> list[Found]:
     """What each line may do, in the order in which the lines run first."""
     found: dict[RuleLine, Found] = {}
-    for pass_ in ruleset.passes:
-        for moment in pass_.moments:
-            asked = Asked.of(moment, facts)
-            for rule in moment.rules:
-                line = rule_line(rule, pass_)
-                _look_at(rule, asked, found.setdefault(line, Found(line)))
-            for rule, pairs in _chains(asked):
-                found[rule_line(rule, pass_)].pairs |= pairs
+    for pass_, moment in ruleset.substeps():
+        asked = Asked.of(moment, facts)
+        for rule in moment.rules:
+            line = rule_line(rule, pass_)
+            _look_at(rule, asked, found.setdefault(line, Found(line)))
+        for rule, pairs in _chains(asked):
+            found[rule_line(rule, pass_)].pairs |= pairs
     return list(found.values())
 
 
@@ -159,13 +158,13 @@ def _look_at(rule: Rule, asked: Asked, found: Found) -> None:
         case Transform():
             found.pairs |= set(becomes(rule, asked, found.pairs))
         case Swap():
-            found.moves |= set(_pushed(rule, asked, found.moves))
+            found.moves |= {a for a in _left(asked, found.moves) if _pushed(rule, a, asked)}
             found.moves |= {
                 a for a in _left(asked, found.moves) if asked.may(rule, is_(a), is_not(a, rule.offset))
             }
         case Move():
             left = rule.leaving.value
-            found.moves |= set(_pushed(rule, asked, found.moves))
+            found.moves |= {a for a in _left(asked, found.moves) if _pushed(rule, a, asked)}
             found.moves |= {a for a in _left(asked, found.moves) if a != left and asked.may(rule, is_(a))}
             found.pairs |= {(x, left) for x in overwritten(rule, asked) if x != left}
     found.writes += rule.effects
@@ -176,11 +175,9 @@ def _left(asked: Asked, known: set[int]) -> Iterable[int]:
     return [number for number in asked.facts.ids if number not in known]
 
 
-def _pushed(rule: Swap | Move, asked: Asked, known: set[int]) -> Iterator[int]:
-    """Elements at the place where another element goes."""
-    for number in _left(asked, known):
-        if asked.may(rule, is_(number, rule.offset), is_not(number)):
-            yield number
+def _pushed(rule: Swap | Move, number: int, asked: Asked) -> bool:
+    """Whether an element may be at the place where another element goes."""
+    return asked.may(rule, is_(number, rule.offset), is_not(number))
 
 
 def overwritten(rule: Move, asked: Asked) -> list[int]:

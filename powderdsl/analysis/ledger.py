@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
-from powderdsl.analysis.ledger.absent import Wants, find_wants, named_by_fields
-from powderdsl.analysis.ledger.changes import Found, RuleLine, find_changes, ledger_facts
-from powderdsl.analysis.ledger.field_writes import FieldEntry, find_fields
-from powderdsl.analysis.ledger.overlaps import Overlap, find_overlaps
-from powderdsl.analysis.ledger.sums import constant_sums, falling_sums, in_order, rising_sums
+from powderdsl.analysis.absent import Wants, find_wants, named_by_fields
+from powderdsl.analysis.changes import Found, RuleLine, find_changes, ledger_facts
+from powderdsl.analysis.field_writes import FieldEntry, find_fields
+from powderdsl.analysis.overlaps import Overlap, find_overlaps
 from powderdsl.model.types import Ruleset
 
 
@@ -91,18 +90,50 @@ class Ledger:
 
     @cached_property
     def constant_sums(self) -> tuple[tuple[str, ...], ...]:
-        """The smallest sums of elements that are constant: see `sums.constant_sums`."""
-        return constant_sums(self.elements, self.changes)
+        """The smallest sums of elements that no single change alters; every other such sum is made of them.
+
+        A change turns one cell of `a` into one of `b`: weights w keep the total if w(a) = w(b). So they are equal
+        within each connected part of the graph of changes, and the parts are the sums.
+        """
+        group = {name: [name] for name in self.elements}
+        for before, after in self.changes:
+            if group[before] is not group[after]:
+                group[before] += group[after]
+                group |= dict.fromkeys(group[after], group[before])
+        parts = {id(part): part for part in group.values()}.values()
+        return tuple(self._in_order(part) for part in parts)
 
     @cached_property
     def rising_sums(self) -> tuple[tuple[str, ...], ...]:
-        """The smallest sums of elements that never fall and are not constant: see `sums.rising_sums`."""
-        return rising_sums(self.elements, self.changes)
+        """For each element the smallest sum with it that never falls, without those that are constant.
+
+        It holds all that the element may become. Every other sum of different elements that cannot fall is joined of
+        these and of constant ones.
+        """
+        return self._closed_sums(self.changes)
 
     @cached_property
     def falling_sums(self) -> tuple[tuple[str, ...], ...]:
-        """The smallest sums of elements that never rise and are not constant."""
-        return falling_sums(self.elements, self.changes)
+        """The same for sums that never rise: all that may become the element."""
+        return self._closed_sums([(after, before) for before, after in self.changes])
+
+    def _closed_sums(self, pairs: Iterable[tuple[str, str]]) -> tuple[tuple[str, ...], ...]:
+        """Each element with everything that it reaches along some pairs, without the constant sums."""
+        reached: dict[tuple[str, ...], None] = {}
+        for start in self.elements:
+            found, fresh = {start}, [start]
+            while fresh:
+                name = fresh.pop()
+                more = [after for before, after in pairs if before == name and after not in found]
+                found.update(more)
+                fresh += more
+            reached[self._in_order(found)] = None
+        return tuple(names for names in reached if names not in self.constant_sums)
+
+    def _in_order(self, chosen: Iterable[str]) -> tuple[str, ...]:
+        """Some elements in the order of their ids."""
+        kept = set(chosen)
+        return tuple(name for name in self.elements if name in kept)
 
     def conserved(self, weights: Mapping[str, int]) -> Verdict:
         """Whether the weighted number of cells is constant: ``{"a": 1, "b": 1}`` is the sum of two elements.
@@ -171,7 +202,7 @@ class Ledger:
                 if before in cells and (after in known or after not in entry.copies)
             }
             if more <= cells:
-                return in_order(self.elements, cells)
+                return self._in_order(cells)
             cells |= more
             known |= more
 

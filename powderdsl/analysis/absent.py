@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from powderdsl.analysis.ledger.changes import HERE, Asked, RuleLine, rule_line
+from powderdsl.analysis.changes import HERE, Asked, RuleLine, rule_line
 from powderdsl.model.expressions.operands import FALSE, TRUE, conjunction, disjunction, look, member, negation
 from powderdsl.model.logic.satisfy import Facts
 from powderdsl.model.types import ELEMENT, Assign, Expr, Let, Move, Rule, Ruleset, Transform, integer
@@ -55,9 +55,8 @@ def _wants(rule: Rule, asked: Asked, lets: list[Let], named: Ids) -> Wants:
     nodes = list(_nodes_of(rule, {**{let.name: let.value for let in lets}, **asked.lets}))
     reads_names = any(node.op in ("field", "let") and node.kind == ELEMENT for node in nodes)
     sets = [frozenset(node.value) for node in nodes if node.op == "member"]
-    candidates = [frozenset({number}) for number in asked.facts.ids] + sorted(
-        dict.fromkeys(sets), key=_by_size
-    )
+    candidates = [frozenset({number}) for number in asked.facts.ids]
+    candidates += sorted(dict.fromkeys(sets), key=_by_size)
     needs: list[Ids] = []
     copies: set[int] = set()
     for ids in candidates:
@@ -87,18 +86,13 @@ def named_by_fields(ruleset: Ruleset) -> Ids:
     found: set[int] = set()
     fields = [*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)]
     found |= {int(value) for item in fields if item.kind == ELEMENT for value in item.defaults}
-    for pass_ in ruleset.passes:
-        for moment in pass_.moments:
-            values = [let.value for let in moment.lets]
-            for rule in moment.rules:
-                values += [one.value for one in ([rule] if isinstance(rule, Assign) else rule.effects)]
-            found |= {int(n.value) for v in values if v.kind == ELEMENT for n in v.walk() if is_name(n)}
+    for _, moment in ruleset.substeps():
+        values = [let.value for let in moment.lets]
+        for rule in moment.rules:
+            values += [one.value for one in ([rule] if isinstance(rule, Assign) else rule.effects)]
+        nodes = [node for value in values if value.kind == ELEMENT for node in value.walk()]
+        found |= {int(node.value) for node in nodes if node.op == "const" and node.kind == ELEMENT}
     return frozenset(found)
-
-
-def is_name(node: Expr) -> bool:
-    """Whether an expression is an element, written out."""
-    return node.op == "const" and node.kind == ELEMENT
 
 
 def _nodes_of(rule: Rule, lets: dict[str, Expr]) -> Iterator[Expr]:

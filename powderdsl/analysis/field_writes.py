@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from powderdsl.analysis.ledger.changes import Found, RuleLine
+from powderdsl.analysis.changes import Found, RuleLine
 from powderdsl.model.text import element_name, show_value
 from powderdsl.model.types import Assign, Kind, Ruleset
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
-from powderdsl.analysis.ledger.changes import HERE, Asked, RuleLine, footprint, possible, rule_line
-from powderdsl.model.expressions.operands import negation
+from powderdsl.analysis.changes import HERE, Asked, RuleLine, footprint, is_not, possible, rule_line
 from powderdsl.model.logic.satisfy import Facts
 from powderdsl.model.types import Assign, Expr, Offset, Pass, Rule, Ruleset, Transform
+
+T = TypeVar("T")
 
 OUTCOMES = {
     "first wins": "both claim a cell at once: the first one happens",
@@ -39,12 +41,11 @@ class Overlap:
 def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
     """Every two lines that could not be shown to keep apart, in the order in which they run."""
     found: dict[Overlap, None] = {}
-    for pass_ in ruleset.passes:
-        for moment in pass_.moments:
-            asked = Asked.of(moment, facts)
-            live = [rule for rule in moment.rules if rule.mask is None or asked.may(rule)]
-            found |= dict.fromkeys(_claims(asked, pass_, found))
-            found |= dict.fromkeys(_writes(live, asked, pass_, found))
+    for pass_, moment in ruleset.substeps():
+        asked = Asked.of(moment, facts)
+        live = [rule for rule in moment.rules if rule.mask is None or asked.may(rule)]
+        found |= dict.fromkeys(_claims(asked, pass_, found))
+        found |= dict.fromkeys(_writes(live, asked, pass_, found))
     found |= dict.fromkeys(_in_turn(ruleset, facts, found))
     return tuple(found)
 
@@ -84,25 +85,27 @@ def _alike(first: Rule, second: Rule) -> bool:
 
 def _writes(rules: list[Rule], asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
     """Writes of one field in one substep whose order makes a difference. Roundings of floats are left out."""
-    plain = [(rule, rule.mask, rule) for rule in rules if isinstance(rule, Assign)]
-    effects = [
-        (effect, rule.mask, rule) for rule in rules if not isinstance(rule, Assign) for effect in rule.effects
-    ]
+    plain = [(rule, rule) for rule in rules if isinstance(rule, Assign)]
+    effects = [(effect, rule) for rule in rules if not isinstance(rule, Assign) for effect in rule.effects]
     for writes in (plain, effects):
-        for i, (b, second, second_rule) in enumerate(writes):
-            for a, first, first_rule in writes[:i]:
-                outcome = order_matters(a, b)
-                if not outcome or first is None or second is None:
-                    continue
-                apart = first_rule is not second_rule and asked.moment.policy != "prove"
-                if apart and _own_cells(first_rule, a) and _own_cells(second_rule, b):
-                    continue  # rules that happen never share a cell
-                overlap = Overlap(
-                    outcome, rule_line(first_rule, pass_), rule_line(second_rule, pass_), a.field
-                )
-                at = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
-                if overlap not in known and _meet(first, second, at, asked):
-                    yield overlap
+        for (a, first), (b, second) in _pairs(writes):
+            outcome = order_matters(a, b)
+            if not outcome or first.mask is None or second.mask is None:
+                continue
+            apart = first is not second and asked.moment.policy != "prove"
+            if apart and _own_cells(first, a) and _own_cells(second, b):
+                continue  # rules that happen never share a cell
+            overlap = Overlap(outcome, rule_line(first, pass_), rule_line(second, pass_), a.field)
+            at = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
+            if overlap not in known and _meet(first.mask, second.mask, at, asked):
+                yield overlap
+
+
+def _pairs(items: Sequence[T]) -> Iterator[tuple[T, T]]:
+    """Every two items, by the second one first: the order in which both have run."""
+    for number, second in enumerate(items):
+        for first in items[:number]:
+            yield first, second
 
 
 def _own_cells(rule: Rule, effect: Assign) -> bool:
@@ -133,27 +136,24 @@ def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iter
     """Transforms of different substeps that could happen to one cell of one world, with different results."""
     rules = [
         (number, pass_, rule, _renamed_lets(moment.lets, number), _renamed(rule.mask, number))
-        for number, (pass_, moment) in enumerate((p, m) for p in ruleset.passes for m in p.moments)
+        for number, (pass_, moment) in enumerate(ruleset.substeps())
         for rule in moment.rules
         if isinstance(rule, Transform)
     ]
     if len({rule.span for _, _, rule, _, _ in rules}) > MAX_LINES:
         return
     seen = set(known)
-    for i, (number, pass_, rule, lets, mask) in enumerate(rules):
-        for other, other_pass, earlier, other_lets, other_mask in rules[:i]:
-            if other == number or (earlier.target == rule.target and rule.target.op == "const"):
-                continue
-            overlap = Overlap("first in turn", rule_line(earlier, other_pass), rule_line(rule, pass_))
-            changing = [
-                (negation(Expr("member", mask.kind, (Expr("element", t.kind),), frozenset({t.value}))), HERE)
-                for t in (rule.target, earlier.target)
-                if t.op == "const"
-            ]
-            conditions = [(other_mask, HERE), (mask, HERE), *changing]
-            if overlap not in seen and possible(facts, conditions, {**other_lets, **lets}):
-                seen.add(overlap)
-                yield overlap
+    for (other, other_pass, earlier, other_lets, other_mask), (number, pass_, rule, lets, mask) in _pairs(
+        rules
+    ):
+        if other == number or (earlier.target == rule.target and rule.target.op == "const"):
+            continue
+        overlap = Overlap("first in turn", rule_line(earlier, other_pass), rule_line(rule, pass_))
+        changing = [is_not(t.value) for t in (rule.target, earlier.target) if t.op == "const"]
+        conditions = [(other_mask, HERE), (mask, HERE), *changing]
+        if overlap not in seen and possible(facts, conditions, {**other_lets, **lets}):
+            seen.add(overlap)
+            yield overlap
 
 
 def _renamed(expr: Expr, number: int) -> Expr:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from powderdsl.analysis.ledger.book import Ledger, RuleEntry
-from powderdsl.analysis.ledger.changes import RuleLine
-from powderdsl.analysis.ledger.field_writes import FieldEntry
-from powderdsl.analysis.ledger.overlaps import OUTCOMES
+from powderdsl.analysis.changes import RuleLine
+from powderdsl.analysis.field_writes import FieldEntry
+from powderdsl.analysis.ledger import Ledger, RuleEntry
+from powderdsl.analysis.overlaps import OUTCOMES
 
 SCHEMA = 1
 """The version of the JSON form. It changes when a key changes its meaning or goes; new keys may come without."""

@@ -1,0 +1,108 @@
+"""YAML as plain Python values, written and read, with arrays that people can read: the last axis a line of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.syntax.sources import read_source
+from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
+from powderdsl.system.writing import failure
+
+Array = NDArray[Any]
+
+Tree = str | list["Tree"] | dict[str, "Tree"]
+"""YAML as Python values; every scalar is text."""
+
+
+def write_yaml(tree: Tree, indent: str = "") -> str:
+    """Block-style YAML of nested mappings, lists and texts."""
+    if isinstance(tree, str):
+        plain = (
+            tree
+            and tree[0] not in "#-%?@`\"'[]{}&*!|>,:"
+            and ": " not in tree
+            and " #" not in tree
+            and not tree.endswith(":")
+        )
+        return (
+            f" {tree}\n" if plain or (len(tree) > 1 and tree[0] == "-" and tree[1] != " ") else f" '{tree}'\n"
+        )
+    lines = []
+    pairs = (
+        [(f"{key}:", value) for key, value in tree.items()]
+        if isinstance(tree, dict)
+        else [("-", value) for value in tree]
+    )
+    for head, value in pairs:
+        body = write_yaml(value, indent + "  ")
+        lines.append(f"{indent}{head}" + (body if isinstance(value, str) else "\n" + body))
+    return "".join(lines) if lines else f"{indent}{{}}\n"
+
+
+def to_tree(node: Node) -> Tree:
+    """Located YAML as plain Python values."""
+    if isinstance(node, Scalar):
+        return node.text
+    if isinstance(node, Mapping):
+        return {key.text: to_tree(value) for key, value in node.entries}
+    return [to_tree(item) for item in node.items]
+
+
+def write_array(values: Array) -> Tree:
+    """An array as a tree; floats as the shortest text that means the same float32."""
+    if values.ndim == 1:
+        return " ".join(str(value) for value in values)
+    return [write_array(part) for part in values]
+
+
+def read_array(tree: Tree, dtype: str) -> Array:
+    """The array of a tree. Raises ValueError, OverflowError or AssertionError for anything else."""
+
+    def nested(part: Tree) -> list:
+        if isinstance(part, str):
+            return [np.dtype(dtype).type(word) for word in part.split()]
+        assert isinstance(part, list)
+        return [nested(item) for item in part]
+
+    return np.asarray(nested(tree), dtype)
+
+
+def line_of(tree: Tree) -> str:
+    """A scalar. Raises AssertionError for anything else."""
+    assert isinstance(tree, str)
+    return tree
+
+
+def entries_of(tree: Tree | None) -> list[tuple[str, Tree]]:
+    """The entries of a mapping; no entries for None. Raises AssertionError for anything else."""
+    assert tree is None or isinstance(tree, dict)
+    return list((tree or {}).items())
+
+
+@contextmanager
+def reading(problem: str, fix: str) -> Iterator[None]:
+    """Turn what the functions above raise into a diagnostic: PD602 with `problem`, the reason and `fix` as its help."""
+    try:
+        yield
+    except CompileError:
+        raise
+    except (AssertionError, KeyError, ValueError, TypeError, OverflowError) as error:
+        text = " ".join(str(error).split())
+        note = f"{type(error).__name__}: {text}" if text else "a part is missing"
+        raise failure("PD602", problem, notes=(note,), helps=(fix,)) from None
+
+
+def read_yaml(path: Path) -> Tree | None:
+    """The tree in a file, None if it is empty. Raises CompileError (PD1xx) if it cannot be read."""
+    reporter = Reporter()
+    source = read_source(path, reporter)
+    root = parse_yaml(source, reporter) if source is not None else None
+    reporter.raise_if_errors()
+    return None if root is None else to_tree(root)
