@@ -27,14 +27,14 @@ RENDER_MODES = ("rgb_array", "ansi")
 
 
 def check_render_mode(mode: str | None) -> str | None:
-    """A render mode that there is. Raises ValueError for another."""
+    """The same render mode. Raises ValueError if it is unknown."""
     if mode is not None and mode not in RENDER_MODES:
         raise ValueError(f"render_mode is one of {', '.join(RENDER_MODES)}; found {mode!r}")
     return mode
 
 
 def frames(env: TensorEnv, mode: str, factor: int) -> tuple[Any, ...]:
-    """Of each world uint8 [H·factor, W·factor, 3], or its rows as glyphs."""
+    """A picture of each world, uint8 [H·factor, W·factor, 3], or its rows as text."""
     if env.episodes is None:
         raise ResetNeeded("reset the environment before rendering it")
     world = env.episodes.world
@@ -103,14 +103,14 @@ class PowderVectorEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """What `TensorEnv.reset` does, in arrays."""
+        """`TensorEnv.reset` with arrays."""
         observed, info = self.tensors.reset(seed=seed, options=options)  # first: a bad seed changes nothing
         if isinstance(seed, int):
             super().reset(seed=seed)
         return array(observed), arrays(info)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """What `TensorEnv.step` does, in arrays. ``final_obs`` is an array of objects: None but where episodes ended."""
+        """`TensorEnv.step` with arrays. ``final_obs`` is an array of objects: None unless the episode ended."""
         observed, reward, terminated, truncated, info = self.tensors.step(actions)
         found = arrays(info)
         if "final_obs" in info:
@@ -125,7 +125,7 @@ class PowderVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 class PowderEnv(gymnasium.Env[Array, NDArray[np.int64]], EzPickle):
-    """One world. It plays what slot 0 of a `PowderVectorEnv` of the same seed plays.
+    """One world: the same episodes as environment 0 of a `PowderVectorEnv` with the same seed.
 
     Pickling keeps what it was made with, not the world in it.
 

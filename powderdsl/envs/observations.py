@@ -1,4 +1,4 @@
-"""What an agent sees of a world: the kinds of observations, each a Gymnasium space and a function on tensors."""
+"""Observations of worlds, of several kinds: each has a Gymnasium space and a function on tensors."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ KINDS = ("ids", "compact", "matrix", "rgb")
 
 @dataclass(frozen=True)
 class Observation:
-    """One kind of observation of worlds of one ruleset and size. Channels come first, but in pictures.
+    """One kind of observation of worlds of one ruleset and size. Channels come first, except in pictures.
 
-    ``ids``: uint8 [1, H, W], element ids. ``compact``: uint8 [C, H, W], all that lasts from step to step, as
+    ``ids``: uint8 [1, H, W], element ids. ``compact``: uint8 [C, H, W], everything that lasts from step to step, as
     `Observer.compact` codes it. ``matrix``: float32 [C, H, W], as the ruleset's `matrix:` names its channels (the
     paper's 20). ``rgb``: uint8 [H, W, 3].
     """
@@ -30,7 +30,7 @@ class Observation:
     space: Box
     """Of one world."""
     channels: tuple[str, ...]
-    """What the channels are."""
+    """The names of the channels."""
 
     def of(self, world: World) -> Tensor:
         """The observations of a batch, in memory of their own: [B, *space.shape]."""
@@ -44,7 +44,7 @@ class Observation:
 
 
 def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
-    """What the channels of a kind of observation are. Raises ValueError for a kind that there is not."""
+    """The names of the channels of a kind of observation. Raises ValueError for an unknown kind."""
     known = {
         "ids": ("element",),
         "compact": observer.compact_names,
@@ -58,7 +58,7 @@ def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
 
 
 def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
-    """The observation of a kind. Raises ValueError for one that there is not."""
+    """The observation of a kind. Raises ValueError for an unknown kind."""
     observer, ruleset = simulator.observer, simulator.ruleset
     channels = channels_of(kind, observer)
     shape = (*size, 3) if kind == "rgb" else (len(channels), *size)

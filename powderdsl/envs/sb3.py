@@ -82,11 +82,11 @@ class PowderVecEnv(VecEnv):
         return array(observed), array(reward), done, infos
 
     def state(self) -> dict[str, Any]:
-        """What `TensorEnv.state` gives."""
+        """The result of `TensorEnv.state`."""
         return self.tensors.state()
 
     def restore(self, state: Mapping[str, Any]) -> Array:
-        """What `TensorEnv.restore` does; seeds and options that no reset has used are forgotten."""
+        """Continue from a state, as `TensorEnv.restore`; seeds and options that no reset has used are forgotten."""
         observed = self.tensors.restore(state)
         self._reset_seeds()
         self._reset_options()

@@ -23,16 +23,16 @@ Info = dict[str, Any]
 
 OPTIONS = ("params", "worlds", "reset_mask")
 ROWS = ("base", "episode", "returned", "ended")
-"""Attributes, with `_` before them, that `TensorEnv.state` saves: a number for each slot."""
+"""Attributes, with `_` before them, that `TensorEnv.state` saves: one number for each environment."""
 
 LAST_ACTIONS = ("auto", "truncates", "terminates")
 
 
 def world_seeds(base: Tensor, episode: Tensor, worlds: int) -> Tensor:
-    """Which world each slot plays: int64 [B].
+    """The number of the world that each environment plays: int64 [B].
 
-    Episode 0 of a slot whose seed is `base` plays world `base`. Later ones play worlds below `worlds`, drawn by a hash
-    of `base` and `episode` (both int64 [B]), so that no slot depends on what happens in others.
+    Episode 0 of an environment whose seed is `base` plays world `base`. Later ones play worlds below `worlds`, drawn by
+    a hash of `base` and `episode` (both int64 [B]), so that environments do not depend on one another.
     """
     key = mix(mix(base & MASK) ^ ((base >> 32) & MASK))
     high, low = mix((key + episode) & MASK), mix((key ^ mix(episode & MASK)) & MASK)
@@ -48,18 +48,18 @@ class TensorEnv:
             a program has its split, knobs, parameters, backend and device already.
         split: which worlds: ``train``, ``test``, or another of the task's.
         observation: a kind of `observations.KINDS`.
-        knobs: values for the task's knobs. params: for parameters of its rules, permanently; `reset` sets them for a while.
-        worlds: how many worlds there are to draw from: numbers 0 … worlds − 1 of the split.
+        knobs: values for the task's knobs. params: values for parameters of its rules; `reset` may override them.
+        worlds: later episodes draw from the worlds 0 … worlds − 1 of the split.
         autoreset_mode: what happens after an episode's last step, as Gymnasium defines it: ``SAME_STEP`` returns the
             next episode's first observation, and the last one in the infos; ``NEXT_STEP`` starts it with the following
             call, whose action is ignored; ``DISABLED`` leaves it to `reset`.
-        last_action: what running out of actions is: it ``truncates``, or ``terminates``. ``auto``: it terminates where
-            the task has a `final` reward, which has then been given, and truncates where rewards would continue.
+        last_action: whether the last action ``truncates`` or ``terminates`` an episode. ``auto``: it terminates if the task
+            has a `final` reward, which has then been given, and truncates if rewards would continue.
         max_episode_steps: truncates earlier than the task does.
         backend, device, threads: those of `powderdsl.compile`.
 
     Raises:
-        CompileError: a task, split, knob or parameter that there is not. ValueError: another argument that is wrong.
+        CompileError: an unknown task, split, knob or parameter. ValueError: another argument is wrong.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class TensorEnv:
         )
         self.actions = min(self.task.agent.actions, max_episode_steps or self.task.agent.actions)
         self.episodes: Episodes | None = None
-        """The worlds as they are: to look at; their tensors are written to by the next call."""
+        """The current worlds, to read; the next call writes to their tensors."""
         self.params: dict[str, Tensor] = {}
         """Parameters that `reset` has set: float64 [B] each."""
         self._base: Tensor | None = None
@@ -122,12 +122,12 @@ class TensorEnv:
         """Begin all episodes, or those of a mask.
 
         Args:
-            seed: s gives slot i the seed s + i; a list gives one each, None to continue as without. A seed decides the
-                worlds of this and all later episodes of a slot: see `world_seeds`. Without one, every slot continues
-                with its next episode.
+            seed: s gives environment i the seed s + i; a list gives each its own, or None. A seed decides the worlds of
+                this and all later episodes: see `world_seeds`. Without one, an environment continues with its next
+                episode.
             options: ``params``: parameters of the rules from now on, a number each or [B]; they stay until others are
                 given, ``{}`` brings back the defaults. ``worlds``: which worlds to play in these episodes, a number
-                or [B]. ``reset_mask``: bool [B], which slots; the others continue where they were.
+                or [B]. ``reset_mask``: bool [B]: only these environments are reset.
 
         Returns:
             observations [B, …], and infos: ``world``, int64 [B], which worlds they play.
@@ -159,7 +159,7 @@ class TensorEnv:
         return self.observation.of(self.episodes.world), info
 
     def _bases(self, seed: Any) -> tuple[Tensor, Tensor]:
-        """The seed of each slot, and whether it is a new one."""
+        """The seed of each environment, and whether it is a new one."""
         old = self._base
         if old is None:
             first = int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
@@ -221,7 +221,7 @@ class TensorEnv:
     # Saving
 
     def state(self) -> dict[str, Any]:
-        """All that decides how things continue, as dicts of tensors on the CPU: worlds, seeds, episodes, returns, parameters.
+        """Everything that later steps depend on, as dicts of tensors on the CPU: worlds, seeds, episodes, returns, parameters.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -241,7 +241,7 @@ class TensorEnv:
             the observations there, [B, …].
 
         Raises:
-            ValueError: it is of another task or number of worlds. KeyError: it is no such state. Nothing has changed then.
+            ValueError: it is of another task or number of worlds. KeyError: it is not such a state. Nothing has changed then.
         """
         if len(state["base"]) != self.num_envs:
             raise ValueError(f"{len(state['base'])} worlds were saved: {self.num_envs} are needed")
@@ -265,11 +265,11 @@ class TensorEnv:
             observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; infos: ``success``, whether
             the task's condition for it holds; ``world``, which worlds are shown; where episodes ended
             ``episode_return`` and ``episode_length`` (zero elsewhere) and, under SAME_STEP, ``final_obs`` (their last
-            observations, [n, …] in the order of the slots) and ``final_info``.
+            observations, [n, …] in the order of the environments) and ``final_info``.
 
         Raises:
             ResetNeeded: before the first reset, or under DISABLED in an episode that has ended. TypeError, ValueError:
-            actions that are none. Nothing has changed then.
+            invalid actions. Nothing has changed then.
         """
         if self.episodes is None:
             raise ResetNeeded("reset the environment before its first step")
@@ -278,8 +278,10 @@ class TensorEnv:
             raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
         waiting = self._ended
         if self.autoreset_mode is AutoresetMode.DISABLED and bool(waiting.any()):
-            slots = waiting.nonzero()[:, 0].tolist()
-            raise ResetNeeded(f"the episodes of slots {slots[:8]} are over: reset them with a reset_mask")
+            over = waiting.nonzero()[:, 0].tolist()
+            raise ResetNeeded(
+                f"the episodes of environments {over[:8]} are over: reset them with a reset_mask"
+            )
         after, reward, success, _ = self.program.act(
             self.episodes, checked, reuse=True, params=self.params or None
         )
@@ -347,7 +349,7 @@ def check_cells(num_envs: int, size: tuple[int, int]) -> None:
 
 
 def _mode(value: AutoresetMode | str) -> AutoresetMode:
-    """A mode of Gymnasium's, by its name in any way of writing."""
+    """A mode of Gymnasium's, or the one of a name, which may be written in any case."""
     if isinstance(value, AutoresetMode):
         return value
     for mode in AutoresetMode:

@@ -1,4 +1,4 @@
-"""What a training run is: one frozen value, checked, that JSON can hold. Needs no torch."""
+"""The settings of a training run: one frozen, checked value that JSON can hold. Needs no torch."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ NETWORKS = ("paper", "small")
 OBSERVATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"paper": ("compact", "ids", "matrix"), "small": ("ids", "compact", "matrix")}
 )
-"""What each network takes; the first is the usual one."""
+"""The observations that each network takes; the first is the default."""
 
 KINDS = ("compact", "ids", "matrix")
 
 HOW = ("steps", "backend", "device", "threads", "checkpoint_minutes")
-"""Settings that may change while a run continues: how long and on what it is trained, not what is trained."""
+"""Settings that may change when a run is resumed: how long and on which machine it trains, not what it trains."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of a PPO run. The defaults are the paper's figures, and Stable-Baselines3's where it gives none."""
+    """Settings of a PPO run. The defaults are the paper's, or Stable-Baselines3's if the paper gives none."""
 
     task: str
     """A shipped task's name, or a file's path."""
@@ -64,7 +64,7 @@ class TrainConfig:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The settings that decide what comes out, without those of HOW."""
+        """The settings that the result depends on: all but those of HOW."""
         return {name: value for name, value in self.as_json().items() if name not in HOW}
 
 
@@ -83,7 +83,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
     }
 )
-"""``paper``: its network and figures. ``small``: a network and figures for a few minutes on one processor core."""
+"""``paper``: its network and settings. ``small``: a network and settings for a few minutes on one processor core."""
 
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
@@ -104,7 +104,7 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
 
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
-    """Settings as `TrainConfig.as_json` gives them; what is missing is as usual. Raises CompileError (PD640)."""
+    """Settings as `TrainConfig.as_json` gives them; missing ones have their defaults. Raises CompileError (PD640)."""
     backend = values.get("backend", "auto")
     if isinstance(backend, str):  # of runs from before its name changed
         backend = RENAMED_BACKENDS.get(backend, backend)

@@ -1,4 +1,4 @@
-"""How good a policy is: its return in many worlds of each split, beside acting at random and doing nothing."""
+"""Evaluation of policies: returns in many worlds of each split, compared with acting at random and doing nothing."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def evaluate(
 
     Args:
         run_or_task: a run, or the path or name of one, or a task as `Task`, which has no trained policy.
-        splits: all of the task's unless given. policies: some of POLICIES; all that there are unless given.
+        splits: all of the task's unless given. policies: some of POLICIES; all of them unless given.
         deterministic: the trained policy takes the likeliest action, instead of drawing one.
         backend, device: those of the run unless given. said: called with each score as it is known.
         packs: names or files of packs that are added to the rules of a run's task.

@@ -66,7 +66,7 @@ class FilmRecorder:
         self._pending.append((world.ids.cpu().numpy().copy(), motion, fields))
 
     def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
-        """What was seen since the last call belongs to these actions; the last scene of them shows the new returns."""
+        """Assign the worlds seen since the last call to these actions; the last of them shows the new returns."""
         before, after = (self._returns, self._over), (returns.cpu().clone(), over.cpu().clone())
         for number, seen in enumerate(self._pending, 1):
             now = after if number == len(self._pending) else before
@@ -84,10 +84,10 @@ def film(
     seed: int = 0,
     factor: int = 4,
 ) -> tuple[Played, Iterator[NDArray[np.uint8]]]:
-    """Play worlds, int64 [n], as `rl.evaluation.play` does; what came of it, and the pictures, uint8 [H', W', 3].
+    """Play worlds, int64 [n], as `rl.evaluation.play` does; the results, and the pictures, uint8 [H', W', 3].
 
     There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
-    episode is over stand still.
+    episode is over no longer change.
     """
     recorder = FilmRecorder(len(worlds))
     played = play(
@@ -153,7 +153,7 @@ def _block(task: Task, row: int, column: int) -> NDArray[np.bool_]:
 
 
 def _words(task: Task, choice: int, blow: list[int]) -> str:
-    """What an action does, in a word or two; nothing where it does nothing."""
+    """An action in a word or two; an empty string if it changes nothing."""
     number = task.agent.choices[choice]
     if number >= 0:
         return next(one.name for one in task.ruleset.elements if one.id == number)

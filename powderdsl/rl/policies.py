@@ -25,7 +25,7 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
 
 BESIDES = ("task_fingerprint", "palette", "channels")
-"""What a run keeps besides its settings."""
+"""Entries of a run's configuration that are not settings."""
 
 
 def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
 
 
 def recorded_palette(run: RunFolder) -> tuple[str | None, ...] | None:
-    """The qualified name of the element of each of a run's slots; None of a run that began before these were kept."""
+    """The qualified name of the element of each of a run's slots; None for a run of an older version, which did not record them."""
     found = run.config.get("palette")
     if not isinstance(found, list) or len(found) > MAX_ELEMENTS:
         return None

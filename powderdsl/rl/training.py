@@ -1,7 +1,7 @@
-"""PPO of Stable-Baselines3's in a run folder. A run that is killed continues as if nothing had happened.
+"""PPO of Stable-Baselines3's in a run folder. A run that was killed resumes as if nothing had happened.
 
-What decides how a run continues is saved between two rollouts: the policy and its optimizer, the worlds, all random
-numbers. Files are read with ``weights_only``: networks are built from the settings, so loading executes nothing.
+Everything that later rollouts depend on is saved between two rollouts: the policy and its optimizer, the worlds, all
+random numbers. Files are read with ``weights_only``: networks are built from the settings, so loading executes nothing.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
 
 
 class _Keeper(BaseCallback):
-    """Saves between rollouts, and keeps in memory what has not been saved."""
+    """Saves between rollouts, and keeps the latest unsaved state in memory."""
 
     def __init__(self, run: RunFolder, env: PowderVecEnv, minutes: float, progress: Progress | None):
         super().__init__()
@@ -167,7 +167,7 @@ class _Keeper(BaseCallback):
 
 
 class _MetricsWriter(KVWriter):
-    """What Stable-Baselines3 logs, as metrics of the run."""
+    """Writes the log of Stable-Baselines3 as metrics of the run."""
 
     def __init__(self, metrics: Metrics):
         self.metrics = metrics
@@ -183,14 +183,14 @@ class _MetricsWriter(KVWriter):
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """What is a number among them: Python's or NumPy's."""
+    """The values that are numbers: Python's or NumPy's."""
     return {
         name: float(value) for name, value in values.items() if isinstance(value, int | float | np.number)
     }
 
 
 def _state(model: PPO, env: PowderVecEnv) -> dict[str, Any]:
-    """All that decides how training continues. Tensors of the model are not copied."""
+    """Everything that later training depends on. Tensors of the model are not copied."""
     return {
         "policy": model.policy.state_dict(),
         "optimizer": model.policy.optimizer.state_dict(),
@@ -246,7 +246,7 @@ def _set_random_state(state: Mapping[str, Any]) -> None:
 
 @contextmanager
 def _own_random_numbers(threads: int) -> Iterator[None]:
-    """The caller's generators and number of threads are afterwards what they were."""
+    """Restore the caller's generators and number of threads at the end."""
     before, used = _random_state(), torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

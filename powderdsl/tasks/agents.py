@@ -1,4 +1,4 @@
-"""The `agent:` of a task file: what may be done, where, how often."""
+"""The `agent:` of a task file: the actions it may take, where, and how often."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ MAX_ACTIONS = 1_000_000
 MAX_STEPS = 100_000
 MAX_SPEED = 1_000_000.0
 ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
-"""What `may:` calls what is not an element."""
+"""Words of `may:` that are not elements."""
 
 
 def read_agent(
     reader: Reader, entry: tuple[yaml_tree.Scalar, yaml_tree.Node] | None, ruleset: Ruleset, size: Size
 ) -> Agent | None:
-    """The agent, or None after reporting what is missing."""
+    """The agent; None if it is missing or empty, which is reported."""
     if entry is None:
         return None
     entries = reader.mapping(entry[1], "agent", "an agent")
@@ -56,7 +56,7 @@ def read_agent(
 
 
 def _choices(reader: Reader, entries: Entries, ruleset: Ruleset) -> tuple[int, ...]:
-    """Element ids ascending, then what is not an element."""
+    """Element ids, ascending, then BLOW and NO_CHANGE."""
     found: set[int] = set()
     acts: set[int] = set()
     words = reader.words(entries["may"][1]) if "may" in entries else ()

@@ -20,7 +20,7 @@ MAX_DRAWINGS = 4_096
 
 @dataclass(frozen=True)
 class DrawingPlan:
-    """What a generator is made of, as written: sections of a file, with the changes of a split on top."""
+    """The parts of a generator, as written: sections of a file, with the changes of a split on top."""
 
     name: str
     fill: int
@@ -37,7 +37,7 @@ class DrawingPlan:
 
 @dataclass
 class Drawer:
-    """Checks one plan. What is wrong goes to the reporter; the generator is of use only if nothing was."""
+    """Checks one plan. Mistakes go to the reporter; the generator is valid only if there were none."""
 
     plan: DrawingPlan
     ruleset: Ruleset
@@ -81,7 +81,7 @@ class Drawer:
         return Region(name, drawings, any(integers(one.amounts) is None for one in drawings))
 
     def groups(self, items: Sequence[Item], inside: tuple[str, ...] = ()) -> tuple[Group, ...]:
-        """Repetitions, and what stands between them, each a group."""
+        """The groups of a list of statements: each repetition is one, and each statement between them."""
         found: list[Group] = []
         for item in items:
             if isinstance(item, Repeat):
@@ -189,7 +189,7 @@ class Drawer:
         return found
 
     def numbers_fit(self, drawing: Drawing, names: Mapping[str, Interval]) -> bool:
-        """Whether all numbers can be what their statement needs; reports those that cannot."""
+        """Whether all numbers can be what their statement needs; reports the others."""
         fits = True
         for amount, (what, lowest) in zip(drawing.amounts, NUMBERS[drawing.kind], strict=True):
             if amount is None:

@@ -14,9 +14,9 @@ from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
-from powderdsl.tasks.tensors.actions import Hands, params_of
+from powderdsl.tasks.tensors.actions import Hands
 from powderdsl.tasks.tensors.generator import Made, WorldMaker, joined
-from powderdsl.tasks.tensors.measures import Facts, Given, Meter, measures_of, scalar_value, scalars_of
+from powderdsl.tasks.tensors.measures import Facts, Meter, measures_of, scalar_value, scalars_of
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 
@@ -26,8 +26,11 @@ ROWS = ("seed", "acted", "failed", "start", "before")
 CLOCK = ("seed", "index", "step")
 """Tensors of `World` that draws depend on."""
 
+Params = Mapping[str, Any] | None
+Seen = Callable[[World], None] | None
+
 DONE = ("painted", "placed", "blown")
-"""What `Hands.act` gives for rewards."""
+"""Numbers that `Hands.act` gives for rewards."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +38,9 @@ class Episodes:
     """A batch of episodes.
 
     `seed`, int64 [B], says which worlds they started as; `acted`, int64 [B], how many actions each has had;
-    `failed`, bool [B], whether `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] where all
-    worlds have the same; `targets` uint8 [B, H, W], 255 where there is none; `start` and `before`, float64 [B, n],
-    what rewards remember of the start and of the action before (not kept where only a last action is rewarded).
+    `failed`, bool [B], whether `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] if all
+    worlds have the same; `targets` uint8 [B, H, W], 255 for no element; `start` and `before`, float64 [B, n], the
+    measures at the start and after the previous action (not updated if only the last action is rewarded).
     """
 
     world: World
@@ -90,7 +93,7 @@ class TaskProgram:
         nothing = torch.zeros_like(seeds)
         clock = (seeds, nothing.clone(), nothing.clone())
         world = World(self.simulator, self._hands.fresh_state(made.ids), *clock)
-        measured = self._meter.take(self._given(world, made.regions, made.targets, {}))
+        measured = self._meter.take(world, made.regions, made.targets, None)
         return Episodes(
             world, seeds, nothing.clone(), nothing.bool(), made.regions, made.targets, measured, measured
         )
@@ -181,8 +184,8 @@ class TaskProgram:
         actions: Tensor | None,
         *,
         reuse: bool = False,
-        params: Mapping[str, Any] | None = None,
-        seen: Callable[[World], None] | None = None,
+        params: Params = None,
+        seen: Seen = None,
     ) -> tuple[Episodes, Tensor, Tensor, Tensor]:
         """One action of each episode, int64 [B, 5] as `check_actions` gives them, and the steps after it.
 
@@ -211,7 +214,7 @@ class TaskProgram:
             world = self._free(world, last, params, seen)
         now = episodes.before
         if self._counts_always or bool(last.any()):
-            now = self._meter.take(self._given(world, episodes.regions, episodes.targets, params or {}))
+            now = self._meter.take(world, episodes.regions, episodes.targets, params)
         action = {"taken": acted, "left": agent.actions - acted, **done}
         facts = Facts(self._places, now, episodes.start, episodes.before, action)
         nothing = torch.zeros(len(acted), dtype=torch.float64, device=acted.device)
@@ -226,19 +229,12 @@ class TaskProgram:
         after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
         return after, reward.float(), success, over
 
-    def measured(self, episodes: Episodes, params: Mapping[str, Any] | None = None) -> Tensor:
-        """What `measures` are now: float64 [B, n]."""
-        return self._meter.take(self._given(episodes.world, episodes.regions, episodes.targets, params or {}))
+    def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
+        """The current values of `measures`: float64 [B, n]."""
+        return self._meter.take(episodes.world, episodes.regions, episodes.targets, params)
 
-    def _run(
-        self,
-        world: World,
-        steps: int,
-        params: Mapping[str, Any] | None,
-        reuse: bool = False,
-        seen: Callable[[World], None] | None = None,
-    ) -> World:
-        """Some steps; one at a time where they are to be seen."""
+    def _run(self, world: World, steps: int, params: Params, reuse: bool, seen: Seen) -> World:
+        """The worlds after some steps, which run one at a time if they are to be seen."""
         if seen is None:
             return self.simulator.step(world, steps, params=params, reuse=reuse)
         for _ in range(steps):
@@ -246,20 +242,14 @@ class TaskProgram:
             seen(world)
         return world
 
-    def _free(
-        self,
-        world: World,
-        last: Tensor,
-        params: Mapping[str, Any] | None,
-        seen: Callable[[World], None] | None,
-    ) -> World:
+    def _free(self, world: World, last: Tensor, params: Params, seen: Seen) -> World:
         """The steps after the last action, in the worlds that had it."""
         steps = self.task.agent.free_steps
         places = last.nonzero()[:, 0]
         if len(places) == 0:
             return world
         if len(places) == len(last):
-            return self._run(world, steps, params, seen=seen)
+            return self._run(world, steps, params, False, seen)
         own = {
             name: value[places] if isinstance(value, Tensor) and value.ndim else value
             for name, value in (params or {}).items()
@@ -267,17 +257,6 @@ class TaskProgram:
         ahead = self.simulator.step(world.select(places), steps, params=own)
         state = {name: value.index_copy(0, places, ahead.state[name]) for name, value in world.state.items()}
         return replace(world, state=state, step=world.step.index_copy(0, places, ahead.step))
-
-    def _given(
-        self,
-        world: World,
-        regions: Mapping[str, Tensor],
-        targets: Mapping[str, Tensor],
-        params: Mapping[str, Any],
-    ) -> Given:
-        return Given(
-            world.state, world.step, params_of(self.simulator, params, len(world.step)), regions, targets
-        )
 
 
 def _copy(tensor: Tensor, device: torch.device | str = "cpu") -> Tensor:
@@ -298,7 +277,7 @@ def compile_task(
         backend, device, threads: those of `powderdsl.compile`; one thread unless said otherwise.
 
     Raises:
-        CompileError: PD801 for a split that the task does not have, PD701 for a backend or device that is not there.
+        CompileError: PD801 for a split that the task does not have, PD701 for a backend or device that is not available.
     """
     found = task if isinstance(task, Task) else load_task(task)
     check_split(found, split)
@@ -307,10 +286,10 @@ def compile_task(
 
 
 def check_actions(program: TaskProgram, actions: Any) -> Tensor:
-    """Actions from outside as int64 [B, 5] on the program's device; those that are not numbers of an action are refused.
+    """Actions from outside as int64 [B, 5] on the program's device; invalid ones are refused.
 
     Raises:
-        TypeError: numbers that are not whole. ValueError: a wrong shape, or a number out of range, with its index.
+        TypeError: they are not integers. ValueError: a wrong shape, or a number out of range, with its index.
     """
     try:
         tensor = torch.as_tensor(actions)

@@ -84,7 +84,7 @@ def _read_rules(
 ) -> tuple[Ruleset, Typer, tuple[str, ...]] | None:
     """The ruleset, what checks expressions against it, and what was loaded.
 
-    What is wrong with the rules is reported here.
+    Mistakes in the rules are reported here.
     """
     word = reader.scalar(entries, "rules")
     if word is None or not word.text:
@@ -132,7 +132,7 @@ class _TaskReader:
         self.rules = rules
         own, _ = read(rules[:1], Reporter())
         self.own = {pack.name.text for pack in own}
-        """The packs of the task's own rules: it knows no names of those that are added."""
+        """The packs of the task's own rules: it does not know the names of added ones."""
         self.taken: dict[str, Span] = {}
         self.broken: set[str] = set()
 

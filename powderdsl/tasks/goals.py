@@ -25,7 +25,7 @@ MEASURES = {
     "highest": "highest(CELLS in REGION)",
     "match": "match(TARGET)",
 }
-"""What can be taken of a whole world, and how it is written."""
+"""Numbers of a whole world, and how they are written."""
 
 MEMORIES = {"start": "start(VALUE)", "change": "change(VALUE)"}
 ARITHMETIC = {"min": "min(A, B, …)", "max": "max(A, B, …)", "abs": "abs(A)"}
@@ -34,7 +34,7 @@ MAX_VALUES = 8
 FUNCTIONS = {**MEASURES, **MEMORIES, **ARITHMETIC}
 
 ACTION_WORDS = ("taken", "left", "painted", "placed", "blown")
-"""Numbers of the action that was just taken, and of how many there were and will be."""
+"""Numbers that describe the last action, and the counts of actions taken and left."""
 
 _BINARY = {
     "add": "add",
@@ -149,7 +149,7 @@ class GoalChecker:
         raise self._needs_measure(syntax)
 
     def _needs_measure(self, syntax: Syntax) -> Poisoned:
-        """Something of each cell stands where one number of the whole world is wanted, or nobody knows the name."""
+        """Report a value of each cell, or an unknown name, where one number of the whole world is needed."""
         names = [*ACTION_WORDS, *FUNCTIONS, *self.knobs]
         text = syntax.span.text
         if syntax.kind == "name" and self.typer.find(syntax.text, syntax.span, self.scope) is None:

@@ -1,4 +1,4 @@
-"""Tasks by name or path. Which names mean tasks is known without reading one; nothing here needs torch."""
+"""Tasks by name or path. `is_task` reads only the start of a file; nothing here needs torch."""
 
 from __future__ import annotations
 

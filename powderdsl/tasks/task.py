@@ -48,7 +48,7 @@ class Drawing:
 
     `number` is its place among all statements and enters the hash of its draws. `amounts` stand in the order of
     `worlds.scene.statements.SHAPES`; None is an open end. One of `ids` is drawn uniformly, in the order given.
-    Only cells of the region `where` are painted, and only those that hold one of `over`.
+    Only cells of the region `where` are painted, and only if they hold one of `over`.
     """
 
     number: int
@@ -123,7 +123,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Agent:
-    """What an agent may do, and for how long.
+    """The actions that an agent may take, and how many.
 
     An action is (x, y, choice, vx, vy). The block of `brush` (rows, columns) cells around the center of bin
     (y, x) of `bins` (rows, columns) is filled with the element ``choices[choice]``; where that is BLOW, its cells get
@@ -164,7 +164,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Goal:
-    """What counts. `each` is given after every action, `final` with the last; conditions end an episode early.
+    """Rewards and ends of episodes. `each` is given after every action, `final` with the last; conditions end an episode early.
 
     Each is arithmetic on one number a world: the arithmetic, comparisons and logic of `model.operations.OPS`, and
     ``measure`` (value: Measure), ``action`` (value: ``taken``, ``left``, ``painted``, ``blown``, ``placed``), ``start``
@@ -191,7 +191,7 @@ class Task:
     goal: Goal
     splits: tuple[Split, ...]
     rules: tuple[str, ...] = field(default=(), compare=False, repr=False)
-    """What was loaded as its ruleset, as `compiler.load` takes it."""
+    """The rules that were loaded, as `compiler.load` takes them."""
 
     def split(self, name: str) -> Split:
         """The split of a name. Raises KeyError."""

@@ -22,7 +22,7 @@ MAX_BYTES = 4 * MAX_CELLS
 def parse_ascii(
     art: Span, elements: Sequence[Element], reporter: Reporter, legend: Mapping[str, str] | None = None
 ) -> NDArray[np.uint8] | None:
-    """The ids uint8 [H, W] of a drawing that stands in a text, or None after reporting what is wrong with it.
+    """The ids uint8 [H, W] of a drawing in a text, or None after reporting mistakes.
 
     `legend` gives characters to elements by name and wins over their glyphs. Empty lines are skipped. Raises
     CompileError (PD604) if the legend names an unknown element, ValueError if one of its keys is not a single
@@ -95,7 +95,7 @@ def write_ascii(
 ) -> str:
     """Rows of characters for ids [H, W], each ended by a line break; `spaced` puts a blank between cells.
 
-    What it writes, `read_ascii` reads with the same elements and legend. Raises ValueError for ids that no
+    `read_ascii` reads it back with the same elements and legend. Raises ValueError for ids that no
     element has, and for another shape.
     """
     world = np.asarray(ids.cpu() if hasattr(ids, "cpu") else ids)

@@ -23,7 +23,7 @@ MAX_REPORTED = 8
 """Wrong colors that are named one at a time. A smoothed picture has thousands."""
 
 MAX_COLORS = 1 << 16
-"""Wrong colors that are counted. A picture with more has more of them below."""
+"""Wrong colors that are counted: reading stops at the row with more."""
 
 CHUNK = 1 << 20
 """Pixels that are looked up at once: more would take memory."""
@@ -37,7 +37,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 
     Colors of a ramp mean its element; the values of its field are not read.
 
-    PD609 names every pixel color that is no element's (and the nearest element), PD607 a picture of too many
+    PD609 names every pixel color that is not an element's (and the nearest element), PD607 a picture of too many
     pixels, which is not decoded, PD602 a file that is not a PNG, PD101 one that cannot be read.
     """
     path = Path(path)
@@ -47,7 +47,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
     for element in elements:
         owners.setdefault(_pack(element.color), []).append(element)
     for color, ramped in _ramp_colors(elements).items():
-        owners.setdefault(color, ramped)  # what is an element's own color says nothing of ramps
+        owners.setdefault(color, ramped)  # an element's own color wins over ramps
     ids, known = np.zeros(packed.shape, np.uint8), np.zeros(packed.shape, np.bool_)
     clear = {color: owned[0].id for color, owned in sorted(owners.items()) if len(owned) == 1}
     colors, meant = np.array([*clear], dtype=np.uint32), np.array([*clear.values()], dtype=np.uint8)
@@ -65,7 +65,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 def _wrong_colors(
     path: Path, packed: NDArray[np.uint32], known: NDArray[np.bool_], owners: dict[int, list[Element]]
 ) -> list[Diagnostic]:
-    """What to say of the colors of pixels that are not known, by their first pixels."""
+    """Reports of unknown colors, in the order of their first pixels."""
     found: dict[int, tuple[int, int]] = {}
     for row, (line, good) in enumerate(zip(packed, known, strict=True)):
         wrong = np.flatnonzero(~good)
@@ -118,7 +118,7 @@ def _pixels(path: Path) -> NDArray[np.uint8]:
 
 
 _BROKEN = (OSError, ValueError, SyntaxError, EOFError, IndexError, OverflowError, MemoryError, zlib.error)
-"""What Pillow raises for broken files, depending on where they are broken."""
+"""Errors that Pillow raises for broken files."""
 
 
 def _decode(file: BinaryIO, path: Path) -> NDArray[np.uint8]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from powderdsl.diagnostics import Span
 
 MAX_CELLS = 1 << 24
-"""The largest world that is read or drawn: 4096×4096 cells, or as many in another shape."""
+"""The largest world that is read or drawn: 4096×4096 cells, or the same number in another shape."""
 
 MAX_COORDINATE = 1 << 24
 """Coordinates, widths and radii lie within ±MAX_COORDINATE, so that int64 holds every product below."""
@@ -67,7 +67,7 @@ class Setting:
 
 
 def mask(shape: Shape, size: Size) -> NDArray[np.bool_]:
-    """The cells of a shape in a grid of `size`, bool [H, W]. What lies outside the grid is cut off."""
+    """The cells of a shape in a grid of `size`, bool [H, W]. Cells outside the grid are cut off."""
     cells = np.zeros(size, dtype=np.bool_)
     window, covered = _in_window(shape, size)
     cells[window] = covered

@@ -23,13 +23,13 @@ FORMAT = 1
 SLOT, IDS = "slot_", "slot_element"
 CLOCK = ("seed", "index", "step")
 MAX_ABOUT = 1 << 20
-"""Bytes of what a file says of itself."""
+"""Bytes of the header `about` of a file."""
 MORE = 1 << 24
 """Bytes that arrays may take beyond those of twice the worlds: fields of packs that are not loaded."""
 
 
 def save(world: World, path: str | Path) -> None:
-    """Write worlds with everything their future depends on. The file appears whole or not at all.
+    """Write worlds with everything that later steps depend on. The file appears whole or not at all.
 
     Raises:
         CompileError: PD613 if the place cannot be written, PD602 if the disk is full, PD607 if there are more than

@@ -1,4 +1,4 @@
-"""Shapes scattered at random: worlds for whoever has drawn none."""
+"""Random start worlds: scattered shapes of all elements."""
 
 from __future__ import annotations
 

@@ -115,12 +115,3 @@ class Hands:
             flat.scatter_(-1, index, torch.where(filled, value.to(slot.dtype)[..., None], kept))
             found[name] = flat.view(slot.shape)
         return found
-
-
-def params_of(sim: Simulator, given: Mapping[str, Tensor], batch: int) -> dict[str, Tensor]:
-    """All parameters as float64 [B], for measures that ask for them."""
-    found = {}
-    for param in sim.ruleset.params:
-        value = given.get(param.name, float(param.default))
-        found[param.name] = torch.as_tensor(value, dtype=torch.float64, device=sim.device).expand(batch)
-    return found

@@ -151,7 +151,7 @@ def _groups(generator: Generator) -> list[Group]:
 
 
 def _draw_blocks(generator: Generator) -> Iterator[tuple[int, int, int]]:
-    """What a generator draws, as `DrawTable` takes it."""
+    """The draws of a generator, as `DrawTable` takes them."""
     for name, amount in generator.lets:
         yield name_number(name), 1, _draws_in(amount)
     for region in generator.regions:
@@ -287,7 +287,7 @@ class WorldMaker:
             assert count is not None
             repeats = group.most
             if planes.device.type == "cpu" and repeats > 1:
-                # What no world of the batch repeats is not drawn.
+                # Repetitions that no world of the batch has are not drawn.
                 repeats = int(count.max()) if count.numel() else 0
             if repeats == 0:
                 continue

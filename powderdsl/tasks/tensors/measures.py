@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, component
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
+from powderdsl.simulation.simulator import World
 from powderdsl.targets.torch.program import Kernels, PassFunction, compiled
 from powderdsl.targets.torch.source import pass_source
 from powderdsl.tasks.goals import REGION_LET, parts_of
@@ -26,7 +28,7 @@ Window = tuple[int, int, int, int]
 """First row, the one after the last, first column, the one after the last."""
 
 _LOOKING = ("look", "count", "sum", "inside", "coordinate")
-"""Operations that see more than the cell itself: a window on the world would change them."""
+"""Operations that read more than the cell itself: in a window they would give something else."""
 
 
 def scalars_of(goal: Goal) -> list[Expr]:
@@ -38,17 +40,6 @@ def scalars_of(goal: Goal) -> list[Expr]:
 def measures_of(goal: Goal) -> tuple[Measure, ...]:
     """Every measure of a goal once."""
     return tuple(dict.fromkeys(part.value for part in scalars_of(goal) if part.op == "measure"))
-
-
-@dataclass(frozen=True)
-class Given:
-    """What measures are taken of: a state and the masks of its episodes."""
-
-    state: Mapping[str, Tensor]
-    step: Tensor
-    params: Mapping[str, Tensor]
-    regions: Mapping[str, Tensor]
-    targets: Mapping[str, Tensor]
 
 
 class Meter:
@@ -66,7 +57,7 @@ class Meter:
         fixed: Mapping[str, Tensor],
         device: torch.device,
     ):
-        self.measures, self.size, self.device = measures, size, device
+        self.ruleset, self.measures, self.size, self.device = ruleset, measures, size, device
         groups: dict[Window, list[int]] = {}
         for number, measure in enumerate(measures):
             if measure.value is not None:
@@ -76,28 +67,41 @@ class Meter:
             for window, numbers in groups.items()
         ]
 
-    def take(self, given: Given) -> Tensor:
-        """The numbers of all measures: float64 [B, n]."""
-        batch = len(given.step)
+    def take(
+        self,
+        world: World,
+        regions: Mapping[str, Tensor],
+        targets: Mapping[str, Tensor],
+        params: Mapping[str, Any] | None,
+    ) -> Tensor:
+        """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own."""
+        batch = len(world.step)
+        values = {one.name: (params or {}).get(one.name, float(one.default)) for one in self.ruleset.params}
+        every = {
+            name: torch.as_tensor(value, dtype=torch.float64, device=self.device).expand(batch)
+            for name, value in values.items()
+        }
         found: list[Tensor] = [torch.zeros(0)] * len(self.measures)
         for part in self._parts:
-            for number, cells in part.cells(given).items():
-                found[number] = self._reduced(self.measures[number], cells, part.window, given)
+            for number, cells in part.cells(world, regions, every).items():
+                found[number] = self._reduced(self.measures[number], cells, part.window, regions)
         for number, measure in enumerate(self.measures):
             if measure.target is not None:
-                target = given.targets[measure.target]
+                target = targets[measure.target]
                 wanted = (target != NOTHING).sum((1, 2)).double()
-                same = (given.state["element"] == target).sum((1, 2)).double()
+                same = (world.state["element"] == target).sum((1, 2)).double()
                 found[number] = same / wanted.clamp(min=1)
         if not found:
             return torch.zeros(batch, 0, dtype=torch.float64, device=self.device)
         return torch.stack([one.expand(batch) for one in found], 1)
 
-    def _reduced(self, measure: Measure, cells: Tensor, window: Window, given: Given) -> Tensor:
+    def _reduced(
+        self, measure: Measure, cells: Tensor, window: Window, regions: Mapping[str, Tensor]
+    ) -> Tensor:
         """One number a world, float64 [B], of cells [B, h, w] in a window."""
         mask = None
         if measure.region is not None:
-            mask = _cut(given.regions[measure.region], window)
+            mask = _cut(regions[measure.region], window)
             cells = cells & mask if cells.dtype == torch.bool else cells * mask
         exact = torch.int32 if cells.dtype == torch.bool else torch.int64  # counts: half the time
         total = cells.sum((1, 2), dtype=torch.float64 if cells.dtype.is_floating_point else exact).double()
@@ -162,20 +166,21 @@ class _Part:
         self.types, self.regions = types, regions
         self.run: PassFunction = compiled(source, name, constants, device)
 
-    def cells(self, given: Given) -> dict[int, Tensor]:
+    def cells(
+        self, world: World, regions: Mapping[str, Tensor], params: Mapping[str, Tensor]
+    ) -> dict[int, Tensor]:
         """The value of each cell of the window, [B, h, w], by the measure's number."""
-        batch = len(given.step)
         top, bottom, left, right = self.window
         none = torch.zeros(0, dtype=torch.int64, device=self.device)
-        shape = (batch, bottom - top, right - left)
-        kernels = Kernels(shape, self.device, given.params, {}, {}, none, none, given.step)
+        shape = (len(world.step), bottom - top, right - left)
+        kernels = Kernels(shape, self.device, params, {}, {}, none, none, world.step)
         planes: dict[str, Tensor] = {}
         for name in self.slots:
             vector, component = component_of(name)
-            plane = given.state[name] if component is None else given.state[vector][:, component]
+            plane = world.state[name] if component is None else world.state[vector][:, component]
             planes[name] = _cut(plane, self.window).to(_WORKING[self.types[name].name])
         for name in self.regions:
-            planes[name] = _cut(given.regions[name.removeprefix(REGION_LET)], self.window)
+            planes[name] = _cut(regions[name.removeprefix(REGION_LET)], self.window)
         found = self.run(kernels, planes)
         return {number: found[f"measure {number}"] for number in self.numbers}
 
@@ -230,4 +235,4 @@ _VALUES: Mapping[str, Callable[..., Tensor]] = {
     "not": lambda a: 1 - a,
     "choose": lambda condition, yes, no: torch.where(condition != 0, yes, no),
 }
-"""What operations do with numbers float64 [B], flags among them. Divisions by 0 give 0: see `scalar_value`."""
+"""Operations on float64 [B]; flags are 0 or 1. `scalar_value` turns divisions by 0 into 0."""

@@ -61,7 +61,7 @@ CALCULATE: dict[str, Callable[[Any, Any], Any]] = {
     "div": operator.floordiv,
     "mod": operator.mod,
 }
-"""What operations do with integers, or tensors of them. The divisor 0 raises ZeroDivisionError for integers."""
+"""Operations on integers, or on tensors of them. Integers divided by 0 raise ZeroDivisionError."""
 
 
 def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
@@ -81,7 +81,7 @@ def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
 
 
 def interval(amount: Amount, names: Mapping[str, Interval]) -> Interval:
-    """Bounds of what the amount can be. Raises KeyError for an unknown name, ZeroDivisionError if a divisor may be 0."""
+    """The lowest and highest value that the amount can have. Raises KeyError for an unknown name, ZeroDivisionError if a divisor may be 0."""
     if amount.op == "number":
         return amount.integer, amount.integer
     if amount.op == "name":

@@ -123,7 +123,7 @@ _WORDS = {
     "ASSIGN": "`:=`",
     "$END": "the end of the statement",
 }
-"""What terminals are called in messages; keywords are called by themselves."""
+"""Names of terminals in messages; keywords stand for themselves."""
 
 
 @lru_cache(maxsize=1)
@@ -180,11 +180,11 @@ def read_choice(span: Span, reporter: Reporter) -> ElementChoice | None:
 
 
 def _read(start: str, span: Span, reporter: Reporter) -> Any:
-    """What stands at `span`, by the start symbol of the grammar; None after a report."""
+    """The value of the text at `span`, by the start symbol of the grammar; None after a report."""
     if len(span.text) > MAX_STATEMENT:
         first = Span(span.source, span.start, span.start + 1)
         label = f"longer than {MAX_STATEMENT} characters"
-        reporter.error("PD605", "a statement that never ends", first, label)
+        reporter.error("PD605", "a statement that is too long", first, label)
         return None
     try:
         tree: Any = _parser().parse(TextSlice(span.source.text, span.start, span.end), start=start)
