@@ -241,10 +241,7 @@ class _TaskReader:
         if low is None or high is None:
             self.reporter.error("PD803", "a knob's range has two integers", bounds.span, "such as `0..64`")
             return None
-        try:
-            value = filled_in(default, {name: knob.value for name, knob in above.items()})
-        except ZeroDivisionError:
-            value = default
+        value = filled_in(default, {name: knob.value for name, knob in above.items()})
         if not value.is_number:
             label = "an integer, or knobs that stand above this one"
             helps = suggest(default.span.text if default.span else "", above, "knobs above it")
@@ -340,7 +337,7 @@ class _TaskReader:
                 if filled.is_number:
                     values[word.text] = filled.integer
                 else:
-                    self.reporter.error("PD803", "a knob is one number", amount.span, "no draws here")
+                    self.reporter.error("PD803", "a knob is one number", amount.span, "not an integer")
             changes["knobs"] = values
         if "let" in entries:
             here = dict.fromkeys(word.text for word, _ in plan.lets)

@@ -73,6 +73,11 @@ generate:
 """
 
 
+def test_a_region_without_shapes_covers_nothing(torch):
+    found = worlds(torch, "regions: {nowhere: []}\ngenerate: [fill sand in nowhere]\n", 2)
+    assert not found.any()
+
+
 def test_a_world_is_the_same_alone_and_in_any_batch(torch, monkeypatch):
     from powderdsl.tasks.tensors import generator
 

@@ -65,7 +65,7 @@ CALCULATE: dict[str, Callable[[Any, Any], Any]] = {
 
 
 def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
-    """The amount with named numbers filled in and arithmetic on numbers done. Raises ZeroDivisionError."""
+    """The amount with named numbers filled in and arithmetic on numbers done, except for divisions by 0."""
     if amount.op == "name" and amount.value in values:
         return number(values[str(amount.value)], amount.span)
     args = tuple(filled_in(arg, values) for arg in amount.args)
@@ -73,9 +73,10 @@ def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
         first, *rest = (arg.integer for arg in args)
         if amount.op == "neg":
             return number(-first, amount.span)
-        if amount.op != "draw":
+        divided = amount.op in ("div", "mod")
+        if amount.op != "draw" and not (divided and rest[0] == 0):
             return number(CALCULATE[amount.op](first, rest[0]), amount.span)
-        if first == rest[0]:
+        if not divided and first == rest[0]:
             return number(first, amount.span)
     return Amount(amount.op, args, amount.value, amount.span)
 
