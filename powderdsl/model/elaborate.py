@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
 from powderdsl.model.composition.names import Named
-from powderdsl.model.declarations import Block, PassDecl
+from powderdsl.model.declarations import Block, PassDecl, TypedDecl
 from powderdsl.model.expressions.operands import (
     FALSE,
     IDENTITY,
@@ -45,29 +45,23 @@ from powderdsl.model.types import (
     Transform,
 )
 from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.yaml_tree import Scalar
 from powderdsl.system.random import name_number
 
 MAX_MOMENTS = 1000
 MAX_RULES = 5000
 MAX_TRIED = 4 * MAX_RULES
-"""Rules with all their copies, before those go that are broken, asleep or the same."""
+"""Rules with all their copies, wrong, inactive and repeated ones included."""
 MAX_BLOCKS = 5000
 
-_MIRROR: Matrix = ((1, 0), (0, -1))
-_TURN: Matrix = ((0, 1), (-1, 0))
+_QUARTERS: tuple[Matrix, ...] = (IDENTITY, ((0, 1), (-1, 0)), ((-1, 0), (0, -1)), ((0, -1), (1, 0)))
+_MIRRORED: tuple[Matrix, ...] = tuple((rows, (-a, -b)) for rows, (a, b) in _QUARTERS)
 
-
-def _times(a: Matrix, b: Matrix) -> Matrix:
-    rows = [[sum(a[i][k] * b[k][j] for k in range(2)) for j in range(2)] for i in range(2)]
-    return ((rows[0][0], rows[0][1]), (rows[1][0], rows[1][1]))
-
-
-_QUARTERS = (IDENTITY, _TURN, _times(_TURN, _TURN), _times(_TURN, _times(_TURN, _TURN)))
 ORIENTATIONS: dict[str | None, tuple[Matrix, ...]] = {
     None: (IDENTITY,),
-    "mirror": (IDENTITY, _MIRROR),
+    "mirror": (IDENTITY, _MIRRORED[0]),
     "rotations": _QUARTERS,
-    "all": (*_QUARTERS, *(_times(_MIRROR, quarter) for quarter in _QUARTERS)),
+    "all": _QUARTERS + _MIRRORED,
 }
 """The orientations in which a rule under `symmetry:` holds."""
 
@@ -79,10 +73,12 @@ class Elaborated:
     passes: list[Pass] = field(default_factory=list)
     streams: dict[str, Stream] = field(default_factory=dict)
     overridden: set[str] = field(default_factory=set)
-    asleep: dict[Span, str] = field(default_factory=dict)
+    inactive: dict[Span, str] = field(default_factory=dict)
+    """Rules some copy of which asks for something that is not loaded, and its name."""
     empty: dict[Span, str] = field(default_factory=dict)
     """Rules that ask for a set or tag without elements, and its name."""
-    awake: set[Span] = field(default_factory=set)
+    active: set[Span] = field(default_factory=set)
+    """Rules some copy of which does not."""
 
 
 class Elaborator:
@@ -100,15 +96,11 @@ class Elaborator:
                 self.result.passes.append(self._pass(named))
             except Poisoned:
                 continue
-        for span, name in self.result.asleep.items():
-            if span not in self.result.awake:
-                self.typer.reporter.report(
-                    "PD506",
-                    f"this rule is inactive: `{name}` is not loaded",
-                    span,
-                    "left out",
-                    helps=[f"it becomes active with a pack that defines `{name}`"],
-                )
+        for span, name in self.result.inactive.items():
+            if span not in self.result.active:
+                helps = [f"it becomes active with a pack that defines `{name}`"]
+                message = f"this rule is inactive: `{name}` is not loaded"
+                self.typer.reporter.report("PD506", message, span, "left out", helps=helps)
         return self.result
 
     def _pass(self, named: Named[PassDecl]) -> Pass:
@@ -122,43 +114,34 @@ class Elaborator:
         self._lets: dict[str, int] = {}
         self._pending: list[Let] = []
         self._moments: list[Moment] = []
-        scratch: dict[str, Field] = {}
-        names: dict[str, Operand] = {}
+        self._scratch: list[Field] = []
+        scope = Scope(named.pack, {})
         for item in decl.scratch:
-            qualified = f"{self._name}.{item.name.text}"
-            fresh = self._fresh(item.name.text, item.name.span, Scope(named.pack, names))
-            try:
-                kind = read_kind(item.type, self.typer) if item.type and fresh else None
-            except Poisoned:
-                kind = None
-            if kind is None:
-                names[item.name.text] = Broken()
-                continue
-            scratch[qualified] = Field(
-                qualified,
-                kind,
-                default_of(kind, self.typer.symbols.first_id),
-                "place",
-                True,
-                None,
-                named.pack,
-                item.name.span,
-            )
-            names[item.name.text] = Expr("field", kind, value=qualified, span=item.name.span)
-        self._scratch = scratch
-        self._block(decl.block, Scope(named.pack, names), "", None, None)
+            scope = scope.bind(**{item.name.text: self._scratch_field(item, scope)})
+        self._block(decl.block, scope, "", None, None)
         if self._pending:
             self._moments.append(Moment(tuple(self._pending), (), "prove", ""))
-        return Pass(self._name, named.pack, tuple(scratch.values()), tuple(self._moments), decl.name.span)
+        return Pass(self._name, named.pack, tuple(self._scratch), tuple(self._moments), decl.name.span)
 
-    def _fresh(self, name: str, span: Span, scope: Scope) -> bool:
+    def _scratch_field(self, decl: TypedDecl, scope: Scope) -> Operand:
+        name, span = f"{self._name}.{decl.name.text}", decl.name.span
+        if not self._is_new(decl.name, scope) or decl.type is None:
+            return Broken()
+        try:
+            kind = read_kind(decl.type, self.typer)
+        except Poisoned:
+            return Broken()
+        default = default_of(kind, self.typer.symbols.first_id)
+        self._scratch.append(Field(name, kind, default, "place", True, None, self._pack, span))
+        return Expr("field", kind, value=name, span=span)
+
+    def _is_new(self, name: Scalar, scope: Scope) -> bool:
         """Whether a local name is new; reports one that hides another."""
-        if not self.typer.hides(name, span, scope):
-            return True
-        self.typer.reporter.error(
-            "PD308", f"`{name}` already means something here", span, "hides the other meaning", helps=["choose another name"]
-        )  # fmt: skip
-        return False
+        hides = self.typer.hides(name.text, name.span, scope)
+        if hides:
+            message, label = f"`{name.text}` already means something here", "hides the other meaning"
+            self.typer.reporter.error("PD308", message, name.span, label, helps=["choose another name"])
+        return not hides
 
     def _block(
         self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None
@@ -166,17 +149,12 @@ class Elaborator:
         self._blocks += 1
         if self._blocks > MAX_BLOCKS and block.header is not None:
             self._blocks = 0
-            raise self.typer.fail(
-                "PD508",
-                "loops in loops that never end",
-                block.header.span,
-                "repeated too often",
-                "loop over fewer things",
-            )
+            message, label = "loops in loops that never end", "repeated too often"
+            raise self.typer.fail("PD508", message, block.header.span, label, "loop over fewer things")
         symmetry, policy = block.symmetry or symmetry, block.conflicts or policy
         for scalar, syntax in block.lets:
-            fresh = self._fresh(scalar.text, scalar.span, scope)
-            scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope) if fresh else Broken()})
+            is_new = self._is_new(scalar, scope)
+            scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope) if is_new else Broken()})
         rounds = self._rounds(block, scope, label)
         if rounds == [] and block.header is not None and not self.typer.reporter.has_errors:
             self.typer.reporter.report(
@@ -198,17 +176,11 @@ class Elaborator:
         if header.kind == "repeat":
             rounds = int(header.text) if len(header.text) < 4 else 1000
             if not 1 <= rounds <= 64:
-                self.typer.reporter.error(
-                    "PD508",
-                    f"a loop of {header.text} rounds",
-                    header.span,
-                    "1 to 64 are possible",
-                    helps=[
-                        "leave the rules out, or write a number from 1 to 64"
-                        if rounds < 1
-                        else "write a number from 1 to 64; a `repeat` inside another multiplies"
-                    ],
-                )
+                fix = "write a number from 1 to 64; a `repeat` inside another multiplies"
+                if rounds < 1:
+                    fix = "leave the rules out, or write a number from 1 to 64"
+                message, label = f"a loop of {header.text} rounds", "1 to 64 are possible"
+                self.typer.reporter.error("PD508", message, header.span, label, helps=[fix])
                 return []
             return [(scope, f"{label}round {i + 1}") for i in range(rounds)]
         try:
@@ -218,11 +190,9 @@ class Elaborator:
         variables = [binding.children[0].text for binding in header.children]
         for variable in variables:
             self.typer.used.discard(variable)
+        before = [label] if label else []
         return [
-            (
-                inner,
-                ", ".join([*filter(None, [label]), *(f"{v} = {_show(inner.locals[v])}" for v in variables)]),
-            )
+            (inner, ", ".join([*before, *(f"{name} = {_show(inner.locals[name])}" for name in variables)]))
             for inner in scopes
         ]
 
@@ -235,8 +205,8 @@ class Elaborator:
             value = self.typer.value(operand, syntax.span)
         except Poisoned:
             return Broken()
-        except Unresolved as asleep:
-            return Absent(asleep.name)
+        except Unresolved as missing:
+            return Absent(missing.name)
         finally:
             self._empty_lets |= self.typer.empty
         value = constant(value) if isinstance(value, Number) else value
@@ -261,12 +231,9 @@ class Elaborator:
         for syntax in rules:
             copies: list[Rule] = []
             for matrix in ORIENTATIONS[symmetry]:
-                copies.extend(
-                    rule
-                    for rule in self._rule(syntax, replace(scope, orientation=matrix))
-                    if rule not in copies
-                )
-            found.extend(copies)
+                rules_here = self._rule(syntax, replace(scope, orientation=matrix))
+                copies += [rule for rule in rules_here if rule not in copies]
+            found += copies
         self._rules += len(found)
         if self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
             raise self._too_many(rules)
@@ -274,13 +241,8 @@ class Elaborator:
         self._pending = []
 
     def _too_many(self, rules: tuple[Syntax, ...]) -> Poisoned:
-        return self.typer.fail(
-            "PD508",
-            f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules",
-            rules[0].span,
-            "here",
-            "loop over fewer things",
-        )
+        message = f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules"
+        return self.typer.fail("PD508", message, rules[0].span, "here", "loop over fewer things")
 
     # Rules
 
@@ -292,19 +254,19 @@ class Elaborator:
                 "transform": self._transform, "swap": self._swap, "move": self._move, "assign": self._assign, "push": self._push,
             }[syntax.kind](syntax, scope)  # fmt: skip
         except Poisoned:
-            self.result.awake.add(syntax.span)
+            self.result.active.add(syntax.span)
             return []
-        except Unresolved as asleep:
-            self.result.asleep[syntax.span] = asleep.name
+        except Unresolved as missing:
+            self.result.inactive[syntax.span] = missing.name
             return []
         empty = self.typer.empty | self._empty_lets
         if empty:
             self.result.empty[syntax.span] = min(empty)
         rules = [rule for rule in rules if not (rule.mask == FALSE and self.typer.absent)]
         if rules:
-            self.result.awake.add(syntax.span)
+            self.result.active.add(syntax.span)
         else:
-            self.result.asleep[syntax.span] = ", ".join(sorted(self.typer.absent))
+            self.result.inactive[syntax.span] = ", ".join(sorted(self.typer.absent))
         return rules
 
     def _mask(self, subjects: list[Expr], syntax: Syntax, scope: Scope) -> Expr:
@@ -366,73 +328,50 @@ class Elaborator:
             wide = Kind(kind.name, -1e6, 1e6)
             expr = self.typer.of_kind(operand, wide, value.span)
         else:
-            raise self.typer.fail(
-                "PD407",
-                f"`{syntax.text}` needs a number",
-                syntax.span,
-                f"`{name}` is a {kind}",
-                "assign with `:=`",
-            )
+            message, label = f"`{syntax.text}` needs a number", f"`{name}` is a {kind}"
+            raise self.typer.fail("PD407", message, syntax.span, label, "assign with `:=`")
         return Assign(name, offset, syntax.text, expr, mask, syntax.span)
 
     def _check_fits(self, value: Expr, kind: Kind, span: Span, name: str) -> None:
         if kind.name == "int" and (value.kind.lo < kind.lo or value.kind.hi > kind.hi):
-            self.typer.reporter.report(
-                "PD408",
-                f"a value of {value.kind} goes into `{name}`, which holds {kind}",
-                span,
-                "it is cut off at the bounds",
-                helps=[f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"],
-            )
+            message = f"a value of {value.kind} goes into `{name}`, which holds {kind}"
+            helps = [f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"]
+            self.typer.reporter.report("PD408", message, span, "it is cut off at the bounds", helps=helps)
 
     def _target(self, syntax: Syntax, scope: Scope) -> tuple[str, Kind, Offset]:
         """The field that is assigned, its kind, and where."""
-        operand: Operand
-        offset = (0, 0)
-        if syntax.kind == "optional_attribute":
-            syntax = self.typer.certain(syntax, scope)
-        own = self.typer.of_pack(syntax, scope) if syntax.kind == "attribute" else None
-        if isinstance(own, Expr) and own.op == "look":
-            operand, offset = own.args[0], own.value
-        elif own is not None:
-            operand = own
-        elif syntax.kind == "attribute":
-            base = self._owner(syntax, scope)
-            offset = self.typer.offset(base.offset, syntax.span)
-            word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
-            operand = self.typer.lookup(syntax.text, word, scope, after_dot=True)
-        else:
-            operand = self.typer.evaluate(syntax, scope)
+        operand, offset = self._assigned(syntax, scope)
         if isinstance(operand, Absent):
             raise Unresolved(operand.name)
         if not isinstance(operand, Expr) or operand.op not in ("field", "property"):
-            fields = [
-                *self.typer.symbols.fields,
-                *self.typer.symbols.properties,
-                *(n.rpartition(".")[2] for n in self._scratch),
-            ]
-            helps = suggest(syntax.text, fields, "fields")
+            symbols, scratch = self.typer.symbols, (one.name.rpartition(".")[2] for one in self._scratch)
+            helps = suggest(syntax.text, (*symbols.fields, *symbols.properties, *scratch), "fields")
             if isinstance(operand, (SetOf, Place)):
                 helps = ("one element becomes another with `->`: `SET -> ELEMENT if …`",)
-            raise self.typer.fail(
-                "PD407",
-                f"`{syntax.span.text}` cannot be assigned",
-                syntax.span,
-                "not a field or property",
-                *helps,
-            )
+            message = f"`{syntax.span.text.removesuffix('?')}` cannot be assigned"
+            raise self.typer.fail("PD407", message, syntax.span, "not a field or property", *helps)
         name = str(operand.value)
         if operand.op == "property":
             if operand.kind.name == "chance":
-                raise self.typer.fail(
-                    "PD407",
-                    f"the chance `{name}` cannot be assigned",
-                    syntax.span,
-                    "chances belong to elements",
-                    "declare it as an integer",
-                )
+                message, label = f"the chance `{name}` cannot be assigned", "chances belong to elements"
+                raise self.typer.fail("PD407", message, syntax.span, label, "declare it as an integer")
             self.result.overridden.add(name)
         return name, operand.kind, offset
+
+    def _assigned(self, syntax: Syntax, scope: Scope) -> tuple[Operand, Offset]:
+        """What stands left of an assignment, and at which neighbor."""
+        if syntax.kind == "optional_attribute":
+            syntax = self.typer.certain(syntax, scope)
+        if syntax.kind != "attribute":
+            return self.typer.evaluate(syntax, scope), (0, 0)
+        own = self.typer.of_pack(syntax, scope)
+        if isinstance(own, Expr) and own.op == "look":
+            return own.args[0], own.value
+        if own is not None:
+            return own, (0, 0)
+        offset = self.typer.offset(self._owner(syntax, scope).offset, syntax.span)
+        word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
+        return self.typer.lookup(syntax.text, word, scope, after_dot=True), offset
 
     def _owner(self, syntax: Syntax, scope: Scope) -> Place:
         """The neighbor before the dot of an assigned field."""
@@ -443,32 +382,23 @@ class Elaborator:
             raise self.typer.wrong(operand, "a neighbor before the dot", before.span, fix)
         if isinstance(operand, Expr) and operand.kind.name == "vec2":
             fix = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
-            raise self.typer.fail(
-                "PD407", "a part of a vector cannot be assigned", syntax.span, "only a part", fix
-            )
+            message = "a part of a vector cannot be assigned"
+            raise self.typer.fail("PD407", message, syntax.span, "only a part", fix)
         return self.typer.place(operand, before.span)
 
     def _push(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         target, amount, source = syntax.children[:3]
         name, kind, _ = self._target(target, scope)
         if kind.name != "vec2":
-            raise self.typer.fail(
-                "PD401",
-                f"`{name}` is not a vector",
-                target.span,
-                f"this is a {kind}",
-                "`push` works on vec2 fields",
-            )
+            message, fix = f"`{name}` is not a vector", "`push` works on vec2 fields"
+            raise self.typer.fail("PD401", message, target.span, f"this is a {kind}", fix)
         mask = self._mask([self.typer.condition(source, scope)], syntax, scope)
         strength = self.typer.real(self.typer.evaluate(amount, scope), amount.span)
-        zero = Expr("const", REAL, value=0.0)
+        part = {0: Expr("const", REAL, value=0.0), 1: strength, -1: Expr("neg", REAL, (strength,))}
         rules: list[Rule] = []
-        for dy, dx in DIRECTION_SETS["sides"]:
-            dy, dx = turned((dy, dx), scope.orientation)
-            parts = tuple(
-                zero if d == 0 else strength if d > 0 else Expr("neg", REAL, (strength,)) for d in (dy, dx)
-            )
-            vector = Expr("vector", VEC2, parts, span=amount.span)
+        for side in DIRECTION_SETS["sides"]:
+            dy, dx = turned(side, scope.orientation)
+            vector = Expr("vector", VEC2, (part[dy], part[dx]), span=amount.span)
             rules.append(Assign(name, (dy, dx), "+=", vector, mask, syntax.span))
         return rules
 

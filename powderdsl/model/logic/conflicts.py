@@ -182,8 +182,8 @@ def _report_fate(span: Span, fate: _Fate, relaxed: Facts, elaborated: Elaborated
             )
             reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
         return
-    if span in elaborated.asleep:
-        reason = f"`{elaborated.asleep[span]}` is not loaded"
+    if span in elaborated.inactive:
+        reason = f"`{elaborated.inactive[span]}` is not loaded"
     elif span in elaborated.empty:
         reason = f"no element is in `{elaborated.empty[span]}`"
     elif any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in fate.silent):
