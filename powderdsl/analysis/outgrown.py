@@ -32,7 +32,7 @@ def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Di
     scopes = {
         pack.source: composition.scopes.of_pack(pack.name.text, _words(pack)) for pack in composition.packs
     }
-    for author in composition.ruleset.lineage if composition.ruleset else ():
+    for author in composition.lineage:
         scopes[author.source] = composition.scopes.of_ruleset(author, _of(author.invariants))
     for source, scope in scopes.items():
         own = [one for one in warnings if one.primary.span and one.primary.span.source == source]

@@ -6,10 +6,10 @@ stands first holds, as with `conflicts: first_wins`, where that changes nothing 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from powderdsl.diagnostics import CompileError, Label, Reporter, Span
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Span
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.logic.unused import pack_words
 from powderdsl.model.types import Moment, Move, Transform
@@ -65,36 +65,33 @@ class AddedPacks:
     def _conflicts_alone(self, scope: tuple[str, ...]) -> frozenset[Span] | None:
         """Where rules of some packs alone meet; None if something else is wrong with them."""
         if scope not in self._conflicts:
-            reporter = Reporter()
+            found: tuple[Diagnostic, ...] = ()
             try:
-                self.check_alone(scope, reporter)
+                self.check_alone(scope, Reporter())
             except CompileError as error:
                 found = error.diagnostics
-                wrong = [one for one in found if one.severity.value == "error" and one.code not in CODES]
-                places = frozenset(one.primary.span for one in found if one.primary.span is not None)
-                self._conflicts[scope] = None if wrong else places
-            else:
-                self._conflicts[scope] = frozenset()
+            wrong = any(one.severity.value == "error" and one.code not in CODES for one in found)
+            places = frozenset(one.primary.span for one in found if one.primary.span is not None)
+            self._conflicts[scope] = None if wrong else places
         return self._conflicts[scope]
 
-    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> Iterator[Given]:
+    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Given]:
         """What packs outside a scope give an element: tags that stand in some words, else such values, else itself."""
         composition = self.composition
         named = composition.element_decls[element]
         entries = [(pack, entry) for pack, name, entry in composition.entries() if name == element]
         tags = [("tag", pack, tag) for pack, entry in entries for tag in entry.tags]
         values = [("value", pack, key) for pack, entry in entries for key, _ in entry.values]
-        found: list[Given] = []
         for several in (tags, values):
-            found = found or [
+            found = [
                 Given(pack, element, noun, name, scalar.span)
                 for noun, pack, scalar in several
                 if pack not in scope
                 and (name := composition.names.of(pack, scalar.word)).rpartition(".")[2] in words
             ]
-        if not found and named.pack not in scope:
-            found = [Given(named.pack, element, "", "", named.decl.name.span)]
-        yield from found
+            if found:
+                return found
+        return [] if named.pack in scope else [Given(named.pack, element, "", "", named.span)]
 
 
 def may_settle(moment: Moment) -> bool:
@@ -119,45 +116,28 @@ def report_added(
     Args:
         rules: what the rules claim. assigns: whether they assign a field.
     """
-    by_element: Mapping[str, list[Given]] = {
-        one.element: [given for given in causes if given.element == one.element] for one in causes
-    }
     first, *more = causes
-    words = [f"`{one.word}`" for one in by_element[first.element] if one.word]
-    listed = " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
-    several = "s" if len(words) > 1 else ""
-    what = (
-        f"gives `{first.element}` the {first.noun}{several} {listed}" if words else f"adds `{first.element}`"
-    )
+    words = [f"`{one.word}`" for one in causes if one.word and one.element == first.element]
+    several = len(words) > 1
+    what = f"adds `{first.element}`"
+    if words:
+        listed = " and ".join([", ".join(words[:-1]), words[-1]] if several else words)
+        what = f"gives `{first.element}` the {first.noun}{'s' * several} {listed}"
     message = f"`{first.pack}` {what}: two rules of `{pass_name}` may claim one cell with it"
-    secondary = [
-        *(Label(one.span, "and this" if one.word else "this element too") for one in more),
-        *(Label(span, "claims the cell" if number == 0 else "claims it too") for number, span in enumerate(dict.fromkeys(rules))),
-    ]  # fmt: skip
+    secondary = [Label(one.span, "and this" if one.word else "this element too") for one in more]
+    secondary += [
+        Label(span, "claims it too" if number else "claims the cell")
+        for number, span in enumerate(dict.fromkeys(rules))
+    ]
+    fix = f"give `{first.element}` other values, so that it does not fulfill the conditions of both rules"
     if first.noun == "tag":
         needless = "all of them" if several else "that"
-        helps = [f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"]
-    else:
-        helps = [
-            f"give `{first.element}` other values, so that it does not fulfill the conditions of both rules"
-        ]
-    if settled:
-        holds = (
-            "the assignment that stands last holds"
-            if assigns
-            else "the rule that stands first holds, as with `conflicts: first_wins`"
-        )
-        reporter.report(
-            "PD517",
-            message,
-            first.span,
-            "because of this",
-            secondary=secondary,
-            notes=[*notes, holds],
-            helps=helps,
-        )
-        return
-    helps.append(f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`")
-    reporter.error(
-        code, message, first.span, "because of this", secondary=secondary, notes=notes, helps=helps
-    )
+        fix = f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"
+    holds = "the rule that stands first holds, as with `conflicts: first_wins`"
+    if assigns:
+        holds = "the assignment that stands last holds"
+    policy = f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`"
+    reporter.report(
+        "PD517" if settled else code, message, first.span, "because of this", secondary=secondary,
+        notes=[*notes, holds] if settled else notes, helps=[fix] if settled else [fix, policy],
+    )  # fmt: skip

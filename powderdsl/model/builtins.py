@@ -35,47 +35,30 @@ def grid_kernel(name: str, rows: tuple[tuple[int, ...], ...], wrap: bool = False
     return Kernel(name, weights, wrap)
 
 
-KERNELS: dict[str, Kernel] = {
-    "box": grid_kernel("box", ((1, 1, 1), (1, 1, 1), (1, 1, 1))),
-    "ring": grid_kernel("ring", ((1, 1, 1), (1, 0, 1), (1, 1, 1))),
-    "cross": grid_kernel("cross", ((0, 1, 0), (1, 1, 1), (0, 1, 0))),
-    "plus": grid_kernel("plus", ((0, 1, 0), (1, 0, 1), (0, 1, 0))),
-}
-"""Neighborhoods for `count` and `sum`. Cells outside the grid count as nothing."""
-
-
 @dataclass(frozen=True)
 class KernelShape:
     """A neighborhood of any radius: which of the cells (rows, columns) away belong to it."""
 
-    name: str
     about: str
     covers: Callable[[int, int, int], bool]
     """Of rows, columns, radius."""
 
 
 KERNEL_SHAPES: dict[str, KernelShape] = {
-    row.name: row
-    for row in (
-        KernelShape(
-            "box",
-            "all cells at most R rows and R columns away",
-            lambda dy, dx, r: max(abs(dy), abs(dx)) <= r,
-        ),
-        KernelShape(
-            "ring", "the border of that box: exactly R away", lambda dy, dx, r: max(abs(dy), abs(dx)) == r
-        ),
-        KernelShape(
-            "disc",
-            "the cells nearer than R + ½, as a circle",
-            lambda dy, dx, r: dy * dy + dx * dx <= r * r + r,
-        ),
-        KernelShape(
-            "diamond", "the cells at most R steps to the sides away", lambda dy, dx, r: abs(dy) + abs(dx) <= r
-        ),
-        KernelShape("cross", "row and column of the cell, R to each side", lambda dy, dx, r: 0 in (dy, dx)),
-        KernelShape("plus", "the same without the cell", lambda dy, dx, r: (dy == 0) != (dx == 0)),
-    )
+    "box": KernelShape(
+        "all cells at most R rows and R columns away", lambda dy, dx, r: max(abs(dy), abs(dx)) <= r
+    ),
+    "ring": KernelShape(
+        "the border of that box: exactly R away", lambda dy, dx, r: max(abs(dy), abs(dx)) == r
+    ),
+    "disc": KernelShape(
+        "the cells nearer than R + ½, as a circle", lambda dy, dx, r: dy * dy + dx * dx <= r * r + r
+    ),
+    "diamond": KernelShape(
+        "the cells at most R steps to the sides away", lambda dy, dx, r: abs(dy) + abs(dx) <= r
+    ),
+    "cross": KernelShape("row and column of the cell, R to each side", lambda dy, dx, r: 0 in (dy, dx)),
+    "plus": KernelShape("the same without the cell", lambda dy, dx, r: (dy == 0) != (dx == 0)),
 }
 """Kernels that take a radius: `box(5)`. With radius 1 they are those of KERNELS; a disc is a box then, a diamond a cross."""
 
@@ -91,39 +74,36 @@ def shaped_kernel(shape: str, radius: int, name: str = "", wrap: bool = False) -
     return Kernel(name or f"{shape}({radius})", weights, wrap)
 
 
+KERNELS: dict[str, Kernel] = {name: shaped_kernel(name, 1, name) for name in ("box", "ring", "cross", "plus")}
+"""Neighborhoods for `count` and `sum`. Cells outside the grid count as nothing."""
+
+
 @dataclass(frozen=True)
 class Function:
-    """A function of the line language: how it is called, and one line for the documentation."""
+    """A function of the line language: how it is called, one line for the documentation, how many arguments it takes."""
 
-    name: str
     signature: str
     about: str
     arity: tuple[int, int]
 
 
 FUNCTIONS: dict[str, Function] = {
-    row.name: row
-    for row in (
-        Function(
-            "count",
-            "count(SET in KERNEL)",
-            "how many cells of the neighborhood hold; `box` if none is named",
-            (1, 16),
-        ),
-        Function("sum", "sum(VALUE in KERNEL)", "the weighted sum of a value over the neighborhood", (1, 1)),
-        Function("at", "at(ROWS, COLUMNS)", "the neighbor ROWS down and COLUMNS right", (2, 2)),
-        Function(
-            "inside", "inside(PLACE)", "whether that neighbor lies inside the grid, without wrapping", (1, 1)
-        ),
-        Function("octant", "octant(VEC2)", "the direction a vector points to", (1, 1)),
-        Function("length", "length(VEC2)", "the length of a vector", (1, 1)),
-        Function("vector", "vector(ROWS, COLUMNS)", "a vec2 from two numbers", (2, 2)),
-        Function("min", "min(A, B)", "the smaller of two numbers", (2, 8)),
-        Function("max", "max(A, B)", "the larger of two numbers", (2, 8)),
-        Function("abs", "abs(A)", "a number without its sign", (1, 1)),
-        Function("clamp", "clamp(A, LOW, HIGH)", "a number kept between two bounds", (3, 3)),
-        Function("opposite", "opposite(PLACE)", "the neighbor, or the direction, the other way", (1, 1)),
-    )
+    "count": Function(
+        "count(SET in KERNEL)", "how many cells of the neighborhood hold; `box` if none is named", (1, 16)
+    ),
+    "sum": Function("sum(VALUE in KERNEL)", "the weighted sum of a value over the neighborhood", (1, 1)),
+    "at": Function("at(ROWS, COLUMNS)", "the neighbor ROWS down and COLUMNS right", (2, 2)),
+    "inside": Function(
+        "inside(PLACE)", "whether that neighbor lies inside the grid, without wrapping", (1, 1)
+    ),
+    "octant": Function("octant(VEC2)", "the direction a vector points to", (1, 1)),
+    "length": Function("length(VEC2)", "the length of a vector", (1, 1)),
+    "vector": Function("vector(ROWS, COLUMNS)", "a vec2 from two numbers", (2, 2)),
+    "min": Function("min(A, B)", "the smaller of two numbers", (2, 8)),
+    "max": Function("max(A, B)", "the larger of two numbers", (2, 8)),
+    "abs": Function("abs(A)", "a number without its sign", (1, 1)),
+    "clamp": Function("clamp(A, LOW, HIGH)", "a number kept between two bounds", (3, 3)),
+    "opposite": Function("opposite(PLACE)", "the neighbor, or the direction, the other way", (1, 1)),
 }
 
 COORDINATES = ("row", "column", "step")
@@ -137,7 +117,7 @@ KIND_WORDS: dict[str, str] = {
     "real": "real(LOW..HIGH): a float32",
     "vec2": "vec2(LOW..HIGH): two float32, (rows, columns)",
 }
-"""Kinds of properties, fields and parameters, besides whole-number ranges LOW..HIGH."""
+"""Kinds of properties, fields and parameters, besides ranges of integers, LOW..HIGH."""
 
 MAX_OFFSET = 15
 """How far a rule may look in one step."""
@@ -148,11 +128,5 @@ MAX_SIDE_MULTIPLE = 64
 MAX_MAGNITUDE = 1_000_000
 """The largest number a rule file may contain."""
 
-RESERVED = (
-    frozenset(DIRECTIONS)
-    | frozenset(DIRECTION_SETS)
-    | frozenset(KERNELS)
-    | frozenset(FUNCTIONS)
-    | frozenset(COORDINATES)
-)
+RESERVED = frozenset((*DIRECTIONS, *DIRECTION_SETS, *KERNELS, *FUNCTIONS, *COORDINATES))
 """Words that no definition may take. Shapes such as `diamond(3)` have their radius with them: elements may have their names."""

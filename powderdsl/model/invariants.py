@@ -57,7 +57,7 @@ def check_invariants(
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(pack.name.text, line, None) for pack in composition.packs for line in pack.invariants]
     gone = names_left_out(composition.ruleset) - composition.names.owners.keys()
-    for ruleset in composition.ruleset.lineage if composition.ruleset else ():
+    for ruleset in composition.lineage:
         written += [(ruleset.name.text, with_optional(line, gone), ruleset) for line in ruleset.invariants]
     found = []
     reporter = typer.reporter
@@ -70,10 +70,10 @@ def check_invariants(
             found.append(Invariant(claim, without, pack, line.span, scope))
         except Poisoned:
             pass
-        except Unresolved as asleep:
+        except Unresolved as missing:
             typer.reporter.report(
-                "PD506", f"this invariant is inactive: `{asleep.name}` is not loaded", line.span, "left out",
-                helps=[f"it becomes active with a pack that defines `{asleep.name}`"],
+                "PD506", f"this invariant is inactive: `{missing.name}` is not loaded", line.span, "left out",
+                helps=[f"it becomes active with a pack that defines `{missing.name}`"],
             )  # fmt: skip
         added = [one.name.text for one in composition.packs if one.name.text not in scope]
         for remark in typer.reporter.diagnostics:
@@ -88,7 +88,7 @@ def check_invariants(
 
 
 def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]]:
-    """What a line says, and the elements without which worlds start. Raises Poisoned after reporting, or Asleep."""
+    """What a line says, and the elements without which worlds start. Raises Poisoned or Unresolved."""
     typer.absent.clear()
     typer.start_rule(line.span)
     where = Scope(pack, {})

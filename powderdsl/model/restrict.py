@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Span
 from powderdsl.model.check import check
+from powderdsl.model.composition.names import needs_of
 from powderdsl.model.declarations import RulesetDecl
 from powderdsl.model.types import Ruleset
 
@@ -68,12 +69,9 @@ def _checked(ruleset: Ruleset, packs: Iterable[str], reporter: Reporter) -> Rule
 def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
     """The model without one pack and those that need it; None if the rest is not a ruleset."""
     assert ruleset.declared is not None
-    gone = {pack}
-    for _ in ruleset.declared.packs:
-        gone |= {
-            decl.name.text for decl in ruleset.declared.packs if any(need.text in gone for need in decl.needs)
-        }
-    return restricted(ruleset, [name for name in ruleset.packs if name not in gone])
+    return restricted(
+        ruleset, [name for name, needs in needs_of(ruleset.declared.packs).items() if pack not in needs]
+    )
 
 
 def _bare(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | None:

@@ -58,7 +58,7 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     """
     names = composition.names
     words = {names.of(pack.name.text, word) for pack in composition.packs for word in pack_words(pack)}
-    for ruleset in composition.ruleset.lineage if composition.ruleset else ():
+    for ruleset in composition.lineage:
         words |= {word for line in ruleset.invariants for word in words_of(line)}
         words |= {scalar.text.removesuffix("?").partition(".")[0] for scalar in ruleset.matrix}
     for name, field in composition.fields.items():
