@@ -22,6 +22,7 @@ from powderdsl.model.expressions.operands import (
     disjunction,
     member,
 )
+from powderdsl.model.expressions.operators import kind_name
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.text import one_line
 from powderdsl.model.types import (
@@ -152,12 +153,9 @@ def _trend(typer: Typer, line: Syntax, scope: Scope) -> Claim:
 
 
 def _elements(typer: Typer, what: Syntax, scope: Scope) -> tuple[int, ...]:
-    operand = typer.evaluate(what, scope)
-    ids = typer.set_of(operand, what.span).ids
-    if not ids and typer.absent:
-        raise Unresolved(", ".join(sorted(typer.absent)))
+    ids = typer.set_of(typer.evaluate(what, scope), what.span).ids
     if not ids:
-        _says_nothing(typer, what.span, "no element is meant")
+        _says_nothing(typer, what.span, "no element is meant", is_empty=True)
     return ids
 
 
@@ -178,27 +176,24 @@ def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
     for child in call.children:
         if child.kind == "in_" and isinstance(typer.evaluate(child.children[1], scope), Kernel):
             raise typer.fail("PD406", "an invariant counts the whole world", call.span, "has a neighborhood")
-    operands = [typer.evaluate(child, scope) for child in call.children]
-    if all(isinstance(operand, (SetOf, Absent)) for operand in operands):
-        ids = {
-            number
-            for child, operand in zip(call.children, operands, strict=True)
-            for number in typer.set_of(operand, child.span).ids
-        }
-        if not ids and typer.absent:
-            raise Unresolved(", ".join(sorted(typer.absent)))
-        if not ids or ids == set(typer.symbols.ids):
-            _says_nothing(typer, call.span, "all cells are counted" if ids else "no element is counted")
-        return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, frozenset(ids))
+    operands = [(typer.evaluate(child, scope), child.span) for child in call.children]
+    if all(isinstance(operand, (SetOf, Absent)) for operand, _ in operands):
+        ids = frozenset(number for operand, span in operands for number in typer.set_of(operand, span).ids)
+        if not ids:
+            _says_nothing(typer, call.span, "no element is counted", is_empty=True)
+        elif ids == frozenset(typer.symbols.ids):
+            _says_nothing(typer, call.span, "all cells are counted")
+        return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, ids)
     if call.text == "sum" and len(operands) == 1:
-        value = typer.value(operands[0], call.children[0].span)
+        (operand, span), *_ = operands
+        value = typer.value(operand, span)
         if isinstance(value, Expr) and value.kind.name not in ("int", "flag"):
             fix = "floats are rounded: their sums are constant for no rule"
-            raise typer.wrong(value, "an integer", call.children[0].span, fix)
+            raise typer.wrong(value, "an integer", span, fix)
         if isinstance(value, Number):
-            raise typer.wrong(value, "something that worlds have", call.children[0].span)
+            raise typer.wrong(value, "something that worlds have", span)
         return Total(value, trend, None)
-    flags = [typer.flag(operand, child.span) for operand, child in zip(operands, call.children, strict=True)]
+    flags = [typer.flag(operand, span) for operand, span in operands]
     return Total(_asked(typer, disjunction(flags, call.span), call.span), trend, None)
 
 
@@ -219,12 +214,10 @@ def _never(typer: Typer, line: Syntax, scope: Scope) -> Claim:
 
 def _asked(typer: Typer, condition: Expr, span: Span) -> Expr:
     """The condition, unless it is not a question: it may depend on a pack that is not loaded, or be false by its words."""
-    if condition == FALSE and typer.absent:
-        raise Unresolved(", ".join(sorted(typer.absent)))
-    if condition in (TRUE, FALSE):
-        _says_nothing(
-            typer, span, "every cell fulfills this" if condition == TRUE else "no cell can fulfill this"
-        )
+    if condition == FALSE:
+        _says_nothing(typer, span, "no cell can fulfill this", is_empty=True)
+    elif condition == TRUE:
+        _says_nothing(typer, span, "every cell fulfills this")
     return condition
 
 
@@ -234,23 +227,20 @@ def _stays(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     operand = typer.evaluate(what, scope)
     if isinstance(operand, Absent):
         raise Unresolved(operand.name)
-    if (
-        not isinstance(operand, Expr)
-        or operand.op not in ("field", "property")
-        or operand.kind.name not in ("int", "real", "vec2")
-    ):
+    numbers = kind_name(operand) in ("int", "real", "vec2")
+    if not isinstance(operand, Expr) or operand.op not in ("field", "property") or not numbers:
         raise typer.wrong(operand, "a field of numbers", what.span, "for anything else say `never CONDITION`")
     lo, hi = read_bounds(bounds, typer)
-    name = str(operand.value)
+    name, kind = str(operand.value), operand.kind
     field = typer.symbols.fields.get(name)
-    outside = hi < operand.kind.lo or lo > operand.kind.hi
-    beyond = [
-        value
-        for value in (field.defaults if field is not None else ())
-        if any(not lo <= part <= hi for part in (value if isinstance(value, tuple) else (value,)))
+    outside = hi < kind.lo or lo > kind.hi
+    defaults = field.defaults if field else ()
+    parts = [
+        (value, part) for value in defaults for part in (value if isinstance(value, tuple) else (value,))
     ]
+    beyond = [value for value, part in parts if not lo <= part <= hi]
     if outside or beyond:
-        found = f"`{name}` holds {operand.kind}" if outside else f"a fresh cell has {beyond[0]}"
+        found = f"`{name}` holds {kind}" if outside else f"a fresh cell has {beyond[0]}"
         raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, "widen the bounds")
     return Bounded(name, lo, hi)
 
@@ -267,7 +257,10 @@ def _agree(typer: Typer, line: Syntax, scope: Scope) -> Claim:
     return Symmetric(line.children[0].text)
 
 
-def _says_nothing(typer: Typer, span: Span, label: str) -> None:
+def _says_nothing(typer: Typer, span: Span, label: str, *, is_empty: bool = False) -> None:
+    """Report an invariant that no world can break. What is empty may need a pack that is not loaded: Unresolved."""
+    if is_empty and typer.absent:
+        raise Unresolved(", ".join(sorted(typer.absent)))
     typer.reporter.report("PD510", "this invariant says nothing", span, label, helps=["remove it"])
 
 

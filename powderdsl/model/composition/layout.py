@@ -7,13 +7,12 @@ its rules are the first to assign, and its fields. So channels stay where they a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.composition.claim_scopes import names_left_out
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.expressions.symbols import Symbols
-from powderdsl.model.types import Element, MatrixChannel, Move, Pass, Swap, Transform
+from powderdsl.model.types import Assign, MatrixChannel, Pass
+from powderdsl.syntax.yaml_tree import Scalar
 
 COMPONENTS = ("row", "column")
 
@@ -28,43 +27,41 @@ def matrix_channels(
 ) -> tuple[MatrixChannel, ...]:
     """The channels of `World.matrix()`. Reports names in a ruleset's `matrix:` that no loaded pack has."""
     own, *others = _blocks(composition, symbols, passes)
-    elements = composition.elements
-    by_id = {element.id: element for element in elements.values()}
-    channels: list[MatrixChannel] = []
+    elements = composition.elements.values()
+    names = {element.id: element.name for element in elements}
     size = own_slots(composition)
-    first = [MatrixChannel(by_id[n].name if n in by_id else "", id=n) for n in range(size)]
+    first = [MatrixChannel(names.get(number, ""), id=number) for number in range(size)]
     written = composition.ruleset.placing.matrix if composition.ruleset else ()
-    gone = names_left_out(composition.ruleset)
-    if written:
-        for scalar in written:
-            name = scalar.word
-            if name == "elements":
-                channels += first
-                continue
-            found = _named(name, composition, symbols)
-            waits = scalar.is_optional or not gone.isdisjoint(name.split("."))
-            if not found and not waits:
-                known = ["elements", *symbols.properties, *symbols.fields]
-                helps = [
-                    *suggest(name.partition(".")[0], known, "channels"),
-                    f"if its pack may be absent, write `{name}?`",
-                ]
-                reporter.error(
-                    "PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property", helps=helps
-                )  # fmt: skip
-            channels += found or [MatrixChannel(name)]
-        if all(scalar.word != "elements" for scalar in written):
-            return tuple(channels)  # a ruleset that shows no elements shows none of further packs either
-    else:
-        channels += [*first, *_holding(own, symbols)]
+    channels: list[MatrixChannel] = []
+    for scalar in written:
+        channels += first if scalar.word == "elements" else _written(scalar, composition, symbols, reporter)
+    if written and all(scalar.word != "elements" for scalar in written):
+        return tuple(channels)  # a ruleset that shows no elements shows none of further packs either
+    if not written:
+        channels = [*first, *_holding(own, symbols)]
     for (pack,), block in zip(composition.groups[1:], others, strict=True):
-        channels += [
-            MatrixChannel(element.name, id=element.id)
-            for element in _elements_of(pack, elements)
-            if element.id >= size
-        ]
+        added = [element for element in elements if element.pack == pack and element.id >= size]
+        channels += [MatrixChannel(element.name, id=element.id) for element in added]
         channels += _holding(block, symbols)
     return tuple(channels)
+
+
+def _written(
+    scalar: Scalar, composition: Composition, symbols: Symbols, reporter: Reporter
+) -> list[MatrixChannel]:
+    """The channels that a name under `matrix:` stands for; always 0 if its pack is not loaded."""
+    name = scalar.word
+    found = _named(name, composition, symbols)
+    waits = scalar.is_optional or not names_left_out(composition.ruleset).isdisjoint(name.split("."))
+    if not found and not waits:
+        known = ["elements", *symbols.properties, *symbols.fields]
+        helps = [
+            *suggest(name.partition(".")[0], known, "channels"),
+            f"if its pack may be absent, write `{name}?`",
+        ]
+        message, label = f"unknown channel `{scalar.text}`", "not a field or property"
+        reporter.error("PD310", message, scalar.span, label, helps=helps)
+    return found or [MatrixChannel(name)]
 
 
 def own_slots(composition: Composition) -> int:
@@ -81,27 +78,16 @@ def _blocks(composition: Composition, symbols: Symbols, passes: tuple[Pass, ...]
     place = {pack: number for number, group in enumerate(composition.groups) for pack in group}
     blocks: list[list[str]] = [[] for _ in composition.groups]
     first: dict[str, int] = {}
-    for name, pack in _assignments(passes):
-        first[name] = min(place[pack], first.get(name, place[pack]))
+    for pass_ in passes:
+        for rule in (rule for moment in pass_.moments for rule in moment.rules):
+            for update in (rule,) if isinstance(rule, Assign) else rule.effects:
+                first[update.field] = min(place[pass_.pack], first.get(update.field, place[pass_.pack]))
     for name, prop in symbols.properties.items():
         if prop.stored:
             blocks[max(first.get(name, 0), place[prop.pack])].append(name)
     for name, field in symbols.fields.items():
         blocks[place[field.pack]].append(name)
     return blocks
-
-
-def _assignments(passes: tuple[Pass, ...]) -> Iterator[tuple[str, str]]:
-    """What is assigned, and the pack whose rule does it."""
-    for pass_ in passes:
-        for moment in pass_.moments:
-            for rule in moment.rules:
-                updates = rule.effects if isinstance(rule, (Transform, Swap, Move)) else (rule,)
-                yield from ((update.field, pass_.pack) for update in updates)
-
-
-def _elements_of(pack: str, elements: Mapping[str, Element]) -> list[Element]:
-    return [element for element in elements.values() if element.pack == pack]
 
 
 def _holding(names: list[str], symbols: Symbols) -> list[MatrixChannel]:
