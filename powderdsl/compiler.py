@@ -170,14 +170,14 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
 
 def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl], RulesetDecl | None]:
     """Declarations of everything named, each pack once, in the order of first mention."""
-    packs: dict[str, PackDecl] = {}
-    rulesets: list[RulesetDecl] = []
+    reader = _Reader(reporter)
+    packs, rulesets = reader.packs, reader.rulesets
     left_out: dict[str, None] = {}
     for name in names:
         plus, minus = split_names(name)
         left_out |= dict.fromkeys(minus)
         for word in plus:
-            _read_one(word, packs, rulesets, reporter, from_ruleset=None)
+            reader.read(word)
     for word in (word for word in left_out if word not in packs):
         helps = suggest(word, packs, "packs")
         reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=helps)
@@ -238,20 +238,17 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
     None after reporting what leads elsewhere (PD112), or is neither (PD304).
     """
     names: list[str] = []
-    known = shipped_rules()
-    good = True
-    for part in text.split("+"):
+    known, parts = shipped_rules(), text.split("+")
+    for part in parts:
         head = part.split("-")[0]
         if is_path(part):
             path = path_beside(part, span, reporter)
             names += [str(path)] if path is not None else []
-            good = good and path is not None
         elif head in known:
             names.append(part)
         else:
             _report_unknown(head, span, reporter)
-            good = False
-    return names if good else None
+    return names if len(names) == len(parts) else None
 
 
 def _is_there(text: str) -> bool:
@@ -262,73 +259,69 @@ def _is_there(text: str) -> bool:
         return False
 
 
-def _read_one(
-    word: str,
-    packs: dict[str, PackDecl],
-    rulesets: list[RulesetDecl],
-    reporter: Reporter,
-    from_ruleset: RulesetDecl | None,
-) -> None:
-    if word in packs:
-        return
-    path = _find(word, reporter, from_ruleset)
+def _declaration(path: Path | None, reporter: Reporter) -> PackDecl | RulesetDecl | None:
     source = read_source(path, reporter) if path else None
-    decl = read_file(source, reporter) if source else None
-    if decl is None:
-        return
-    if isinstance(decl, PackDecl):
-        if decl.name.text in packs:
-            other = packs[decl.name.text]
-            if other.source.name != decl.source.name:
-                message, label = f"pack `{decl.name.text}` is loaded twice", f"also in {other.source.name}"
-                reporter.error("PD302", message, decl.name.span, label, helps=["rename one of them"])
+    return read_file(source, reporter) if source else None
+
+
+class _Reader:
+    """Declarations that have been read: each pack and ruleset once, in the order of first mention."""
+
+    def __init__(self, reporter: Reporter):
+        self.reporter = reporter
+        self.packs: dict[str, PackDecl] = {}
+        self.rulesets: list[RulesetDecl] = []
+
+    def read(self, word: str, lister: RulesetDecl | None = None) -> None:
+        """Read what a word names; `lister` is the ruleset that lists it."""
+        if word in self.packs:
             return
-        packs[decl.name.text] = decl
-    elif from_ruleset is not None:
-        span = next(scalar.span for scalar in from_ruleset.packs if scalar.text == word)
-        reporter.error(
-            "PD304", f"`{word}` is a ruleset, not a pack", span, "under `packs:` stand packs",
-            helps=[f"to start from it, write `extends: {word}`"],
-        )  # fmt: skip
-    else:
-        _read_ruleset(decl, packs, rulesets, reporter)
+        decl = _declaration(_find(word, self.reporter, lister), self.reporter)
+        if isinstance(decl, PackDecl):
+            name = decl.name
+            other = self.packs.setdefault(name.text, decl)
+            if other.source.name != decl.source.name:
+                message, label = f"pack `{name.text}` is loaded twice", f"also in {other.source.name}"
+                self.reporter.error("PD302", message, name.span, label, helps=["rename one of them"])
+        elif decl is not None and lister is not None:
+            span = next(scalar.span for scalar in lister.packs if scalar.text == word)
+            message, label = f"`{word}` is a ruleset, not a pack", "`packs:` lists packs only"
+            helps = [f"to start from it, write `extends: {word}`"]
+            self.reporter.error("PD304", message, span, label, helps=helps)
+        elif decl is not None:
+            self.read_ruleset(decl)
 
-
-def _read_ruleset(
-    written: RulesetDecl, packs: dict[str, PackDecl], rulesets: list[RulesetDecl], reporter: Reporter
-) -> None:
-    """A ruleset with what it inherits, and its packs: each is looked for beside the file that lists it."""
-    found = _with_base(written, (written,), reporter)
-    if found is None or any(one.source.name == found.source.name for one in rulesets):
-        return
-    rulesets.append(found)
-    for name in found.members:
-        lister = found.lister(name)
-        assert lister is not None
-        _read_one(name, packs, rulesets, reporter, lister)
+    def read_ruleset(self, written: RulesetDecl) -> None:
+        """A ruleset with what it inherits, and its packs: each is looked for beside the file that lists it."""
+        found = _with_base(written, (written,), self.reporter)
+        if found is None or any(one.source.name == found.source.name for one in self.rulesets):
+            return
+        self.rulesets.append(found)
+        for name in found.members:
+            lister = found.lister(name)
+            assert lister is not None
+            self.read(name, lister)
 
 
 def _left_out_by(ruleset: RulesetDecl, reporter: Reporter) -> dict[str, PackDecl]:
     """The packs that rulesets leave out of those that they extend: the ids of their elements stay reserved."""
-    packs: dict[str, PackDecl] = {}
+    reader = _Reader(reporter)
     for one in ruleset.lineage:
         for scalar in one.without:
             lister = one.base.lister(scalar.text) if one.base else None
             if lister is not None and scalar.text not in ruleset.members:
-                _read_one(scalar.text, packs, [], reporter, lister)
-    return packs
+                reader.read(scalar.text, lister)
+    return reader.packs
 
 
 def _with_base(decl: RulesetDecl, path: tuple[RulesetDecl, ...], reporter: Reporter) -> RulesetDecl | None:
     """The ruleset with the one that it extends; `path` leads from the first one to this one."""
     if decl.extends is None:
         return decl
-    file = _find_beside(decl.extends.text, reporter, decl, decl.extends.span)
-    source = read_source(file, reporter) if file else None
-    base = read_file(source, reporter) if source else None
+    span, name = decl.extends.span, decl.extends.text
+    base = _declaration(_find_beside(name, reporter, decl, span), reporter)
     if base is None:
         return None
-    span, name = decl.extends.span, decl.extends.text
     if isinstance(base, PackDecl):
         reporter.error(
             "PD304", f"`{name}` is a pack, not a ruleset", span, "only a ruleset can be extended",

@@ -14,7 +14,6 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import counted
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.media import write_png
 from powderdsl.testing.pack_tests.runner import ExampleResult, run_examples
 from powderdsl.testing.properties.blame import difference_of_test
 from powderdsl.testing.properties.breaks import breaks
@@ -128,6 +127,8 @@ class TestingReport:
         if found is not None:
             self.say(*(f"      {line}" for line in counterexample_lines(found, ruleset)))
             if self.picture is not None:
+                from powderdsl.simulation.media import write_png  # brings Pillow
+
                 write_png(self.picture, picture(found, ruleset))
                 self.say(f"      drawn: {self.picture}")
                 self.picture = None

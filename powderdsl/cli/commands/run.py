@@ -146,8 +146,9 @@ def play(start: World, plan: Playback) -> World:
     """Run to the end; the last world. Nothing half-written stays behind when it is interrupted."""
     from powderdsl.cli.pictures import first_world, pictures
     from powderdsl.cli.terminal import LiveView
-    from powderdsl.simulation import media
 
+    if plan.out is not None:
+        from powderdsl.simulation import media  # brings Pillow
     ruleset, world = start.sim.ruleset, start
 
     def stream() -> Iterator[World]:

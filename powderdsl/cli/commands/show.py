@@ -138,46 +138,36 @@ def _data(ruleset: Ruleset) -> dict[str, Any]:
         "packs": list(ruleset.packs),
         "slots": ruleset.slots,
         "elements": [_element_data(ruleset, element) for element in ruleset.elements],
-        "properties": [
-            {"name": p.name, "kind": str(p.kind), "pack": p.pack, "where": place_of(p.span)}
-            for p in ruleset.properties
-        ],
-        "fields": [
-            {"name": f.name, "kind": str(f.kind), "at": f.at, "pack": f.pack, "where": place_of(f.span)}
-            for f in ruleset.fields
-        ],
+        "properties": [_described(one, "name", "kind", "pack") for one in ruleset.properties],
+        "fields": [_described(one, "name", "kind", "at", "pack") for one in ruleset.fields],
         "reactions": [
             {
                 "from": [element_name(ruleset, number) for number in one.before],
                 "to": [element_name(ruleset, number) for number in one.after],
                 "pass": one.pass_name,
-                "pack": one.pack,
                 "rule": one_line(one.span),
-                "where": place_of(one.span),
+                **_described(one, "pack"),
             }
             for one in reactions(ruleset)
         ],
         "passes": [
             {
-                "name": one.name,
-                "pack": one.pack,
                 "moments": len(one.moments),
                 "rules": [{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(one)],
-                "where": place_of(one.span),
+                **_described(one, "name", "pack"),
             }
             for one in ruleset.passes
         ],
         "params": [
-            {
-                "name": param.name,
-                "value": _plain(param.default),
-                "kind": str(param.kind),
-                "about": param.about,
-                "where": place_of(param.span),
-            }
-            for param in ruleset.params
+            {"value": _plain(one.default), **_described(one, "name", "kind", "about")}
+            for one in ruleset.params
         ],
     }
+
+
+def _described(one: Any, *names: str) -> dict[str, str]:
+    """Some attributes of a part of the model as text, and its place."""
+    return {**{name: str(getattr(one, name)) for name in names}, "where": place_of(one.span)}
 
 
 def _element_data(ruleset: Ruleset, element: Element) -> dict[str, Any]:
