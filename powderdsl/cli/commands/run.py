@@ -147,8 +147,6 @@ def play(start: World, plan: Playback) -> World:
     from powderdsl.cli.pictures import first_world, pictures
     from powderdsl.cli.terminal import LiveView
 
-    if plan.out is not None:
-        from powderdsl.simulation import media  # brings Pillow
     ruleset, world = start.sim.ruleset, start
 
     def stream() -> Iterator[World]:
@@ -170,6 +168,8 @@ def play(start: World, plan: Playback) -> World:
                 bar(step)
 
         if plan.out is not None and plan.suffix in ANIMATIONS:
+            from powderdsl.simulation import media  # brings Pillow
+
             write = media.write_gif if plan.suffix == ".gif" else media.write_mp4
             with user_values():
                 write(plan.out, map(picture, stream()), fps=plan.fps)
@@ -181,7 +181,9 @@ def play(start: World, plan: Playback) -> World:
             with LiveView(ruleset.elements) as view:
                 view.show(**first_world(world))
     elif plan.suffix == ".png":
-        media.write_png(plan.out, picture(world))
+        from powderdsl.simulation.media import write_png
+
+        write_png(plan.out, picture(world))
     elif plan.suffix == ".npz":
         from powderdsl.worlds.store import save
 
