@@ -62,15 +62,15 @@ def current_backend(name: str) -> str:
 
 
 def starting_backend(device: str) -> str:
-    """What runs rules on a torch device at once, without compiling."""
+    """The backend that runs rules on a torch device at once, without compiling."""
     return "arrays" if str(device).partition(":")[0] == "cpu" else "torch"
 
 
 MAX_BASES = 8
-"""Rulesets that extend each other, in a row."""
+"""Maximum length of a chain of rulesets that extend each other."""
 
 MAX_PLUSES = 16
-"""`+` characters of one path."""
+"""Maximum number of `+` characters in one path."""
 
 
 def shipped(folder: str) -> Path:
@@ -148,9 +148,9 @@ def load_with_diagnostics(
 
 
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
-    """Where a model has room for the elements of some rules: by slot, a qualified name or None.
+    """The slots of a model for the elements of some rules: a qualified name or None each.
 
-    Packs that are left out have their places too. The ids of a ruleset's own packs, or of a list of packs, stay as they
+    Packs that are left out have slots too. The ids of a ruleset's own packs, or of a list of packs, stay as they
     are; the elements of packs that are added to a ruleset follow without gaps.
 
     Raises:
@@ -224,7 +224,7 @@ def _names_a_file(part: str) -> bool:
 
 
 def _without(part: str) -> tuple[str, list[str]]:
-    """What a word without ``+`` names, and what it leaves out."""
+    """The name in a word without ``+``, and the packs that it leaves out."""
     if _is_there(part):
         return part, []
     path = re.fullmatch(r"(.*\.ya?ml)((?:-[^-/\\]*)*)", part, re.DOTALL)
@@ -235,7 +235,7 @@ def _without(part: str) -> tuple[str, list[str]]:
 def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None:
     """Names for `read` from rules that a file names at `span`: shipped names, and paths of files beside it or below.
 
-    None after reporting what leads elsewhere (PD112), or is neither (PD304).
+    Returns None after reporting a path that leads elsewhere (PD112) or an unknown name (PD304).
     """
     names: list[str] = []
     known, parts = shipped_rules(), text.split("+")
@@ -252,7 +252,7 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
 
 
 def _is_there(text: str) -> bool:
-    """Whether a text names something that is not a folder: a file, or what reading will refuse."""
+    """Whether a text names something other than a folder: a file, or something that reading will refuse."""
     try:
         return os.path.exists(text) and not os.path.isdir(text)
     except (OSError, ValueError):

@@ -55,10 +55,10 @@ def start(
 def start_drawn(
     ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None
 ) -> Start | None:
-    """Fresh worlds, ids uint8 [B, H, W], or None for a saved world, which has everything.
+    """Fresh worlds, ids uint8 [B, H, W]; None for a saved world, which is complete.
 
     A saved world continues as it was saved, random future included, so `size`, `batch` and `seed` do not go
-    with it. A drawn world stands `batch` times. Without a name every world is scattered by itself.
+    with it. A drawn world is repeated `batch` times. Without a name, each world is scattered independently.
     """
     if name is None:
         size = size or (fitting(ruleset, DEFAULT_SIZE[0]), fitting(ruleset, DEFAULT_SIZE[1]))

@@ -1,4 +1,4 @@
-"""What `powderdsl show` says of a task, and its sheet of worlds."""
+"""What `powderdsl show` prints of a task, and a picture of its worlds."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ class LiveView:
         self._height = len(lines)
 
     def _thinning(self, height: int, width: int) -> int:
-        """Every how many-th row and column is shown, so that the frame fits: no line may wrap."""
+        """The step between rows and columns that are shown, so that the frame fits: no line may wrap."""
         columns, lines = shutil.get_terminal_size()
         room = max((lines - 2) * (2 if self.color else 1), 1)
         return max(-(-height // room), -(-width // max(columns, 1)), 1)

@@ -1,4 +1,4 @@
-"""Studies are checked before the first command runs: with every value of the study, as the commands themselves would."""
+"""Check a study before its first command runs, with every value of the study, as the commands would check it."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ class _StudyCheck:
                         found |= {} if param.multiple else {param.name or "": value}
         return found
 
-    # What commands ask for
+    # What several commands take
 
     def device(self, call: Call) -> None:
         """Whether the machine has the device of a step, which all of its runs would need."""
@@ -208,7 +208,7 @@ class _StudyCheck:
         return found
 
     def knobs_and_params(self, call: Call, name: str, task: Task) -> None:
-        """Knobs of a task, and parameters of its rules, each alone."""
+        """Check knobs of a task, and parameters of its rules, one by one."""
         known = {one.name: one for one in task.knobs}
         options = self.options_of(call.step)
         short = {name: str(one.name) for name, one in options.items() if one.name in SHORT_KNOBS}
@@ -233,7 +233,7 @@ class _StudyCheck:
             check_split(task, DEFAULT_SPLITS[call.step.command] if word is None else word.filled)
 
     def run(self, word: Word, kind: str) -> None:
-        """Whether there is a run that `on` names, which is not a step before."""
+        """Whether `on`, where it does not name an earlier step, names a run."""
         from powderdsl.experiments.runs import find_run
 
         if not self.first_time(word.step, "on", word.filled):

@@ -12,7 +12,7 @@ from powderdsl.experiments.studies.study import SEED, Measure, StudyStep
 from powderdsl.tasks.task import Task
 
 LEADS_TO = "*"
-"""A key that stands for any name, where names are known only once worlds have been drawn."""
+"""A key that stands for any name, where names are known only after worlds have been drawn."""
 
 EVALUATES: dict[tuple[str, ...], tuple[tuple[str, ...], ...]] = {
     ("evaluate",): (("train",),),
@@ -27,7 +27,7 @@ PREDICTORS = ("model", "nothing changes", "most frequent outcome")
 def check_measure(
     places: Places, measure: Measure, task_of: Callable[[StudyStep, Values], Task | None]
 ) -> None:
-    """Report a measure whose keys do not lead to a number in what is evaluated last.
+    """Report a measure whose keys do not lead to a number in the last evaluation.
 
     Args:
         task_of: the task that a step plays with some values; None if it is not known.

@@ -1,4 +1,4 @@
-"""Where mistakes in the words of a study stand: values are written in one place and used in another."""
+"""Locations of mistakes in a study: values are written in one place and used in another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from powderdsl.experiments.studies.paths import TEXT, confined
 from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, Study, StudyStep
 
 Values = Mapping[str, str]
-"""What each name stands for."""
+"""The value of each name."""
 
 
 def names_in(texts: Iterable[str]) -> set[str]:
@@ -26,7 +26,7 @@ def names_in(texts: Iterable[str]) -> set[str]:
 
 @dataclass(frozen=True)
 class Word:
-    """A word of a step: which of its option's, and what it is with some values.
+    """A word of an option of a step, with some values of the study.
 
     `written` has the values in place of their names; `filled` is what the command is given.
     """
@@ -40,20 +40,20 @@ class Word:
 
 
 class Places:
-    """A study's words with all of its values, and reports of what is wrong with them."""
+    """The words of a study with all of its values, and reports of mistakes in them."""
 
     def __init__(self, study: Study, reporter: Reporter):
         self.study, self.reporter = study, reporter
         self.steps = {step.name: step for step in study.steps}
         self.set_by = {axis.name: axis.name for axis in study.axes}
-        """Which setting gives each name its value."""
+        """The setting that gives each name its value."""
         for axis in study.axes:
             self.set_by |= {name: axis.name for values in axis.sets.values() for name in values}
         self.wrong: set[str] = set()
-        """Steps with mistakes: consequences of those are not reported."""
+        """Steps with mistakes, whose consequences are not reported."""
 
     def known(self, names: set[str]) -> bool:
-        """Whether all names have values; others are reported by whoever reads the file."""
+        """Whether all names have values; unknown names are reported when the file is read."""
         return names <= {*self.set_by, SEED, SIZE}
 
     def values(self, names: set[str]) -> Iterator[Values]:
@@ -132,7 +132,7 @@ class Places:
 
     @contextmanager
     def told(self, where: Word | StudyStep, *, here: bool = False) -> Iterator[list[Exception]]:
-        """Report what the block raises, which the list then holds.
+        """Report the exceptions that the block raises; the list then holds them.
 
         Args:
             here: a value of the study is wrong, even where that shows in another file. Otherwise mistakes of other files

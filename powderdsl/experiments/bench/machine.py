@@ -1,4 +1,4 @@
-"""The machine that figures were measured on, which a reader must know to compare them, and peak memory on it."""
+"""The machine of a measurement, which a reader must know to compare results, and peak memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 BUSY = 0.5
-"""Runnable processes a CPU from which others are in the way."""
+"""Runnable processes per CPU above which other processes disturb a measurement."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Machine:
 
     @property
     def busy(self) -> bool:
-        """Whether others were at work before we began."""
+        """Whether other processes were running before the measurement."""
         return self.load is not None and self.load > BUSY * self.cpus
 
 
@@ -58,7 +58,7 @@ def this_machine(device: str) -> Machine:
 
 
 def load_average() -> float | None:
-    """Runnable processes in the last minute, None where the system does not say."""
+    """The load average of the last minute; None where the system does not report it."""
     try:
         return os.getloadavg()[0]
     except (OSError, AttributeError):
@@ -99,14 +99,14 @@ UNKNOWN = "not measured on this system"
 
 @dataclass(frozen=True)
 class Memory:
-    """Bytes, or None where the system does not say, and how they were found."""
+    """Bytes, or None where the system does not report them, and how they were measured."""
 
     growth: int | None
     how: str
 
 
 def peak_growth(work: Callable[[], None], device: str) -> Memory:
-    """Do some work; how far memory rose over what was in use before.
+    """Do some work; returns by how much the peak of memory exceeded the memory in use before.
 
     On Linux the process' own peak is reset first. What freed memory still belongs to the process is handed back
     before, so that the work cannot hide in it.
