@@ -1,4 +1,4 @@
-"""What a syntax error most likely meant: words for what could follow, and the fix for common slips."""
+"""Likely meanings of syntax errors: words for what could follow, and the fix for common slips."""
 
 from __future__ import annotations
 
@@ -30,16 +30,13 @@ TERMINAL_WORDS = {
 """What each terminal is called in messages; keywords, which are missing here, are called by themselves."""
 
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
-_VALUES = {
-    "NAME",
-    "INTEGER",
+_VALUES = _VALUE_STARTS | {
     "DECIMAL",
     "PERCENT",
     "YES",
     "NO",
     "TRUE",
     "FALSE",
-    "LPAR",
     "CHANCE",
     "ANY",
     "ALL",
@@ -60,19 +57,15 @@ _CHARACTERS = {
     "&": "write `and`",
     "|": "write `or`",
     "!": "write `not`, or `!=` between two values",
-    "{": "write rules without braces",
-    "}": "write rules without braces",
-    "[": "a set is written `(a, b)`",
-    "]": "a set is written `(a, b)`",
+    **dict.fromkeys("{}", "write rules without braces"),
+    **dict.fromkeys("[]", "a set is written `(a, b)`"),
     "→": "write `->`",
     "≥": "write `>=`",
     "≤": "write `<=`",
     "≠": "write `!=`",
     "×": "write `*`",
     "−": "write `-`",
-    '"': "names stand without quotes",
-    "'": "names stand without quotes",
-    "“": "names stand without quotes",
+    **dict.fromkeys("\"'“", "names stand without quotes"),
     ":": "assign with `:=`",
     ";": "one line is one rule: put the next one on a line of its own",
     "%": "a percentage is a number and `%`, without a blank; the remainder of a division is `mod`",
@@ -80,19 +73,11 @@ _CHARACTERS = {
     "#": "a comment needs a blank before its `#`",
 }
 _WORDS = {
-    "when": "if",
-    "where": "if",
-    "while": "if",
-    "provided": "if",
+    **dict.fromkeys(("when", "where", "while", "provided"), "if"),
     "unless": "if not",
-    "becomes": "->",
-    "become": "->",
-    "into": "->",
-    "to": "->",
-    "turns": "->",
+    **dict.fromkeys(("becomes", "become", "into", "to", "turns"), "->"),
     "equals": "==",
-    "chance": "with chance",
-    "probability": "with chance",
+    **dict.fromkeys(("chance", "probability"), "with chance"),
     "but": "and not",
     "swap": "swaps",
     "move": "moves",
@@ -105,17 +90,11 @@ _WORDS = {
 _LOOK_ALIKES = {
     **dict.fromkeys("\u00ad\u200b\u200c\u200d\u2060\ufeff\u200e\u200f", ""),
     **dict.fromkeys("\u00a0\u2002\u2003\u2009\u202f\u3000", " "),
-    "\u2013": "-",
-    "\u2014": "-",
-    "\u2010": "-",
-    "\u2011": "-",
-    "\u2212": "-",
+    **dict.fromkeys("\u2013\u2014\u2010\u2011\u2212", "-"),
     "\u2026": "..",
     "\u037e": ";",
-    "\u2018": "'",
-    "\u2019": "'",
-    "\u201d": '"',
-    "\u201e": '"',
+    **dict.fromkeys("\u2018\u2019", "'"),
+    **dict.fromkeys("\u201d\u201e", '"'),
 }
 """Characters that look like others, or like nothing, and what is meant."""
 
@@ -143,21 +122,22 @@ def character_help(text: str, position: int, begin: int) -> str:
         return f"it only looks like {wanted}: type {wanted}" if wanted else "it has no shape: remove it"
     before = text[begin:position]
     asks = re.search(r"\b(if|where|chance)\b", before) is not None
-    if text[position] == "=" and text[position : position + 2] == "=>" and asks:
+    pair = text[position : position + 2]
+    if pair == "=>" and asks:
         return "write `>=`"
-    if text[position] == "=" and re.fullmatch(r"(.*\bthen)?\s*[\w.?]+\s*", before, re.DOTALL) and not asks:
-        return _PAIRS.get(text[position : position + 2], "assign with `:=`")
-    if text[position] == "=" and asks:
-        return _PAIRS.get(text[position : position + 2], "compare with `==`, ask for an element with `is`")
-    return _PAIRS.get(text[position : position + 2]) or _CHARACTERS.get(text[position], "")
+    if pair in _PAIRS:
+        return _PAIRS[pair]
+    if pair[0] == "=" and asks:
+        return "compare with `==`, ask for an element with `is`"
+    if pair[0] == "=" and re.fullmatch(r"(.*\bthen)?\s*[\w.?]+\s*", before, re.DOTALL):
+        return "assign with `:=`"
+    return _CHARACTERS.get(pair[0], "")
 
 
 def was_cut(text: str, begin: int, end: int) -> bool:
     """Whether a comma of YAML's `{…}` or `[…]` stands right before or after the line."""
-    return (
-        text[end : end + 64].lstrip(" ")[:1] == ","
-        or text[max(begin - 64, 0) : begin].rstrip(" ")[-1:] == ","
-    )
+    before, after = text[max(begin - 64, 0) : begin], text[end : end + 64]
+    return before.rstrip(" ").endswith(",") or after.lstrip(" ").startswith(",")
 
 
 def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
@@ -179,9 +159,7 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
         return "only a field of this cell, or of a neighbor, can be assigned"
     if "ELSE" in accepted and re.search(r"\bthen\b", before):
         return "a choice has two sides: `VALUE if CONDITION else VALUE`"
-    if "ELSE" in accepted and assigns and not token:
-        return "an assignment says `where`: `field := value where condition`"
-    if token == "if" and "WHERE" in accepted:
+    if ("ELSE" in accepted and assigns and not token) or (token == "if" and "WHERE" in accepted):
         return "an assignment says `where`: `field := value where condition`"
     if token == "if" and "LEAVING" in accepted:
         return "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
@@ -234,11 +212,8 @@ def _phrase_help(token: str, before: str) -> str:
     if token == "." and re.search(r"(^|[\s(<>=+*/-])\Z", before):
         return "a number has a digit before its point: `0.5`"
     if token in "+-" and token and before.rstrip().endswith(token):
-        return (
-            f"write `{word or 'field'} {token}= 1`".replace("field", re.sub(r"\W", "", before))
-            if re.fullmatch(r"\w+[+-]", before.strip())
-            else ""
-        )
+        field = re.fullmatch(r"(\w+)[+-]", before.strip())
+        return f"write `{field[1]} {token}= 1`" if field else ""
     if token == "*" and before.endswith("*"):
         return "powers are written out: `x * x`"
     if not token and re.search(r"\bmoves\s+\S+\Z", before.rstrip()):

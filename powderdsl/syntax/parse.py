@@ -56,45 +56,32 @@ def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | Non
     """Parse a YAML scalar as one of STARTS; report and return None if it is none."""
     span = scalar.content
     if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
-        reporter.error(
-            "PD203",
-            "escapes in a quoted rule",
-            scalar.span,
+        label, helps = (
             "a backslash, or doubled quotes",
-            helps=["write the line without quotes, or without the escapes"],
+            ["write the line without quotes, or without the escapes"],
         )
+        reporter.error("PD203", "escapes in a quoted rule", scalar.span, label, helps=helps)
         return None
     return parse_text(span.source, span.start, span.end, start, reporter)
 
 
 def parse_text(source: Source, begin: int, end: int, start: str, reporter: Reporter) -> Syntax | None:
     """Parse characters `begin` to `end` of a source. Reports at most one syntax error."""
-    whole = Span(source, begin, max(end, begin + 1))
+    first, helps = Span(source, begin, begin + 1), ["give parts of it names with `let:`"]
     if end - begin > MAX_LENGTH:
-        reporter.error(
-            "PD202",
-            f"a line of {end - begin:,} characters",
-            Span(source, begin, begin + 1),
-            f"longer than {MAX_LENGTH:,}",
-            helps=["give parts of it names with `let:`"],
-        )
+        message, label = f"a line of {end - begin:,} characters", f"longer than {MAX_LENGTH:,}"
+        reporter.error("PD202", message, first, label, helps=helps)
         return None
     try:
         tree = parser().parse(TextSlice(source.text, begin, end), start=start)
+        return _convert(tree, source, Span(source, begin, max(end, begin + 1)), 0)
     except UnexpectedInput as error:
         _report_syntax_error(error, source, begin, end, reporter)
-        return None
-    try:
-        return _convert(tree, source, whole, 0)
     except _TooDeep:
-        reporter.error(
-            "PD202",
-            f"an expression nested more than {MAX_DEPTH} deep",
-            Span(source, begin, begin + 1),
-            notes=["a long chain of `and`, `or` or `+` nests as well"],
-            helps=["give parts of it names with `let:`"],
-        )
-        return None
+        message = f"an expression nested more than {MAX_DEPTH} deep"
+        notes = ["a long chain of `and`, `or` or `+` nests as well"]
+        reporter.error("PD202", message, first, notes=notes, helps=helps)
+    return None
 
 
 class _TooDeep(Exception):
@@ -122,11 +109,10 @@ def _report_syntax_error(
     text = source.text
     if isinstance(error, UnexpectedCharacters):
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
+        message = f"unexpected character {shown_character(text[start])}"
         fix = character_help(text, start, begin)
-        reporter.error(
-            "PD201", f"unexpected character {shown_character(text[start])}", Span(source, start, start + 1), "not part of a rule",
-            helps=[fix] if fix else [],
-        )  # fmt: skip
+        span, label = Span(source, start, start + 1), "not part of a rule"
+        reporter.error("PD201", message, span, label, helps=[fix] if fix else [])
         return
     assert isinstance(error, UnexpectedToken)
     token = error.token
@@ -137,8 +123,6 @@ def _report_syntax_error(
     accepted = set(error.accepts or error.expected or ())
     expected = expected_words(accepted)
     fix = token_help("" if at_end else str(token), accepted, text[begin:start], was_cut(text, begin, end))
-    reporter.error(
-        "PD201", "the line ends too early" if at_end else f"unexpected `{token}`",
-        Span(source, start, max(stop, start + 1)), f"expected {expected}" if expected else "",
-        helps=[fix] if fix else [],
-    )  # fmt: skip
+    message = "the line ends too early" if at_end else f"unexpected `{token}`"
+    span, label = Span(source, start, max(stop, start + 1)), f"expected {expected}" if expected else ""
+    reporter.error("PD201", message, span, label, helps=[fix] if fix else [])

@@ -1,4 +1,4 @@
-"""What PyYAML complains about, in plain words: where the mistake is, and how to fix it.
+"""PyYAML's complaints in plain words: where the mistake is, and how to fix it.
 
 PyYAML reports where its scanner gave up, in its own terms. Each row of the table below knows what people
 usually did there.
@@ -49,49 +49,45 @@ class Place:
     @property
     def before(self) -> str:
         """The text of the line before the place."""
-        return self.text[self.text.rfind("\n", 0, self.at) + 1 : self.at]
+        return self.before_of(self.at)
 
     def before_of(self, at: int) -> str:
         """The text of the line before another place."""
         return self.text[self.text.rfind("\n", 0, at) + 1 : at]
+
+    def line_end(self, at: int) -> int:
+        end = self.text.find("\n", at)
+        return end if end >= 0 else len(self.text)
 
     @property
     def same_line(self) -> bool:
         return "\n" not in self.text[self.since : self.at]
 
     def span(self, start: int, length: int = 1) -> Span:
-        # At the end of the file there is nothing to underline but what stands last.
+        # At the end of the file the last character is underlined.
         start = min(start, max(len(self.text.rstrip()) - 1, 0))
         return Span(self.source, start, start + max(length, 1))
 
     def quoted(self, at: int) -> str:
         """The fix for the value on the line of a place: the same line with quotes."""
-        begin, end = self.text.rfind("\n", 0, at) + 1, self.text.find("\n", at)
-        found = _ENTRY.match(self.text[begin : end if end >= 0 else len(self.text)])
-        if found is None or found.start("value") > at - begin:
+        before = self.before_of(at)
+        found = _ENTRY.match(before + self.text[at : self.line_end(at)])
+        if found is None or found.start("value") > len(before):
             return QUOTE
         quote = "'" if '"' in found["value"] else '"'
         return f"put quotes around it: {found['key']}: {quote}{found['value']}{quote}"
 
     def rest(self, start: int) -> Span:
         """From `start` to the end of its line."""
-        end = self.text.find("\n", start)
-        return self.span(start, len(self.text[start : end if end >= 0 else len(self.text)].rstrip()))
+        return self.span(start, len(self.text[start : self.line_end(start)].rstrip()))
 
 
 def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> None:
     """Report what PyYAML raised as PD103."""
-    problem = (
-        _character(error, source) if not isinstance(error, yaml.MarkedYAMLError) else _marked(error, source)
-    )
-    reporter.error(
-        "PD103",
-        f"invalid YAML: {problem.message}",
-        problem.span,
-        problem.label,
-        secondary=[problem.other] if problem.other else [],
-        helps=[problem.help] if problem.help else [],
-    )
+    found = _marked(error, source) if isinstance(error, yaml.MarkedYAMLError) else _character(error, source)
+    others, helps = [found.other] if found.other else [], [found.help] if found.help else []
+    message = f"invalid YAML: {found.message}"
+    reporter.error("PD103", message, found.span, found.label, secondary=others, helps=helps)
 
 
 def _character(error: yaml.YAMLError, source: Source) -> Problem:
@@ -99,10 +95,8 @@ def _character(error: yaml.YAMLError, source: Source) -> Problem:
     code = getattr(error, "character", 0)
     char = chr(code) if isinstance(code, int) else str(code)
     start = max(source.text.find(char), 0)
-    span = Span(source, start, start + 1)
-    return Problem(
-        f"the character U+{ord(char[0]):04X} is not allowed", span, "cannot stand in a text file", "remove it"
-    )
+    message = f"the character U+{ord(char[0]):04X} is not allowed"
+    return Problem(message, Span(source, start, start + 1), "cannot stand in a text file", "remove it")
 
 
 def _marked(error: yaml.MarkedYAMLError, source: Source) -> Problem:
@@ -121,66 +115,48 @@ def _second_colon(place: Place) -> Problem:
     if ": " in place.before or place.before.rstrip().endswith(":"):
         return Problem("a second `: ` in one line", place.span(place.at), "only a key ends with `:`", QUOTE)
     start = place.at - len(place.before.lstrip())
-    return Problem(
-        "a key that cannot stand here",
-        place.span(start, place.at - start),
-        "indented deeper than the line before, or part of it",
-        "check the indentation, and that the line before ends as it should: a key with `:`",
-    )
+    label = "indented deeper than the line before, or part of it"
+    fix = "check the indentation, and that the line before ends as it should: a key with `:`"
+    return Problem("a key that cannot stand here", place.span(start, place.at - start), label, fix)
 
 
 def _key(place: Place) -> Problem:
     if place.before.rstrip().endswith(('"', "'")):
-        return Problem(
-            "text after a closing quote", place.rest(place.at), "does not belong to the value", QUOTE
-        )
+        label = "does not belong to the value"
+        return Problem("text after a closing quote", place.rest(place.at), label, QUOTE)
     if place.char == ":":
         return Problem("a `:` without a key", place.span(place.at), "a key is missing before it")
-    return _indentation(place, "a line that does not line up", "not indented like the keys of this mapping")
+    return _indentation(place, "not indented like the keys of this mapping")
 
 
 def _item(place: Place) -> Problem:
-    return _indentation(place, "a line that does not line up", "expected `- `, as far in as the items above")
+    return _indentation(place, "expected `- `, as far in as the items above")
 
 
-def _indentation(place: Place, message: str, label: str) -> Problem:
+def _indentation(place: Place, label: str) -> Problem:
     other = None if place.same_line else Label(place.span(place.since), "which begins here")
-    return Problem(
-        message,
-        place.rest(place.at),
-        label,
-        "indent it like its neighbors, or deeper than its own key",
-        other,
-    )
+    fix = "indent it like its neighbors, or deeper than its own key"
+    return Problem("a line that does not line up", place.rest(place.at), label, fix, other)
 
 
 def _unclosed(place: Place) -> Problem:
-    opener = place.text[place.since : place.since + 1]
+    opener, opened = place.text[place.since : place.since + 1], place.span(place.since)
     closer = {"{": "}", "[": "]"}.get(opener, "}")
     comment = _comment(place)
     if comment is not None:
-        return Problem(
-            f"a comment inside `{opener}…{closer}`", place.rest(comment), COMMENT,
-            f'put quotes around a value that starts with `#`: "{_word(place.text, comment)}"',
-            Label(place.span(place.since), "opened here"),
-        )  # fmt: skip
-    opened = place.span(place.since)
+        message = f"a comment inside `{opener}…{closer}`"
+        fix = f'put quotes around a value that starts with `#`: "{_word(place.text, comment)}"'
+        return Problem(message, place.rest(comment), COMMENT, fix, Label(opened, "opened here"))
+    message, fix = f"a `{opener}` that is never closed", f"write the `{closer}`"
     if place.at >= len(place.text.rstrip()) or not place.same_line:
-        line = place.rest(place.since).text
-        fix = place.quoted(place.since)
-        if (
-            closer not in line
-            and re.search(r"\b(given|expect): \Z", place.before_of(place.since))
-            and fix != QUOTE
-        ):
-            return Problem(
-                f"a `{opener}` that is never closed", opened, "not closed", f"write the `{closer}`, or {fix}"
-            )
+        quoted = place.quoted(place.since)
+        drawn = re.search(r"\b(given|expect): \Z", place.before_of(place.since))
+        if drawn and closer not in place.rest(place.since).text and quoted != QUOTE:
+            return Problem(message, opened, "not closed", f"{fix}, or {quoted}")
     if place.same_line and place.at < len(place.text):
-        return Problem(
-            f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, Label(opened, "opened here")
-        )
-    return Problem(f"a `{opener}` that is never closed", opened, "not closed", f"write the `{closer}`")
+        label = Label(opened, "opened here")
+        return Problem(f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, label)
+    return Problem(message, opened, "not closed", fix)
 
 
 def _comment(place: Place) -> int | None:
@@ -198,21 +174,26 @@ def _comment(place: Place) -> int | None:
 
 
 def _word(text: str, start: int) -> str:
-    end = start
-    while end < len(text) and text[end] not in " \t\r\n,}]":
-        end += 1
-    return text[start:end]
+    return re.split(r"[ \t\r\n,}\]]", text[start:], maxsplit=1)[0]
 
 
 def _bad_start(place: Place) -> Problem:
-    if place.char == "\t":
-        return _tab(place)
-    return Problem(
-        f"a value cannot start with `{place.char}`",
-        place.span(place.at),
-        "has a meaning of its own in YAML",
-        place.quoted(place.at),
+    return (
+        _tab(place) if place.char == "\t" else _meaning(place, place.at, "has a meaning of its own in YAML")
     )
+
+
+def _start_of_value(place: Place) -> Problem:
+    return _meaning(place, place.since, "has a meaning of its own in YAML")
+
+
+def _complex_key(place: Place) -> Problem:
+    return _meaning(place, place.at, "begins a key, to YAML")
+
+
+def _meaning(place: Place, at: int, label: str) -> Problem:
+    span = place.span(at)
+    return Problem(f"a value cannot start with `{span.text}`", span, label, place.quoted(at))
 
 
 def _tab(place: Place) -> Problem:
@@ -222,35 +203,27 @@ def _tab(place: Place) -> Problem:
 def _open_quote(place: Place) -> Problem:
     if place.text[place.since : place.since + 1] not in "\"'":
         return Problem("the file ends too early", place.span(place.at), "something is not finished")
-    return Problem(
-        "a quote that is never closed", place.span(place.since), "no closing quote", "write the closing quote"
-    )
+    span, fix = place.span(place.since), "write the closing quote"
+    return Problem("a quote that is never closed", span, "no closing quote", fix)
 
 
 def _escape(place: Place) -> Problem:
-    return Problem(
-        "an unknown escape",
-        place.span(place.at, 2),
-        'in "…" a backslash starts an escape',
-        "use '…' quotes, or no quotes",
-    )
+    label, fix = 'in "…" a backslash starts an escape', "use '…' quotes, or no quotes"
+    return Problem("an unknown escape", place.span(place.at, 2), label, fix)
 
 
 def _no_colon(place: Place) -> Problem:
+    fix = "a key ends with `:`; text that continues is indented deeper than its key"
     return Problem(
-        "a line that is neither a key nor a value", place.rest(place.since), "no `:` after it",
-        "a key ends with `:`; text that continues is indented deeper than its key",
-    )  # fmt: skip
+        "a line that is neither a key nor a value", place.rest(place.since), "no `:` after it", fix
+    )
 
 
 def _list_beside_key(place: Place) -> Problem:
-    fix = place.quoted(place.at)
-    return Problem(
-        "a list on the line of its key",
-        place.span(place.at),
-        "a list starts on the next line",
-        "put `- …` on a line of its own" + ("" if fix == QUOTE else f"; if it is not a list, {fix}"),
-    )
+    quoted = place.quoted(place.at)
+    fix = "put `- …` on a line of its own" + ("" if quoted == QUOTE else f"; if it is not a list, {quoted}")
+    span, label = place.span(place.at), "a list starts on the next line"
+    return Problem("a list on the line of its key", span, label, fix)
 
 
 def _nothing(place: Place) -> Problem:
@@ -258,54 +231,28 @@ def _nothing(place: Place) -> Problem:
     line = Place(place.source, last.at, last.at - len(last.before))
     if "{" in last.before and _comment(line) is not None:
         return _unclosed(Place(place.source, last.at, line.since + last.before.rindex("{")))
+    span = place.span(place.at)
     if place.char in ("}", "]"):
-        return Problem(
-            f"a `{place.char}` that closes nothing",
-            place.span(place.at),
-            "nothing is open, or a value is missing",
-        )
-    return Problem(
-        "a value is missing", place.span(place.at), "before this", "remove one comma, or write the value"
-    )
+        label = "nothing is open, or a value is missing"
+        return Problem(f"a `{place.char}` that closes nothing", span, label)
+    return Problem("a value is missing", span, "before this", "remove one comma, or write the value")
 
 
 def _block_header(place: Place) -> Problem:
     char = place.text[place.since : place.since + 1]
     fix = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
-    return Problem(
-        f"text after `{char}`", place.rest(place.at), f"`{char}` starts a block on the next lines", fix
-    )
+    label = f"`{char}` starts a block on the next lines"
+    return Problem(f"text after `{char}`", place.rest(place.at), label, fix)
 
 
 def _after_end(place: Place) -> Problem:
-    return Problem(
-        "text after the end of the document",
-        place.rest(place.at),
-        "not part of it",
-        "remove it, or the line before it",
-    )
+    message, fix = "text after the end of the document", "remove it, or the line before it"
+    return Problem(message, place.rest(place.at), "not part of it", fix)
 
 
 def _directive(place: Place) -> Problem:
-    return Problem(
-        "a YAML directive", place.rest(place.since), "a line that starts with `%`", "remove the line"
-    )
-
-
-def _start_of_value(place: Place) -> Problem:
-    since = place.span(place.since)
-    return Problem(
-        f"a value cannot start with `{since.text}`",
-        since,
-        "has a meaning of its own in YAML",
-        place.quoted(place.since),
-    )
-
-
-def _complex_key(place: Place) -> Problem:
-    return Problem(
-        "a value cannot start with `?`", place.span(place.at), "begins a key, to YAML", place.quoted(place.at)
-    )
+    span, label = place.rest(place.since), "a line that starts with `%`"
+    return Problem("a YAML directive", span, label, "remove the line")
 
 
 _ROWS: tuple[tuple[tuple[str, ...], Callable[[Place], Problem]], ...] = (

@@ -57,10 +57,7 @@ class Mapping:
     span: Span
 
     def get(self, key: str) -> Node | None:
-        for name, value in self.entries:
-            if name.text == key:
-                return value
-        return None
+        return next((value for name, value in self.entries if name.text == key), None)
 
 
 Node = Scalar | Sequence | Mapping
@@ -70,13 +67,9 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
     """Parse a whole file. Reports what is wrong and returns None where no tree can be had."""
     text = source.text
     if len(text) > MAX_CHARACTERS:
-        reporter.error(
-            "PD102",
-            f"file of {len(text):,} characters",
-            None,
-            notes=[f"{source.name}: a rule file may have {MAX_CHARACTERS:,} characters"],
-            helps=["split the pack, or check that this is the file you meant"],
-        )
+        notes = [f"{source.name}: a rule file may have {MAX_CHARACTERS:,} characters"]
+        helps = ["split the pack, or check that this is the file you meant"]
+        reporter.error("PD102", f"file of {len(text):,} characters", None, notes=notes, helps=helps)
         return None
     if _Loader is None:
         helps = ["reinstall it from a wheel: `pip install --force-reinstall pyyaml`"]
@@ -91,7 +84,7 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
         return None
     except _Abort:
         return None
-    # What a broken tree would mean is not worth a second message.
+    # A broken tree gets no further messages.
     return None if builder.failed else root
 
 
@@ -131,39 +124,25 @@ class _Builder:
         self.reporter.error("PD105", f"{what} is not allowed", place, "not allowed", helps=[fix])
         raise _Abort
 
-    def _fail(
-        self, code: str, message: str, span: Span, label: str, fix: str, secondary: tuple[Label, ...] = ()
-    ) -> None:
+    def _fail(self, code: str, message: str, span: Span, label: str, fix: str, *others: Label) -> None:
         self.failed = True
-        self.reporter.error(code, message, span, label, secondary=secondary, helps=[fix])
+        self.reporter.error(code, message, span, label, secondary=others, helps=[fix])
 
     def _node(self, event, events, depth: int) -> Node:  # type: ignore[no-untyped-def]
         self.nodes += 1
         if depth > MAX_DEPTH or self.nodes > MAX_NODES:
-            what = (
-                f"nested more than {MAX_DEPTH} deep"
-                if depth > MAX_DEPTH
-                else f"of more than {MAX_NODES:,} values"
-            )
-            start = event.start_mark.index
-            self.reporter.error(
-                "PD106", f"document {what}", Span(self.source, start, start + 1), "here it is too much"
-            )
+            deep = f"document nested more than {MAX_DEPTH} deep"
+            large = f"document of more than {MAX_NODES:,} values"
+            place = Span(self.source, event.start_mark.index, event.start_mark.index + 1)
+            self.reporter.error("PD106", deep if depth > MAX_DEPTH else large, place, "here it is too much")
             raise _Abort
-        if isinstance(event, yaml.AliasEvent):
-            self._forbid(
-                event, f"the alias `*{event.anchor}`", "write the value out: rule files have no anchors"
-            )
-        if event.anchor:
-            self._forbid(
-                event, f"the anchor `&{event.anchor}`", "write the value out: rule files have no anchors"
-            )
+        if event.anchor:  # an alias has the name of its anchor
+            what = "alias `*" if isinstance(event, yaml.AliasEvent) else "anchor `&"
+            fix = "write the value out: rule files have no anchors"
+            self._forbid(event, f"the {what}{event.anchor}`", fix)
         if event.tag is not None:
-            self._forbid(
-                event,
-                f"the tag `{event.tag}`",
-                "remove it: rule files are plain data; a value that starts with `!` needs quotes",
-            )
+            fix = "remove it: rule files are plain data; a value that starts with `!` needs quotes"
+            self._forbid(event, f"the tag `{event.tag}`", fix)
         if isinstance(event, yaml.ScalarEvent):
             return self._scalar(event)
         if isinstance(event, yaml.SequenceStartEvent):
@@ -173,21 +152,13 @@ class _Builder:
     def _scalar(self, event) -> Scalar:  # type: ignore[no-untyped-def]
         span = self._span(event)
         if event.style in ("'", '"'):
-            return Scalar(
-                event.value,
-                span,
-                Span(self.source, span.start + 1, max(span.start + 1, span.end - 1)),
-                "quoted",
-            )
+            content = Span(self.source, span.start + 1, max(span.start + 1, span.end - 1))
+            return Scalar(event.value, span, content, "quoted")
         if event.style in ("|", ">"):
             newline = self.source.text.find("\n", span.start)
             body = newline + 1 if newline >= 0 else span.end
-            return Scalar(
-                event.value,
-                Span(self.source, span.start, span.start + 1),
-                Span(self.source, body, max(body, span.end)),
-                "block",
-            )
+            content = Span(self.source, body, max(body, span.end))
+            return Scalar(event.value, Span(self.source, span.start, span.start + 1), content, "block")
         return Scalar(event.value, span, span, "plain")
 
     def _sequence(self, start, events, depth: int) -> Sequence:  # type: ignore[no-untyped-def]
@@ -208,39 +179,22 @@ class _Builder:
                 break
             key = self._node(event, events, depth + 1)
             value = self._node(next(events), events, depth + 1)
+            plain_empty = isinstance(value, Scalar) and value.style == "plain" and not value.text
             if not isinstance(key, Scalar):
-                self._fail(
-                    "PD107",
-                    "a key must be a word",
-                    key.span,
-                    "a list or a mapping",
-                    "write a name before the `:`",
-                )
+                label, fix = "a list or a mapping", "write a name before the `:`"
+                self._fail("PD107", "a key must be a word", key.span, label, fix)
             elif key.text == "<<" and key.style == "plain":
-                self._fail(
-                    "PD105",
-                    "the merge key `<<` is not allowed",
-                    key.span,
-                    "not allowed",
-                    "write the entries out",
-                )
-            elif (
-                self._in_braces(start)
-                and isinstance(value, Scalar)
-                and value.style == "plain"
-                and not value.text
-            ):
+                message = "the merge key `<<` is not allowed"
+                self._fail("PD105", message, key.span, "not allowed", "write the entries out")
+            elif plain_empty and self._in_braces(start):
                 self._no_value(key, first=not seen)
             elif key.text in seen:
-                other = (Label(seen[key.text], "first time here"),)
-                self._fail(
-                    "PD104",
+                message, fix = (
                     f"key `{key.text}` stands twice in one mapping",
-                    key.span,
-                    "second time here",
                     "keep one of them, or join them",
-                    other,
                 )
+                other = Label(seen[key.text], "first time here")
+                self._fail("PD104", message, key.span, "second time here", fix, other)
             else:
                 seen[key.text] = key.span
                 entries.append((key, value))
@@ -250,10 +204,8 @@ class _Builder:
     def _no_value(self, key: Scalar, *, first: bool) -> None:
         """Nothing in `{…}` has a key without a value: most often a comma has cut a value in two."""
         if self.source.text[key.span.end :].lstrip().startswith(":"):
-            label, fix = (
-                "nothing stands after its `:`",
-                'write its value; one with `#` in it needs quotes: "#RRGGBB"',
-            )
+            label = "nothing stands after its `:`"
+            fix = 'write its value; one with `#` in it needs quotes: "#RRGGBB"'
         elif first:
             label, fix = "a key without a `:`", "`{…}` holds `key: value` pairs; rules stand outside braces"
         else:
