@@ -183,12 +183,12 @@ class _PassBits:
                 if node.op == "swap":
                     moved = self.build.select(movers, self.build.shift(content, (dy, dx)), moved)
                 return moved
-            return self.build.move(node.op, content, movers, rest, offset)
+            return self.build.derive(node.op, content, movers, rest, attr=offset)
         assert isinstance(rest, Bits)
         content = self.gates.fit(content, node.type.lo, node.type.hi)
         rest = self.gates.fit(rest, node.type.lo, node.type.hi)
         planes = tuple(
-            a if a is b and a.op == "const" else self.build.move(node.op, a, movers, b, offset)
+            a if a is b and a.op == "const" else self.build.derive(node.op, a, movers, b, attr=offset)
             for a, b in zip(content.planes, rest.planes, strict=True)
         )
         return Bits(planes, content.signed)
@@ -409,7 +409,7 @@ class _PassBits:
         (first, weight), *rest = weights.values()
         total = build.select(first, build.real(always + weight), build.real(always))
         for plane, weight in rest:
-            total = build.arithmetic("add", total, build.select(plane, build.real(weight), build.real(0.0)))
+            total = build.derive("add", total, build.select(plane, build.real(weight), build.real(0.0)))
         return total
 
 

@@ -2,9 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Offset, Type, integer
+
+Range = tuple[int, int]
+
+
+def _product(a: Type, b: Type) -> Range:
+    corners = [x * y for x in (a.lo, a.hi) for y in (b.lo, b.hi)]
+    return min(corners), max(corners)
+
+
+def _union(a: Type, b: Type) -> Range:
+    return min(a.lo, b.lo), max(a.hi, b.hi)
+
+
+_RANGES: dict[str, Callable[..., Range]] = {
+    "add": lambda a, b: (a.lo + b.lo, a.hi + b.hi),
+    "sub": lambda a, b: (a.lo - b.hi, a.hi - b.lo),
+    "mul": _product,
+    "min": lambda a, b: (min(a.lo, b.lo), min(a.hi, b.hi)),
+    "max": lambda a, b: (max(a.lo, b.lo), max(a.hi, b.hi)),
+    "neg": lambda a: (-a.hi, -a.lo),
+    "abs": lambda a: (max(a.lo, -a.hi, 0), max(-a.lo, a.hi)),
+    "select": lambda condition, yes, no: _union(yes, no),
+    "swap": lambda content, movers, rest: _union(content, rest),
+    "arrive": lambda content, movers, rest: _union(content, rest),
+}
+"""The ranges of integers that follow from those of the arguments."""
 
 
 class Builder:
@@ -61,32 +87,11 @@ class Builder:
 
     # Numbers
 
-    def arithmetic(self, op: str, a: Node, b: Node) -> Node:
-        if a.type == REAL:
-            return self.make(op, REAL, a, b)
-        (al, ah), (bl, bh) = (a.type.lo, a.type.hi), (b.type.lo, b.type.hi)
-        match op:
-            case "add":
-                type = integer(al + bl, ah + bh)
-            case "sub":
-                type = integer(al - bh, ah - bl)
-            case "mul":
-                corners = [x * y for x in (al, ah) for y in (bl, bh)]
-                type = integer(min(corners), max(corners))
-            case "min":
-                type = integer(min(al, bl), min(ah, bh))
-            case _:
-                type = integer(max(al, bl), max(ah, bh))
-        return self.make(op, type, a, b)
-
-    def neg(self, a: Node) -> Node:
-        return self.make("neg", REAL if a.type == REAL else integer(-a.type.hi, -a.type.lo), a)
-
-    def abs(self, a: Node) -> Node:
-        if a.type == REAL:
-            return self.make("abs", REAL, a)
-        low = 0 if a.type.lo <= 0 <= a.type.hi else min(abs(a.type.lo), abs(a.type.hi))
-        return self.make("abs", integer(low, max(abs(a.type.lo), abs(a.type.hi))), a)
+    def derive(self, op: str, *args: Node, attr: Hashable = None) -> Node:
+        """One of the operations of `_RANGES`, or the same on floats or flags."""
+        last = args[-1].type
+        type = integer(*_RANGES[op](*(arg.type for arg in args))) if last.name == "int" else last
+        return self.make(op, type, *args, attr=attr)
 
     def quotient(self, a: Node, b: Node) -> Node:
         """Integer division, rounded down; 0 where b is 0."""
@@ -108,9 +113,9 @@ class Builder:
     def clamp(self, a: Node, lo: int, hi: int) -> Node:
         """Integers clamped to bounds, where their range asks for it."""
         if a.type.lo < lo:
-            a = self.arithmetic("max", a, self.integer(lo))
+            a = self.derive("max", a, self.integer(lo))
         if a.type.hi > hi:
-            a = self.arithmetic("min", a, self.integer(hi))
+            a = self.derive("min", a, self.integer(hi))
         return a
 
     # Neighbors, choices, movements
@@ -123,12 +128,16 @@ class Builder:
             type = integer(min(type.lo, 0), max(type.hi, 0))
         return self.make("shift", type, a, attr=(*offset, wraps))
 
-    def joined(self, a: Type, b: Type) -> Type:
-        return integer(min(a.lo, b.lo), max(a.hi, b.hi)) if a.name == "int" else a
-
     def select(self, condition: Node, yes: Node, no: Node) -> Node:
-        return self.make("select", self.joined(yes.type, no.type), condition, yes, no)
+        return self.derive("select", condition, yes, no)
 
-    def move(self, op: str, content: Node, movers: Node, rest: Node, offset: Offset) -> Node:
-        """`swap` or `arrive`."""
-        return self.make(op, self.joined(content.type, rest.type), content, movers, rest, attr=offset)
+    def rebuild(self, node: Node, args: tuple[Node, ...]) -> Node:
+        """The same operation on other arguments; ranges are derived again where they follow from the arguments."""
+        if node.op in _RANGES:
+            return self.derive(node.op, *args, attr=node.attr)
+        if node.op == "shift":
+            dy, dx, wraps = node.attr
+            return self.shift(args[0], (dy, dx), wraps)
+        if node.op == "table":
+            return self.table(args[0], node.attr)
+        return self.make(node.op, node.type, *args, attr=node.attr)

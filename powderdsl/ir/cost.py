@@ -1,4 +1,4 @@
-"""What each pass of a program costs, counted in its IR: nothing is run, nothing is taken to be skipped."""
+"""The cost of each pass of a program, counted in its IR: nothing runs, and nothing counts as skipped."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PassCost:
 
 
 def costs(program: Program) -> tuple[PassCost, ...]:
-    """What the passes of an optimized program cost, in their order. Shares add up to 1."""
+    """The costs of the passes of an optimized program, in their order. Shares add up to 1."""
     counts = [_counted(carry(program, pass_)) for pass_ in program.passes]
     weights = [sum(WEIGHTS[kind] * number for kind, number in count.items()) for _, count in counts]
     whole = sum(weights) or 1.0
@@ -93,7 +93,7 @@ def _counted(carried: Carried) -> tuple[Carried, Counter[str]]:
 
 
 def _random_bits(nodes: Iterable[Node]) -> int:
-    """Bits drawn a cell: of each stream as many as its finest question needs. They are shared within a pass."""
+    """Bits drawn a cell: for each stream the bits that its finest comparison needs. A pass shares them."""
     needed: Counter[str] = Counter()
     for node in nodes:
         if node.op in ("chance", "below", "below_planes", "draw"):
@@ -104,7 +104,7 @@ def _random_bits(nodes: Iterable[Node]) -> int:
 
 
 def _neighbors(pass_: PassGraph) -> set[Offset]:
-    """Offsets at which other cells are read or written."""
+    """The offsets at which a pass reads or writes other cells."""
     found: set[Offset] = set()
     for node in nodes_of(pass_, substeps=False):
         if node.op == "shift":

@@ -65,7 +65,7 @@ def rewrite_pass(pass_: PassGraph, rules: Rules) -> PassGraph:
                 continue
             args = tuple(final[id(arg)] for arg in top.args)
             same = all(a is b for a, b in zip(args, top.args, strict=True))
-            rebuilt = top if same else rebuild(top, args, build)
+            rebuilt = top if same else build.rebuild(top, args)
             if id(rebuilt) not in final:
                 final[id(rebuilt)] = rebuilt  # the replacement may contain the node itself
                 found = rules.apply(rebuilt, build)
@@ -80,7 +80,7 @@ def rewrite_pass(pass_: PassGraph, rules: Rules) -> PassGraph:
 
     for node in nodes_of(pass_):
         build.place = node.places[0] if node.places else ""
-        done[id(node)] = finish(rebuild(node, tuple(done[id(arg)] for arg in node.args), build))
+        done[id(node)] = finish(build.rebuild(node, tuple(done[id(arg)] for arg in node.args)))
     substeps = tuple(
         SubstepGraph(
             one.label,
@@ -92,25 +92,3 @@ def rewrite_pass(pass_: PassGraph, rules: Rules) -> PassGraph:
     )
     outputs = tuple((slot, done[id(node)]) for slot, node in pass_.outputs)
     return PassGraph(pass_.name, pass_.pack, substeps, outputs)
-
-
-def rebuild(node: Node, args: tuple[Node, ...], build: Builder) -> Node:
-    """The same operation on other arguments; ranges are derived again where they follow from the arguments."""
-    match node.op:
-        case "add" | "sub" | "mul" | "min" | "max":
-            return build.arithmetic(node.op, *args)
-        case "select":
-            return build.select(*args)
-        case "swap" | "arrive":
-            content, movers, rest = args
-            return build.move(node.op, content, movers, rest, node.attr)
-        case "neg":
-            return build.neg(*args)
-        case "abs":
-            return build.abs(*args)
-        case "shift":
-            dy, dx, wraps = node.attr
-            return build.shift(args[0], (dy, dx), wraps)
-        case "table":
-            return build.table(args[0], node.attr)
-    return build.make(node.op, node.type, *args, attr=node.attr)

@@ -1,4 +1,4 @@
-"""What a legal IR is. Checked after lowering and after every stage."""
+"""The rules of legal IR, checked after lowering and after every stage."""
 
 from __future__ import annotations
 

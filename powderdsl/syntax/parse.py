@@ -53,7 +53,7 @@ def words_of(grammar: Lark) -> frozenset[str]:
 
 
 def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | None:
-    """Parse a YAML scalar as one of STARTS; report and return None if it is none."""
+    """Parse a YAML scalar as one of STARTS; None after reporting a syntax error."""
     span = scalar.content
     if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
         label, helps = (

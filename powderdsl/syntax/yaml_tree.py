@@ -18,7 +18,7 @@ MAX_DEPTH = 32
 MAX_NODES = 50_000
 
 _Loader: type | None = getattr(yaml, "CSafeLoader", None)
-"""libyaml's parser. The pure Python one is twenty times slower and refuses `[name?]`, so it is no fallback."""
+"""libyaml's parser. The pure Python one is twenty times slower and refuses `[name?]`, so it cannot be a fallback."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ Node = Scalar | Sequence | Mapping
 
 
 def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
-    """Parse a whole file. Reports what is wrong and returns None where no tree can be had."""
+    """Parse a whole file; None after reporting what is wrong with it."""
     text = source.text
     if len(text) > MAX_CHARACTERS:
         notes = [f"{source.name}: a rule file may have {MAX_CHARACTERS:,} characters"]

@@ -130,7 +130,7 @@ F, N, R = BUILD.input("f", FLAG), BUILD.input("n", integer(0, 3)), BUILD.input("
         (("f", Node("eq", FLAG, (N, R), None, 903)), "mixes"),
         (("f", Node("shift", FLAG, (F,), None, 904)), "attribute"),
         (("n", Node("add", REAL, (N, N), None, 905)), "gives real"),
-        (("n", BUILD.arithmetic("add", N, N)), "gets 0..6"),
+        (("n", BUILD.derive("add", N, N)), "gets 0..6"),
         (("f", N), "gets a 0..3"),
         (("g", F), "unknown slot g"),
         (("f", BUILD.input("h", FLAG)), "unknown slot h"),

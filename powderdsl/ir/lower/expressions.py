@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from math import ceil, floor
 from typing import Any
 
@@ -131,8 +132,7 @@ def _look(expr: Expr, at: Context) -> Node | Pair:
 
 
 def _arithmetic(expr: Expr, at: Context) -> Node | Pair:
-    args = [lower_expression(arg, at) for arg in expr.args]
-    return _each(lambda a, b: at.build.arithmetic(expr.op, a, b), *args)
+    return _each(partial(at.build.derive, expr.op), *(lower_expression(arg, at) for arg in expr.args))
 
 
 def _member(expr: Expr, at: Context) -> Node:
@@ -159,7 +159,7 @@ def _draw_real(expr: Expr, at: Context) -> Node:
     parts = [_draw_real(a, at) if a.kind.name == "draw" else at.build.to_real(node(a, at)) for a in expr.args]
     if expr.op == "look":
         return at.build.shift(parts[0], expr.value)
-    return at.build.arithmetic(expr.op, parts[0], parts[1])
+    return at.build.derive(expr.op, parts[0], parts[1])
 
 
 def _chance(expr: Expr, at: Context, threshold: Threshold | None = None) -> Node:
@@ -210,11 +210,11 @@ def _split_draw(expr: Expr, at: Context) -> tuple[Expr, tuple[int, int], Node | 
     if left.kind.name == "draw":
         draw, offset, extra = _split_draw(left, at)
         other = node(right, at)
-        other = at.build.neg(other) if expr.op == "sub" else other
+        other = at.build.derive("neg", other) if expr.op == "sub" else other
     else:
         draw, offset, extra = _split_draw(right, at)
         other = node(left, at)
-    return draw, offset, at.build.arithmetic("add", extra, other) if extra else other
+    return draw, offset, at.build.derive("add", extra, other) if extra else other
 
 
 def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
@@ -293,17 +293,17 @@ def _neighborhood(value: Node, kernel: Kernel, build: Builder) -> Node:
             term = build.shift(value, (0, dx), kernel.wrap)
             if weight != 1:
                 factor = build.real(float(weight)) if value.type == REAL else build.integer(weight)
-                term = build.arithmetic("mul", term, factor)
-            row = term if row is None else build.arithmetic("add", row, term)
+                term = build.derive("mul", term, factor)
+            row = term if row is None else build.derive("add", row, term)
         assert row is not None
         row = build.shift(row, (dy, 0), kernel.wrap)
-        total = row if total is None else build.arithmetic("add", total, row)
+        total = row if total is None else build.derive("add", total, row)
     return total if total is not None else build.const(0, value.type)
 
 
 def _length(vector: Pair, build: Builder) -> Node:
     y, x = vector
-    squares = build.arithmetic("add", build.arithmetic("mul", y, y), build.arithmetic("mul", x, x))
+    squares = build.derive("add", build.derive("mul", y, y), build.derive("mul", x, x))
     return build.make("sqrt", REAL, squares)
 
 
@@ -311,12 +311,12 @@ def _octant(expr: Expr, at: Context) -> Node:
     """The octant, by comparing x with the borders of the octants at this length."""
     build = at.build
     y, x = pair(expr.args[0], at)
-    reach = build.arithmetic("add", _length((y, x), build), build.real(_float32(0.001)))
-    near = build.arithmetic("mul", build.real(_float32(NEAR)), reach)
-    far = build.arithmetic("mul", build.real(_float32(FAR)), reach)
+    reach = build.derive("add", _length((y, x), build), build.real(_float32(0.001)))
+    near = build.derive("mul", build.real(_float32(NEAR)), reach)
+    far = build.derive("mul", build.real(_float32(FAR)), reach)
     up = build.compare("lt", y, build.real(0.0))
     result: Node = build.integer(4)
-    borders = (near, far, build.neg(far), build.neg(near))
+    borders = (near, far, build.derive("neg", far), build.derive("neg", near))
     for octant in (3, 2, 1, 0):
         mirrored = build.select(up, build.integer((8 - octant) % 8), build.integer(octant))
         result = build.select(build.compare("lt", borders[octant], x), mirrored, result)
@@ -324,7 +324,7 @@ def _octant(expr: Expr, at: Context) -> Node:
 
 
 def _opposite(expr: Expr, at: Context) -> Node:
-    return at.build.mod(at.build.arithmetic("add", node(expr.args[0], at), at.build.integer(4)), 8)
+    return at.build.mod(at.build.derive("add", node(expr.args[0], at), at.build.integer(4)), 8)
 
 
 def _vector(expr: Expr, at: Context) -> Pair:
@@ -356,10 +356,8 @@ _LOWER: dict[str, Callable[[Expr, Context], Node | Pair]] = {
     **dict.fromkeys(("not", "and", "or"), _logic),
     **dict.fromkeys(("eq", "le"), _compare),
     "lt": _lt,
-    **dict.fromkeys(("add", "sub", "mul", "min", "max", "div"), _arithmetic),
+    **dict.fromkeys(("add", "sub", "mul", "min", "max", "div", "neg", "abs"), _arithmetic),
     "quotient": lambda e, at: at.build.quotient(node(e.args[0], at), node(e.args[1], at)),
-    "neg": lambda e, at: _each(at.build.neg, lower_expression(e.args[0], at)),
-    "abs": lambda e, at: at.build.abs(node(e.args[0], at)),
     "mod": lambda e, at: at.build.mod(node(e.args[0], at), e.value),
     "to_real": _to_real,
     "count": _count,

@@ -213,7 +213,7 @@ class _PassLowering:
             old = self.state[name]
             new = build.shift(part, back)
             if write.op != ":=":
-                new = build.arithmetic("add" if write.op == "+=" else "sub", old, new)
+                new = build.derive("add" if write.op == "+=" else "sub", old, new)
             if slot.kind.name == "int":
                 new = build.clamp(new, int(slot.kind.lo), int(slot.kind.hi))
             self.state[name] = build.select(mask, new, old)
@@ -234,7 +234,7 @@ class _PassLowering:
             op = "swap" if isinstance(rule, Swap) else "arrive"
             for name in (name for slot in self.slots.values() if slot.travels for name in slot_names(slot)):
                 mask, rest = masks[id(rule)], self.state[name]
-                self.state[name] = build.move(op, before[name], mask, rest, rule.offset)
+                self.state[name] = build.derive(op, before[name], mask, rest, attr=rule.offset)
 
     def _fresh(self, element: Node) -> dict[str, Node]:
         """What a new cell of an element holds."""

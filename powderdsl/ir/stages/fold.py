@@ -172,7 +172,7 @@ def _divide(node: Node, build: Builder) -> Node | None:
     """x / 2^k = x · 2^-k, exactly."""
     a, b = node.args
     if b.op == "const" and b.attr and frexp(abs(b.attr))[0] == 0.5:
-        return build.arithmetic("mul", a, build.real(1.0 / b.attr))
+        return build.derive("mul", a, build.real(1.0 / b.attr))
     return None
 
 

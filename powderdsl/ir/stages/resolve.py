@@ -8,7 +8,7 @@ from functools import reduce
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import Node, PassGraph
-from powderdsl.ir.rewrite import Rules, rebuild, rewrite_pass
+from powderdsl.ir.rewrite import Rules, rewrite_pass
 
 MAX_VALUES = 16
 
@@ -131,5 +131,5 @@ def _substitute(
         return node
     if node not in done:
         args = tuple(_substitute(arg, known, build, tables, done) for arg in node.args)
-        done[node] = node if args == node.args else rebuild(node, args, build)
+        done[node] = node if args == node.args else build.rebuild(node, args)
     return done[node]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import Node
-from powderdsl.ir.rewrite import Rules, rebuild
+from powderdsl.ir.rewrite import Rules
 
 SHARE = Rules()
 
@@ -35,4 +35,4 @@ def _of_shifts(node: Node, build: Builder) -> Node | None:
     if not shifts or others or (compares and len(shifts) > 1) or len({arg.attr for arg in shifts}) > 1:
         return None
     args = tuple(arg.args[0] if _wraps(arg) else arg for arg in node.args)
-    return build.shift(rebuild(node, args, build), shifts[0].attr[:2])
+    return build.shift(build.rebuild(node, args), shifts[0].attr[:2])

@@ -1,4 +1,4 @@
-"""Operands turned into the kind that their place wants, and literals into exact numbers; or the report why not."""
+"""Turns operands into the kind that their place needs, and literals into exact numbers, or reports why not."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def describe(operand: Operand) -> str:
 
 
 class Coercer:
-    """Turns operands into the kind that their place wants, or reports why not."""
+    """Turns operands into the kind that their place needs, or reports why not."""
 
     def __init__(self, reporter: Reporter):
         self.reporter = reporter
@@ -137,7 +137,7 @@ class Coercer:
         raise self.wrong(operand, "an element", span)
 
     def value(self, operand: Operand, span: Span) -> Expr | Number:
-        """A runtime value or a number: what arithmetic and comparison work on."""
+        """A runtime value or a number, as arithmetic and comparisons need."""
         match operand:
             case Expr() | Number():
                 return operand
@@ -247,7 +247,7 @@ class Coercer:
         return offset
 
     def bounded(self, value: Expr, span: Span) -> Expr:
-        """An integer whose declared range is still reasonable."""
+        """An integer; reports a range that is too large."""
         most = max(abs(value.kind.lo), abs(value.kind.hi))
         if most > MAX_MAGNITUDE:
             raise self.fail("PD402", f"numbers up to {most:,}", span, f"the limit is {MAX_MAGNITUDE:,}")

@@ -1,4 +1,4 @@
-"""What a piece of syntax can stand for while it is checked, where it stands, and how expressions are put together.
+"""Operands, which syntax stands for while it is checked; the scope where it stands; how expressions are put together.
 
 Compile-time operands (sets, places, numbers) vanish before the checked model; `Expr` stays.
 """
@@ -17,7 +17,7 @@ MAX_CHAIN = 16
 
 @dataclass(frozen=True)
 class SetOf:
-    """A set of elements, ids ascending. `name` is given if it was written as one element's name."""
+    """A set of elements, ids ascending. `name` is set where a rule names one element."""
 
     ids: tuple[int, ...]
     name: str | None = None
@@ -119,7 +119,7 @@ def constant(number: Number, span: Span | None = None) -> Expr:
 
 
 def look(value: Expr, offset: Offset, span: Span | None = None) -> Expr:
-    """The value as it is at a neighbor; looks of looks add up, constants are the same everywhere."""
+    """A value at a neighbor; offsets of nested looks add up, constants are the same everywhere."""
     if value.op == "look":
         inner = value.value
         assert isinstance(inner, tuple)

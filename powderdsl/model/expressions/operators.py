@@ -179,7 +179,7 @@ def _check_resolution(typer: Typer, draw: Expr, chance: Fraction, span: Span) ->
 
 
 def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
-    """Whether `left` is, or lies in, `right`: what the two sides can be, and what it means."""
+    """Whether `left` is, or lies in, `right`, for every pair of operands that can stand there."""
     span = syntax.span
     first, second = (child.span for child in syntax.children)
     match left, right:

@@ -1,4 +1,4 @@
-"""Every global name of a composition, resolved: what the checker looks words up in, and what it says of others."""
+"""The global names of a composition, resolved, for the checker to look words up in; reports of unknown names."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Symbols:
         return min(self.ids, key=self.composition.order.__getitem__)
 
     def names(self, *, after_dot: bool = False) -> list[str]:
-        """All words that an expression can use, for suggestions; `after_dot` those that follow a neighbor."""
+        """All words that an expression can use, for suggestions; with `after_dot`, the words that can follow a neighbor."""
         if after_dot:
             return [*self.properties, *self.fields, *self.streams, *DIRECTIONS]
         params = (name.split(".")[1] for name in self.params)

@@ -51,16 +51,16 @@ from powderdsl.model.types import Value as Constant
 from powderdsl.syntax.ast import Syntax
 
 MAX_ROUNDS = 4096
-"""Rounds of one loop over several variables."""
+"""The most rounds of one loop over several variables."""
 
 MAX_RULE_WORK = 5_000
-"""Parts of expressions that one rule may come to, quantifiers written out."""
+"""The most parts of expressions in one rule, quantifiers written out."""
 
 MAX_WORK = 60_000
-"""Parts of expressions that all rules may come to: a second or two."""
+"""The most parts of expressions in all rules: a second or two."""
 
 MAX_SET_DEPTH = 24
-"""How many sets may be defined by each other in a row."""
+"""The longest chain of sets that are defined by each other."""
 
 
 class Typer(Coercer):
@@ -80,7 +80,7 @@ class Typer(Coercer):
         self._rule_span: Span | None = None
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
-        """What the syntax stands for. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
+        """The operand that syntax stands for. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
         self._work += 1
         if self._work > MAX_WORK + 1:
             raise Poisoned  # that has been reported, and is true of all that follows
@@ -98,7 +98,7 @@ class Typer(Coercer):
         return HANDLERS[syntax.kind](self, syntax, scope)
 
     def start_rule(self, span: Span) -> None:
-        """From here on the work of the rule or value at `span` is counted."""
+        """Start counting the work of the rule or value at `span`."""
         self._rule_start, self._rule_span = self._work, span
         self.empty.clear()
 
@@ -162,7 +162,7 @@ class Typer(Coercer):
         return operand
 
     def hides(self, name: str, span: Span, scope: Scope) -> bool:
-        """Whether a new local name would hide one that its pack knows. What strangers' packs define may be hidden."""
+        """Whether a new local name would hide one that its pack knows. Names of other packs may be hidden."""
         if name in scope.locals:
             return True
         found = self.find(name, span, Scope(scope.pack, {}))
@@ -193,7 +193,7 @@ class Typer(Coercer):
         return result
 
     def turn(self, operand: Operand, scope: Scope) -> Operand:
-        """Places and kernels as the scope's symmetry turns them."""
+        """The operand with its places and kernels turned by the scope's symmetry."""
         if scope.orientation == IDENTITY:
             return operand
         match operand:
@@ -400,7 +400,7 @@ class Typer(Coercer):
         return (disjunction if syntax.kind == "any_of" else conjunction)(flags, syntax.span)
 
     def bindings(self, bindings: tuple[Syntax, ...], scope: Scope) -> list[Scope]:
-        """The scopes of a loop's rounds: the first variable turns slowest."""
+        """The scopes of a loop's rounds: the first variable changes slowest."""
         domains: dict[str, list[Operand]] = {}
         for binding in bindings:
             variable, domain = binding.children

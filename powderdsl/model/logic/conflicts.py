@@ -1,4 +1,4 @@
-"""The logic of rules, decided before anything runs: collisions, writes that clash, rules that never fire."""
+"""The logic of rules, decided before anything runs: collisions, clashing writes, rules that never fire."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Conflict:
         return claim(self.first), claim(self.second)
 
     def report(self, labels: list[str], example: str, reporter: Reporter) -> None:
-        """Report it once, whatever the number of rounds that have it. `example` is for the first of them."""
+        """Report it once for all rounds that have it. `example` is for the first of them."""
         where = f" ({labels[0]})" if labels[0] else ""
         notes = [*filter(None, [example]), *self.notes]
         if len(labels) > 1:
@@ -86,7 +86,7 @@ class Conflict:
 
 
 def claim(span: Span) -> Span:
-    """What a rule does, without its condition: the part of its text to underline."""
+    """The part of a rule's text to underline: what it does, without its condition."""
     rest = re.search(r",?\s+(if|where|with|then)\b", span.text)
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
 
@@ -107,7 +107,7 @@ class _Fate:
     Args:
         fires: whether one of them may happen.
         useful: whether one of them may change something.
-        silent: conditions and values of those that never happen.
+        silent: conditions and values of the copies that never happen.
     """
 
     fires: bool | None = False
@@ -126,7 +126,7 @@ def check_logic(
     reporter: Reporter,
     added: AddedPacks | None = None,
 ) -> tuple[tuple[Pass, ...], list[Span]]:
-    """Report conflicts (errors), rules that never fire or do nothing (warnings), and those that sleep (notes).
+    """Report conflicts (errors), rules that never fire or do nothing (warnings), and inactive rules (notes).
 
     Conflicts that come from `added` packs alone are resolved.
 
@@ -338,7 +338,7 @@ _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the l
 
 
 def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
-    """What may stand where two rules meet, such as `x` here and `y` below."""
+    """An example of elements where two rules meet, such as `x` here and `y` below."""
     found = [(at, facts.names[number]) for at, number in sorted(elements.items()) if number in facts.names]
     if not found or len(elements) > 4:
         return ""
@@ -413,7 +413,7 @@ def _undecided(conflict: Conflict) -> Conflict:
 
 
 class Glances:
-    """What conditions of a substep's rules ask of single variables: elements, fields and counts at places."""
+    """What the rules of a substep require of single variables: elements, fields and counts at places."""
 
     def __init__(self, masks: Sequence[Expr], facts: Facts, lets: Lets):
         self._facts = facts

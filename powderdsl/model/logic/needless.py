@@ -1,5 +1,5 @@
-"""What is written and decides nothing: comparisons that always come out alike, rules that others always overrule,
-writes that no cell keeps.
+"""Rules and parts of them that decide nothing: comparisons with one outcome, rules that others always overrule, writes
+that no cell keeps.
 
 Rules are legal with these, so they are warnings. Loops and symmetries write a rule out many times: a warning is
 given only if all its copies deserve it.
@@ -42,7 +42,7 @@ from powderdsl.syntax.ast import Syntax
 
 BUDGET = 100_000
 """Nodes evaluated for each kind of these warnings: a quarter of a second. After that nothing more is found, and a note
-says so."""
+reports it."""
 
 GLANCES = 10
 """Rules of a substep that are looked at for the work of one node."""
@@ -58,7 +58,7 @@ def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) 
     """Report comparisons that ranges decide, and rules that others always overrule.
 
     Returns:
-        The rules that may be overruled: to tell takes too much work.
+        The rules that may be overruled, which takes too much work to decide.
     """
     known = silent_rules(reporter)
     _report_decided(passes, known, reporter)
@@ -111,7 +111,7 @@ def _parts(rule: Rule) -> Iterator[Expr]:
 
 
 def decided(node: Expr) -> bool | None:
-    """What a comparison of integers comes to by their ranges alone; None if it depends on the world."""
+    """The outcome of a comparison of integers by their ranges alone; None if it depends on the world."""
     a, b = node.args
     if a.kind.name != "int" or b.kind.name != "int" or a.op == b.op == "const":
         return None
@@ -214,10 +214,10 @@ def report_undrawn(
     """Report chances of elements against which no rule draws there: mostly a tag is missing.
 
     Args:
-        given: property, element id, and where an element's value of it stands.
+        given: property, element id, and the place of an element's value of it.
 
     Returns:
-        The chances that no rule may draw: to tell takes too much work.
+        The chances that perhaps no rule draws, which takes too much work to decide.
     """
     quick = _quick(facts)
     undecided = []
@@ -298,10 +298,10 @@ def report_lost_writes(
     """Warn of assignments and effects that are lost wherever their rule happens, in all its copies.
 
     Args:
-        known: rules about which more has been said already.
+        known: rules that have been reported already.
 
     Returns:
-        The writes that may be lost: to tell takes too much work.
+        The writes that may be lost, which takes too much work to decide.
     """
     limited = {name: field for name, field in fields.items() if field.of is not None}
     quick = _quick(facts)
@@ -332,7 +332,7 @@ def _arrives(
 ) -> bool:
     """Whether the cell may hold one of these elements when the write lands. Effects come after all that moves.
 
-    Raises Exhausted if to tell takes too much work.
+    Raises Exhausted if that takes too much work to decide.
     """
     if rule.mask is None:
         return True
@@ -373,7 +373,7 @@ def _brought(moment: Moment) -> Iterator[tuple[Expr, Expr]]:
 
 
 def report_undecided(spans: Iterable[Span], reporter: Reporter) -> None:
-    """Note the rules of which it is not known whether they ever have an effect.
+    """Note the rules for which it is not known whether they ever have an effect.
 
     Args:
         spans: rules, writes and values; repetitions count once.

@@ -1,7 +1,7 @@
 """Can these conditions hold at once? A small constraint search over elements, properties, fields, counts and draws.
 
-The answer errs to one side only: False is a proof, True may mean "could not tell". What it cannot enumerate
-(float comparisons, parameters, large ranges) it treats as free, the same expression at the same place once.
+The answer errs to one side only: False is a proof, True may mean "could not decide". The search cannot enumerate float
+comparisons, parameters and large ranges: it treats them as free, the same expression at the same place once.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAX_QUESTION = 100_000
 """Nodes evaluated for one question. A harder one stays undecided, and the others keep their share."""
 
 QUESTION = 60
-"""What a question costs besides its evaluations."""
+"""The cost of a question besides its evaluations."""
 
 
 class Exhausted(Exception):
@@ -65,7 +65,7 @@ class Budget:
 
     @contextmanager
     def question(self, most: int | None = None) -> Iterator[None]:
-        """Spend at most this much within. What one question may not spend is left for the next."""
+        """Spend at most this much within. The rest is left for the next question."""
         reserve = max(self.left - (most or self.most), 0)
         self.left -= reserve
         try:
@@ -77,7 +77,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known of cells: which ids exist, and what the elements' properties are."""
+    """What is known about cells: which ids exist, and the properties of the elements."""
 
     ids: tuple[int, ...]
     properties: dict[str, Property]
@@ -183,7 +183,7 @@ class Search:
         return self._assign(order, 0, joint, self._chosen)
 
     def alone(self) -> dict[Key, frozenset[object]] | None:
-        """What conditions on one variable leave of it, draws left out; None if one of them leaves nothing."""
+        """The values that conditions on one variable leave of it, draws left out; None if one leaves nothing."""
         if self._narrow() is None:
             return None
         cut = {key: values for key, values in self._domains.items() if key[0] != "draw"}
@@ -265,7 +265,7 @@ class Search:
         return list(range(int(kind.lo), int(kind.hi) + 1))
 
     def _variables(self, expr: Expr, at: Offset) -> dict[Key, None] | None:
-        """What the value depends on, in the order it is named; None if some of it cannot be enumerated."""
+        """The variables of an expression, in the order they are named; None if one of them cannot be enumerated."""
         found: dict[Key, None] = {}
 
         def visit(node: Expr, at: Offset) -> None:
@@ -341,7 +341,7 @@ class Search:
         return _EVALUATE[node.op](node, *args)
 
     def _bounds(self, node: Expr, at: Offset, chosen: Assignment) -> Bounds:
-        """Between which numbers the value lies while some variables are open: a flag lies between 0 and 1."""
+        """The bounds of the value while some variables are open; those of a flag are 0 and 1."""
         self.facts.budget.spend(1)
         match node.op:
             case "const":

@@ -16,7 +16,7 @@ from powderdsl.model.types import Assign, Moment, Move, Pass, Transform
 
 
 def report_unused(composition: Composition, typer: Typer, produced: frozenset[int]) -> None:
-    """Report what no rule uses (warnings), and what the loaded packs lack (notes)."""
+    """Report definitions that no rule uses (warnings), and what the loaded packs lack (notes)."""
     reporter = typer.reporter
     values = [str(value) for prop in typer.symbols.properties.values() for value in prop.values]
     for qualified, param in composition.params.items():
@@ -99,7 +99,7 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
 
 
 def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
-    """For each of these properties the ids whose cells may hold their own value: those that some rule assigns it to.
+    """For each of these properties the ids whose cells may hold their own value: the ids that some rule assigns it to.
 
     A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
     """
