@@ -12,7 +12,7 @@ from powderdsl.ir.segments import Carried, carry
 GATES = {"not": 1, "and": 1, "or": 1, "xor": 1, "select": 3}
 """Gates that an operation on bit planes takes: a choice is (a and c) or (b and not c)."""
 
-WEIGHTS = {"gate": 1.0, "shift": 4.0, "move": 8.0, "random": 8.0, "real": 32.0, "dense": 200.0}
+WEIGHTS = {"gates": 1.0, "shifts": 4.0, "moves": 8.0, "random_bits": 8.0, "reals": 32.0, "dense": 200.0}
 """About what one of each takes, in vector operations on 512 cells: sixteen floats fill the vector that holds 512 flags,
 a random bit is a hash, what runs on cells goes through memory. Chosen so that the shares of the shipped rulesets come
 out as native code needs them on worlds full of everything: most do to a factor of two."""
@@ -46,50 +46,43 @@ class PassCost:
 
 def costs(program: Program) -> tuple[PassCost, ...]:
     """The costs of the passes of an optimized program, in their order. Shares add up to 1."""
-    counts = [_counted(carry(program, pass_)) for pass_ in program.passes]
-    weights = [sum(WEIGHTS[kind] * number for kind, number in count.items()) for _, count in counts]
-    whole = sum(weights) or 1.0
-    found = []
-    for (carried, count), weight in zip(counts, weights, strict=True):
-        pass_ = carried.cells
-        found.append(
-            PassCost(
-                name=pass_.name,
-                pack=pass_.pack,
-                moments=len(pass_.substeps),
-                gates=count["gate"],
-                shifts=count["shift"],
-                moves=count["move"],
-                random_bits=count["random"],
-                reals=count["real"],
-                dense=count["dense"],
-                neighbors=len(_neighbors(pass_)),
-                form="planes" if carried.planes else "cells",
-                why=carried.why,
-                place=carried.place,
-                share=weight / whole,
-            )
+    carried = [carry(program, pass_) for pass_ in program.passes]
+    counts = [_work(one) for one in carried]
+    weights = [sum(WEIGHTS[kind] * number for kind, number in count.items()) for count in counts]
+    total = sum(weights) or 1.0
+    return tuple(
+        PassCost(
+            name=one.cells.name,
+            pack=one.cells.pack,
+            moments=len(one.cells.substeps),
+            **{kind: count[kind] for kind in WEIGHTS},
+            neighbors=len(_neighbors(one.cells)),
+            form="planes" if one.planes else "cells",
+            why=one.why,
+            place=one.place,
+            share=weight / total,
         )
-    return tuple(found)
+        for one, count, weight in zip(carried, counts, weights, strict=True)
+    )
 
 
-def _counted(carried: Carried) -> tuple[Carried, Counter[str]]:
+def _work(carried: Carried) -> Counter[str]:
     """The amount of each kind of work."""
     nodes = nodes_of(carried.planes or carried.cells, substeps=False)
-    count = Counter({"random": _random_bits(nodes)})
+    count = Counter({"random_bits": _random_bits(nodes)})
     if carried.planes is None:
         count["dense"] = sum(1 for node in nodes if node.args)
-        return carried, count
+        return count
     for node in nodes:
         if node.type == REAL or any(arg.type == REAL for arg in node.args):
-            count["real"] += bool(node.args)
+            count["reals"] += bool(node.args)
         elif node.op in GATES:
-            count["gate"] += GATES[node.op]
+            count["gates"] += GATES[node.op]
         elif node.op == "shift":
-            count["shift"] += 1
+            count["shifts"] += 1
         elif node.op in ("swap", "arrive"):
-            count["move"] += 1
-    return carried, count
+            count["moves"] += 1
+    return count
 
 
 def _random_bits(nodes: Iterable[Node]) -> int:

@@ -56,10 +56,8 @@ def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | Non
     """Parse a YAML scalar as one of STARTS; None after reporting a syntax error."""
     span = scalar.content
     if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
-        label, helps = (
-            "a backslash, or doubled quotes",
-            ["write the line without quotes, or without the escapes"],
-        )
+        label = "a backslash, or doubled quotes"
+        helps = ["write the line without quotes, or without the escapes"]
         reporter.error("PD203", "escapes in a quoted rule", scalar.span, label, helps=helps)
         return None
     return parse_text(span.source, span.start, span.end, start, reporter)

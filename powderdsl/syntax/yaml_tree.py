@@ -189,10 +189,8 @@ class _Builder:
             elif plain_empty and self._in_braces(start):
                 self._no_value(key, first=not seen)
             elif key.text in seen:
-                message, fix = (
-                    f"key `{key.text}` stands twice in one mapping",
-                    "keep one of them, or join them",
-                )
+                message = f"key `{key.text}` stands twice in one mapping"
+                fix = "keep one of them, or join them"
                 other = Label(seen[key.text], "first time here")
                 self._fail("PD104", message, key.span, "second time here", fix, other)
             else:

@@ -212,10 +212,8 @@ class Coercer:
                 value = self.integer(operand, span)
         number = value.value if value.op == "const" else kind.lo
         if isinstance(number, (int, float)) and not kind.lo <= number <= kind.hi:
-            label, fix = (
-                f"the range is {kind.lo:g}..{kind.hi:g}",
-                "write a number in this range, or widen it where it is declared",
-            )
+            label = f"the range is {kind.lo:g}..{kind.hi:g}"
+            fix = "write a number in this range, or widen it where it is declared"
             raise self.fail("PD402", f"{number:g} lies outside {kind}", span, label, fix)
         return value
 

@@ -112,10 +112,8 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     for child in syntax.children:
         value = typer.evaluate(child, scope)
         if not isinstance(value, Number) or not is_integer(value):
-            label, fix = (
-                "not an integer constant",
-                "where it varies, loop over the values: `any(… for n in 0..3)`",
-            )
+            label = "not an integer constant"
+            fix = "where it varies, loop over the values: `any(… for n in 0..3)`"
             raise typer.fail("PD405", "`at` takes two integer constants", child.span, label, fix)
         steps.append(int(value.value))
     return typer.turn(Place(typer.offset((steps[0], steps[1]), syntax.span)), scope)

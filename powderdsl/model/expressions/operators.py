@@ -168,10 +168,8 @@ def _check_resolution(typer: Typer, draw: Expr, chance: Fraction, span: Span) ->
     nearest = Fraction(max(0, ceil(chance * steps - Fraction(1, 2))), steps)
     if abs(nearest - chance) > chance / 20:
         message = f"a chance of {float(100 * chance):.3g}% is drawn as {float(100 * nearest):.3g}%"
-        label, fix = (
-            f"this stream draws in steps of 1/{steps}",
-            "declare the stream with `bits: 32`, or say `with chance`",
-        )
+        label = f"this stream draws in steps of 1/{steps}"
+        fix = "declare the stream with `bits: 32`, or say `with chance`"
         typer.reporter.report("PD404", message, span, label, helps=[fix])
 
 

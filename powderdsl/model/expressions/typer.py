@@ -316,23 +316,11 @@ class Typer(Coercer):
 
     # Literals and lists
 
-    def number(self, syntax: Syntax, scope: Scope) -> Operand:
-        return Number(read_number(syntax, self))
-
-    def truth(self, syntax: Syntax, scope: Scope) -> Operand:
-        return TRUE if syntax.kind == "yes" else FALSE
-
-    def range_(self, syntax: Syntax, scope: Scope) -> Operand:
-        return Bounds(*read_bounds(syntax, self))
-
     def tuple_(self, syntax: Syntax, scope: Scope) -> Operand:
         items = tuple(self.evaluate(child, scope) for child in syntax.children)
         if all(isinstance(item, (SetOf, Absent)) for item in items):
             return self.set_of(Items(items), syntax.span)
         return Items(items)
-
-    def any_(self, syntax: Syntax, scope: Scope) -> Operand:
-        return SetOf(self.symbols.ids)
 
     def any_but(self, syntax: Syntax, scope: Scope) -> Operand:
         left_out = self.set_of(self.evaluate(syntax.children[0], scope), syntax.children[0].span)
@@ -350,9 +338,6 @@ class Typer(Coercer):
         pairs = zip(operands, syntax.children, strict=True)
         flags = [self.flag(operand, child.span) for operand, child in pairs]
         return (disjunction if syntax.kind == "or_" else conjunction)(flags, syntax.span)
-
-    def not_(self, syntax: Syntax, scope: Scope) -> Operand:
-        return negation(self.condition(syntax.children[0], scope), syntax.span)
 
     def compare(self, syntax: Syntax, scope: Scope) -> Operand:
         operands = [self.evaluate(child, scope) for child in syntax.children]
@@ -443,9 +428,6 @@ class Typer(Coercer):
         left, right = (self.value_of(child, scope) for child in syntax.children)
         return binary(self, left, right, syntax)
 
-    def negate(self, syntax: Syntax, scope: Scope) -> Operand:
-        return negate(self, self.value_of(syntax.children[0], scope), syntax.span)
-
     def chance_draw(self, stream: str, syntax: Syntax, scope: Scope) -> Expr:
         """`with chance P`: a draw of the rule's own stream below P."""
         span = syntax.span
@@ -461,21 +443,24 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "optional_name": Typer.optional_name,
     "attribute": Typer.attribute,
     "optional_attribute": Typer.optional_attribute,
-    **dict.fromkeys(("integer", "decimal", "percent"), Typer.number),
-    **dict.fromkeys(("yes", "no"), Typer.truth),
-    "range": Typer.range_,
+    **dict.fromkeys(
+        ("integer", "decimal", "percent"), lambda typer, at, scope: Number(read_number(at, typer))
+    ),
+    "yes": lambda typer, at, scope: TRUE,
+    "no": lambda typer, at, scope: FALSE,
+    "range": lambda typer, at, scope: Bounds(*read_bounds(at, typer)),
     "tuple": Typer.tuple_,
-    "any": Typer.any_,
+    "any": lambda typer, at, scope: SetOf(typer.symbols.ids),
     "any_but": Typer.any_but,
     **dict.fromkeys(("or_", "and_"), Typer.logic),
-    "not_": Typer.not_,
+    "not_": lambda typer, at, scope: negation(typer.condition(at.children[0], scope), at.span),
     "compare": Typer.compare,
     **dict.fromkeys(("is_", "is_not", "in_", "not_in"), Typer.is_),
     "choose": Typer.choose,
     **dict.fromkeys(("any_of", "all_of"), Typer.quantifier),
     "call": call,
     **dict.fromkeys(("add", "subtract", "multiply", "divide"), Typer.binary),
-    "negate": Typer.negate,
+    "negate": lambda typer, at, scope: negate(typer, typer.value_of(at.children[0], scope), at.span),
     "quotient": quotient,
     "mod": modulo,
 }

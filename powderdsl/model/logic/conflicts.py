@@ -176,10 +176,8 @@ def _report_fate(span: Span, fate: _Fate, relaxed: Facts, elaborated: Elaborated
     """Report a rule that never fires, and why, or that changes nothing."""
     if fate.fires:
         if not fate.useful:
-            label, fix = (
-                "the cell already is what it becomes",
-                "remove it, or name another element after `->`",
-            )
+            label = "the cell already is what it becomes"
+            fix = "remove it, or name another element after `->`"
             reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
         return
     if span in elaborated.inactive:
@@ -193,10 +191,8 @@ def _report_fate(span: Span, fate: _Fate, relaxed: Facts, elaborated: Elaborated
         label = "no cell can fulfill all of it"
         reporter.report("PD503", "this rule can never fire", span, label, helps=[fix])
         return
-    label, fix = (
-        "cannot happen with these packs",
-        "it becomes active with a pack that brings what it asks for",
-    )
+    label = "cannot happen with these packs"
+    fix = "it becomes active with a pack that brings what it asks for"
     reporter.report("PD506", f"this rule is inactive: {reason}", span, label, helps=[fix])
 
 

@@ -79,8 +79,9 @@ def silent_rules(reporter: Reporter) -> list[Span]:
 
 def _report_decided(passes: tuple[Pass, ...], known: Sequence[Span], reporter: Reporter) -> None:
     outcomes: dict[Span, set[bool | None]] = {}
-    for expr in _expressions(passes):
-        for node in expr.walk():
+    for _, moment, lets in substeps(passes):
+        parts = [*lets.values(), *(part for rule in moment.rules for part in _parts(rule))]
+        for node in (node for part in parts for node in part.walk()):
             if node.op in ("eq", "lt", "le") and node.span is not None:
                 outcomes.setdefault(node.span, set()).add(decided(node))
     for span, found in outcomes.items():
@@ -89,13 +90,6 @@ def _report_decided(passes: tuple[Pass, ...], known: Sequence[Span], reporter: R
                 "PD513", "this comparison decides nothing", span, "it comes out the same in every world",
                 helps=["look at the bounds of both sides", "remove it, if it is meant so"],
             )  # fmt: skip
-
-
-def _expressions(passes: tuple[Pass, ...]) -> Iterator[Expr]:
-    for _, moment, lets in substeps(passes):
-        yield from lets.values()
-        for rule in moment.rules:
-            yield from _parts(rule)
 
 
 def _parts(rule: Rule) -> Iterator[Expr]:
