@@ -13,7 +13,6 @@ import numpy as np
 
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, REAL, Node, Threshold, component_names, integer
-from powderdsl.model.state import Slot
 from powderdsl.model.types import Expr, Kernel, Property, Ruleset
 
 Pair = tuple[Node, Node]
@@ -24,14 +23,13 @@ NEAR, FAR = 0.92387953251128674, 0.38268343236508977
 
 
 @dataclass
-class Context:
+class Inputs:
     """What expressions read: the current node of each slot, and lets."""
 
     ruleset: Ruleset
     build: Builder
     state: dict[str, Node]
     lets: dict[str, Node | Pair]
-    slots: dict[str, Slot]
 
     def property_of(self, prop: Property, element: Node) -> Node:
         """A property of given elements; values that are parameters are chosen one at a time."""
@@ -58,25 +56,25 @@ class Context:
         return result
 
 
-def lower_expression(expr: Expr, at: Context) -> Node | Pair:
+def lower_expression(expr: Expr, at: Inputs) -> Node | Pair:
     """The node of a checked expression; a pair for vectors."""
     return _LOWER[expr.op](expr, at)
 
 
-def node(expr: Expr, at: Context) -> Node:
+def node(expr: Expr, at: Inputs) -> Node:
     """The node of an expression that is not a vector."""
     lowered = lower_expression(expr, at)
     assert isinstance(lowered, Node)
     return lowered
 
 
-def pair(expr: Expr, at: Context) -> Pair:
+def pair(expr: Expr, at: Inputs) -> Pair:
     lowered = lower_expression(expr, at)
     assert not isinstance(lowered, Node)
     return lowered
 
 
-def param_node(at: Context, name: str, threshold: Threshold | None = None) -> Node:
+def param_node(at: Inputs, name: str, threshold: Threshold | None = None) -> Node:
     """A parameter's value, or as a chance the number of draws that lie below it."""
     param = next(p for p in at.ruleset.params if p.name == name)
     if threshold is not None:
@@ -85,7 +83,7 @@ def param_node(at: Context, name: str, threshold: Threshold | None = None) -> No
     return at.build.make("param", type, attr=(name, None))
 
 
-def _const(expr: Expr, at: Context) -> Node:
+def _const(expr: Expr, at: Inputs) -> Node:
     build = at.build
     match expr.kind.name:
         case "flag":
@@ -100,7 +98,7 @@ def _float32(value: object) -> float:
     return float(np.float32(float(value)))  # type: ignore[arg-type]
 
 
-def _property(expr: Expr, at: Context) -> Node:
+def _property(expr: Expr, at: Inputs) -> Node:
     prop = at.ruleset.property(str(expr.value))
     assert prop is not None
     if prop.stored:
@@ -110,7 +108,7 @@ def _property(expr: Expr, at: Context) -> Node:
     return at.property_of(prop, at.state["element"])
 
 
-def _slot(name: str, at: Context) -> Node | Pair:
+def _slot(name: str, at: Inputs) -> Node | Pair:
     if name in at.state:
         return at.state[name]
     row, column = component_names(name)
@@ -126,24 +124,24 @@ def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
     return function(*rows), function(*columns)
 
 
-def _look(expr: Expr, at: Context) -> Node | Pair:
+def _look(expr: Expr, at: Inputs) -> Node | Pair:
     offset = expr.value
     return _each(lambda a: at.build.shift(a, offset), lower_expression(expr.args[0], at))
 
 
-def _arithmetic(expr: Expr, at: Context) -> Node | Pair:
+def _arithmetic(expr: Expr, at: Inputs) -> Node | Pair:
     return _each(partial(at.build.derive, expr.op), *(lower_expression(arg, at) for arg in expr.args))
 
 
-def _member(expr: Expr, at: Context) -> Node:
+def _member(expr: Expr, at: Inputs) -> Node:
     return at.build.in_set(node(expr.args[0], at), expr.value)
 
 
-def _logic(expr: Expr, at: Context) -> Node:
+def _logic(expr: Expr, at: Inputs) -> Node:
     return at.build.make(expr.op, FLAG, *(node(arg, at) for arg in expr.args))
 
 
-def _to_real(expr: Expr, at: Context) -> Node:
+def _to_real(expr: Expr, at: Inputs) -> Node:
     argument = expr.args[0]
     if argument.kind.name == "draw":
         return _draw_real(argument, at)
@@ -152,7 +150,7 @@ def _to_real(expr: Expr, at: Context) -> Node:
     return at.build.to_real(node(argument, at))
 
 
-def _draw_real(expr: Expr, at: Context) -> Node:
+def _draw_real(expr: Expr, at: Inputs) -> Node:
     """A draw as float32. Sums with integers are rounded after each addition."""
     if expr.op == "draw":
         return at.build.make("draw", REAL, attr=_stream(expr, at))
@@ -162,7 +160,7 @@ def _draw_real(expr: Expr, at: Context) -> Node:
     return at.build.derive(expr.op, parts[0], parts[1])
 
 
-def _chance(expr: Expr, at: Context, threshold: Threshold | None = None) -> Node:
+def _chance(expr: Expr, at: Inputs, threshold: Threshold | None = None) -> Node:
     """A chance as float32, or as the number of draws below it."""
     build = at.build
 
@@ -193,12 +191,12 @@ def _chance(expr: Expr, at: Context, threshold: Threshold | None = None) -> Node
 # Draws
 
 
-def _stream(expr: Expr, at: Context) -> tuple[str, int]:
+def _stream(expr: Expr, at: Inputs) -> tuple[str, int]:
     stream = next(s for s in at.ruleset.streams if s.name == expr.value)
     return stream.name, stream.bits
 
 
-def _split_draw(expr: Expr, at: Context) -> tuple[Expr, tuple[int, int], Node | None]:
+def _split_draw(expr: Expr, at: Inputs) -> tuple[Expr, tuple[int, int], Node | None]:
     """A draw expression as (draw, where it is read, integer added to it)."""
     if expr.op == "draw":
         return expr, (0, 0), None
@@ -224,7 +222,7 @@ def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
     return min(max(count, 0), 1 << threshold.bits)
 
 
-def _lt(expr: Expr, at: Context) -> Node:
+def _lt(expr: Expr, at: Inputs) -> Node:
     left, right = expr.args
     if "draw" not in (left.kind.name, right.kind.name):
         return _compare(expr, at)
@@ -260,7 +258,7 @@ def _lt(expr: Expr, at: Context) -> Node:
     return build.not_(result) if flipped else result
 
 
-def _compare(expr: Expr, at: Context) -> Node:
+def _compare(expr: Expr, at: Inputs) -> Node:
     a, b = (node(arg, at) for arg in expr.args)
     if a.type == FLAG:
         return at.build.not_(at.build.make("xor", FLAG, a, b))
@@ -270,13 +268,13 @@ def _compare(expr: Expr, at: Context) -> Node:
 # Neighborhoods and vectors
 
 
-def _count(expr: Expr, at: Context) -> Node:
+def _count(expr: Expr, at: Inputs) -> Node:
     kernel = expr.value
     type = integer(int(expr.kind.lo), int(expr.kind.hi))
     return at.build.make("count", type, node(expr.args[0], at), attr=(kernel.weights, kernel.wrap))
 
 
-def _sum(expr: Expr, at: Context) -> Node | Pair:
+def _sum(expr: Expr, at: Inputs) -> Node | Pair:
     kernel = expr.value
     return _each(lambda a: _neighborhood(a, kernel, at.build), lower_expression(expr.args[0], at))
 
@@ -307,7 +305,7 @@ def _length(vector: Pair, build: Builder) -> Node:
     return build.make("sqrt", REAL, squares)
 
 
-def _octant(expr: Expr, at: Context) -> Node:
+def _octant(expr: Expr, at: Inputs) -> Node:
     """The octant, by comparing x with the borders of the octants at this length."""
     build = at.build
     y, x = pair(expr.args[0], at)
@@ -323,15 +321,15 @@ def _octant(expr: Expr, at: Context) -> Node:
     return result
 
 
-def _opposite(expr: Expr, at: Context) -> Node:
+def _opposite(expr: Expr, at: Inputs) -> Node:
     return at.build.mod(at.build.derive("add", node(expr.args[0], at), at.build.integer(4)), 8)
 
 
-def _vector(expr: Expr, at: Context) -> Pair:
+def _vector(expr: Expr, at: Inputs) -> Pair:
     return node(expr.args[0], at), node(expr.args[1], at)
 
 
-def _choose(expr: Expr, at: Context) -> Node | Pair:
+def _choose(expr: Expr, at: Inputs) -> Node | Pair:
     if expr.kind.name == "chance":
         return _chance(expr, at)
     condition = node(expr.args[0], at)
@@ -339,7 +337,7 @@ def _choose(expr: Expr, at: Context) -> Node | Pair:
     return _each(lambda a, b: at.build.select(condition, a, b), *values)
 
 
-_LOWER: dict[str, Callable[[Expr, Context], Node | Pair]] = {
+_LOWER: dict[str, Callable[[Expr, Inputs], Node | Pair]] = {
     "const": _const,
     "param": lambda e, at: param_node(at, str(e.value)),
     "element": lambda e, at: at.state["element"],

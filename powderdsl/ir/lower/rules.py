@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from powderdsl.analysis.reactions import facts_of
 from powderdsl.ir.build import Builder
-from powderdsl.ir.lower.expressions import Context, Pair, lower_expression, node
+from powderdsl.ir.lower.expressions import Inputs, Pair, lower_expression, node
 from powderdsl.ir.ops import (
     FLAG,
     REAL,
@@ -175,16 +175,16 @@ class _PassLowering:
             outputs.append((name, last))
         return PassGraph(pass_.name, pass_.pack, substeps, tuple(outputs))
 
-    def context(self) -> Context:
-        return Context(self.ruleset, self.build, dict(self.state), self.lets, self.slots)
+    def inputs(self) -> Inputs:
+        return Inputs(self.ruleset, self.build, dict(self.state), self.lets)
 
     def substep(self, moment: Moment) -> SubstepGraph:
         build = self.build
         place = next((f"{r.span.source.name}:{r.span.line}" for r in moment.rules), "")
         build.place = place
         for let in moment.lets:
-            self.lets[let.name] = lower_expression(let.value, self.context())
-        at = self.context()
+            self.lets[let.name] = lower_expression(let.value, self.inputs())
+        at = self.inputs()
         masks = {id(rule): node(rule.mask, at) for rule in moment.rules if rule.mask is not None}
         movers: list[Mover] = [rule for rule in moment.rules if not isinstance(rule, Assign)]
         if moment.policy != "prove":
@@ -218,7 +218,7 @@ class _PassLowering:
                 new = build.clamp(new, int(slot.kind.lo), int(slot.kind.hi))
             self.state[name] = build.select(mask, new, old)
 
-    def _move(self, movers: list[Mover], masks: dict[int, Node], at: Context) -> None:
+    def _move(self, movers: list[Mover], masks: dict[int, Node], at: Inputs) -> None:
         """Transforms and what moves leave behind first, then arrivals, all from the world before."""
         build = self.build
         before = dict(self.state)
@@ -239,7 +239,7 @@ class _PassLowering:
     def _fresh(self, element: Node) -> dict[str, Node]:
         """What a new cell of an element holds."""
         build = self.build
-        at = self.context()
+        at = self.inputs()
         found = {"element": element}
         for slot in self.slots.values():
             if not slot.travels or slot.name == "element":

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.lower.expressions import Context, lower_expression
+from powderdsl.ir.lower.expressions import Inputs, lower_expression
 from powderdsl.ir.lower.rules import ir_type, slot_names
 from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, component_of
 from powderdsl.ir.stages import run_passes
@@ -152,7 +152,7 @@ class _Part:
         lets: dict[str, Node | tuple[Node, Node]] = {name: build.input(name, FLAG) for name in regions}
         outputs = []
         for number, expr in zip(self.numbers, exprs, strict=True):
-            node = lower_expression(expr, Context(ruleset, build, state, lets, table))
+            node = lower_expression(expr, Inputs(ruleset, build, state, lets))
             assert isinstance(node, Node)
             outputs.append((f"measure {number}", node))
         every = {**types, **dict.fromkeys(regions, FLAG), **{name: node.type for name, node in outputs}}
