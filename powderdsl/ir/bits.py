@@ -21,6 +21,7 @@ from powderdsl.ir.ops import (
     SlotType,
     SubstepGraph,
     Type,
+    kernel_rows,
     nodes_of,
     plane_name,
 )
@@ -267,19 +268,12 @@ class _PassBits:
             return None
         weights, wraps = counted.attr
         flag = self._flag(counted.args[0])
-        rows = self._rows(weights)
+        rows = kernel_rows(weights)
         joined = self.gates.any([
             self.gates.shift(self.gates.any([self.gates.shift(flag, (0, dx), wraps) for dx, _ in pattern]), (dy, 0), wraps)
             for dy, pattern in rows.items()
         ])  # fmt: skip
         return joined if some else self.gates.not_(joined)
-
-    @staticmethod
-    def _rows(weights: tuple[tuple[int, int, int], ...]) -> dict[int, tuple[tuple[int, int], ...]]:
-        rows: dict[int, list[tuple[int, int]]] = {}
-        for dy, dx, weight in weights:
-            rows.setdefault(dy, []).append((dx, weight))
-        return {dy: tuple(pattern) for dy, pattern in rows.items()}
 
     def _count(self, node: Node) -> Bits:
         """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
@@ -288,7 +282,7 @@ class _PassBits:
         flag = self._flag(node.args[0])
         sums: dict[tuple[tuple[int, int], ...], tuple[tuple[Node, ...], tuple[Node, ...]]] = {}
         columns: tuple[list[list[Node]], list[list[Node]]] = ([], [])
-        for dy, pattern in self._rows(weights).items():
+        for dy, pattern in kernel_rows(weights).items():
             if pattern not in sums:
                 parts = []
                 for sign in (1, -1):

@@ -234,6 +234,14 @@ def plane_name(slot: str, bit: int) -> str:
     return f"{slot}:{bit}"
 
 
+def kernel_rows(weights: Iterable[tuple[int, int, int]]) -> dict[int, tuple[tuple[int, int], ...]]:
+    """The columns and weights of each row of a kernel, from weights by row and column."""
+    rows: dict[int, tuple[tuple[int, int], ...]] = {}
+    for dy, dx, weight in weights:
+        rows[dy] = (*rows.get(dy, ()), (dx, weight))
+    return rows
+
+
 @dataclass(frozen=True)
 class Program:
     """A ruleset in IR."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import FLAG, REAL, Node, Threshold, component_names, integer
+from powderdsl.ir.ops import FLAG, REAL, Node, Threshold, component_names, integer, kernel_rows
 from powderdsl.model.types import Expr, Kernel, Property, Ruleset
 
 Pair = tuple[Node, Node]
@@ -281,11 +281,8 @@ def _sum(expr: Expr, at: Inputs) -> Node | Pair:
 
 def _neighborhood(value: Node, kernel: Kernel, build: Builder) -> Node:
     """The weighted sum, each row from the left, then the rows from the top. Equal rows are summed once and shifted."""
-    rows: dict[int, list[tuple[int, int]]] = {}
-    for dy, dx, weight in kernel.weights:
-        rows.setdefault(dy, []).append((dx, weight))
     total: Node | None = None
-    for dy, cells in rows.items():
+    for dy, cells in kernel_rows(kernel.weights).items():
         row: Node | None = None
         for dx, weight in cells:
             term = build.shift(value, (0, dx), kernel.wrap)

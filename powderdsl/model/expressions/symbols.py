@@ -32,7 +32,7 @@ from powderdsl.system.random import name_number
 
 @dataclass
 class Symbols:
-    """Names known everywhere. Filled in order by `resolve_symbols`; frozen in use afterwards."""
+    """Names known everywhere. Filled in order by `check.resolve_names`; not changed afterwards."""
 
     composition: Composition
     properties: dict[str, Property] = field(default_factory=dict)
