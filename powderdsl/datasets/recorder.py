@@ -32,7 +32,7 @@ from powderdsl.envs.acting import Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs.folder import held
-from powderdsl.system.writing import failure
+from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
 
@@ -145,8 +145,7 @@ def _held(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(exist_ok=True)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise failure("PD613", f"cannot write {folder}", notes=(reason,)) from None
+        raise not_writable(folder, error) from None
     with held(folder):
         yield
 

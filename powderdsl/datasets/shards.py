@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from powderdsl.datasets.manifest import Recipe, ShardRow, damaged, shard_file
 from powderdsl.system.reading import open_regular
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.writing import not_writable, replacing
 
 Array = NDArray[Any]
 
@@ -81,7 +81,7 @@ def write_shard(
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             size = temporary.stat().st_size
         except OSError as error:
-            raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
+            raise not_writable(path, error) from None
     return ShardRow(number, digest, size, sum(map(len, parts["action"])))
 
 

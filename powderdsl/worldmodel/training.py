@@ -14,7 +14,15 @@ from torch.nn import functional as F
 
 from powderdsl.compiler import load, whole_palette
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, open_run, read_run
+from powderdsl.experiments.runs import (
+    Checkpoint,
+    RunFolder,
+    does_not_fit,
+    find_run,
+    no_run,
+    open_run,
+    read_run,
+)
 from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
@@ -108,7 +116,7 @@ HERE = Machine()
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """What training says of itself, after each iteration: how many are done, and the last loss that was logged."""
+    """The state after each iteration: how many are done, and the last loss that was logged."""
 
     done: int
     of: int
@@ -154,102 +162,75 @@ def train(
         found = task_worlds(config.data, **machine.simulation, palette=palette)
         worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
     check_palette(Path(folder), palette, worlds.rules)
-    plain = {
-        **asdict(config),
-        "palette": palette,
-        "rules_fingerprint": fingerprint(worlds.rules),
-        **(identity or {}),
-    }
-    run = open_run(folder, KIND, plain, note={"machine": asdict(machine), **(note or {})})
+    own = {"palette": palette, "rules_fingerprint": fingerprint(worlds.rules), **(identity or {})}
+    run = open_run(folder, KIND, {**asdict(config), **own}, note={"machine": asdict(machine), **(note or {})})
     with run.locked():
         model = network or fresh_unet(len(palette), config.width, config.seed)
-        model.to(machine.device)
-        optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
-        done, recent = _restore(run, model, optimizer, parent, machine.device)
-        if done < config.iterations:
-            replay = Replay(
-                worlds,
-                config.data,
-                seed=config.seed,
-                device=machine.device,
-                store=machine.store,
-                folder=run.path,
-            )
-            try:
-                replay.go_to(done)
-                trainer = _Trainer(config, machine, run, model, optimizer, replay, len(palette), done, recent)
-                trainer.go(tell or (lambda progress: None), save_seconds)
-            finally:
-                replay.close()
+        trainer = _Trainer(config, machine, run, model.to(machine.device), len(palette))
+        trainer.restore(parent)
+        if trainer.done < config.iterations:
+            trainer.train(worlds, tell or (lambda progress: None), save_seconds)
     return run
 
 
-def _restore(
-    run: RunFolder,
-    model: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    parent: Checkpoint | None,
-    device: str,
-) -> tuple[int, list[float]]:
-    """Iterations that are done, and the losses since the last line of metrics."""
-    found = run.latest_checkpoint(device)
-    if found is None:
-        if parent is not None:
-            fit_weights(model, parent, grow=True)
-        return 0, []
-    fit_weights(model, found)
-    try:
-        optimizer.load_state_dict(found.state["optimizer"])
-        return found.step, [float(one) for one in found.state["recent"]]
-    except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
-        why = " ".join(str(error).split())[:300]
-        raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
-
-
 class _Trainer:
-    """One call of `train`, from `done` iterations on."""
+    """A network in training: `done` iterations so far, and the losses since the last line of metrics."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        machine: Machine,
-        run: RunFolder,
-        model: nn.Module,
-        optimizer: torch.optim.Optimizer,
-        replay: Replay,
-        slots: int,
-        done: int,
-        recent: list[float],
-    ):
-        self.config, self.machine, self.run = config, machine, run
-        self.model, self.optimizer, self.replay, self.slots = model, optimizer, replay, slots
-        self.done, self.recent = done, recent
+    def __init__(self, config: TrainConfig, machine: Machine, run: RunFolder, model: nn.Module, slots: int):
+        self.config, self.machine, self.run, self.model, self.slots = config, machine, run, model, slots
+        self.optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
         self.forward: Network = torch.compile(model) if machine.compiled else model
-        self.cuda = torch.device(machine.device).type == "cuda"
+        self.done = 0
+        self.recent: list[float] = []
 
-    def go(self, tell: Callable[[TrainingProgress], None], save_seconds: float) -> None:
-        """To the end. A signal is raised once a checkpoint is written, a second one at once."""
-        total, loss, simulated = self.config.iterations, None, 0.0
+    def restore(self, parent: Checkpoint | None) -> None:
+        """Continue from the run's newest checkpoint; a new run starts with the weights of `parent`."""
+        found = self.run.latest_checkpoint(self.machine.device)
+        if found is None:
+            if parent is not None:
+                fit_weights(self.model, parent, grow=True)
+            return
+        fit_weights(self.model, found)
+        try:
+            self.optimizer.load_state_dict(found.state["optimizer"])
+            self.done, self.recent = found.step, [float(one) for one in found.state["recent"]]
+        except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
+            why = " ".join(str(error).split())[:300]
+            raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
+
+    def train(self, worlds: Worlds, tell: Callable[[TrainingProgress], None], save_seconds: float) -> None:
+        """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""
+        device, store = self.machine.device, self.machine.store
+        replay = Replay(
+            worlds, self.config.data, seed=self.config.seed, device=device, store=store, folder=self.run.path
+        )
+        try:
+            replay.go_to(self.done)
+            self._iterate(replay, tell, save_seconds)
+        finally:
+            replay.close()
+
+    def _iterate(self, replay: Replay, tell: Callable[[TrainingProgress], None], save_seconds: float) -> None:
+        config, total = self.config, self.config.iterations
+        loss, simulated, making = None, 0.0, 0.0
         saved = since = time.monotonic()
-        making = 0.0
         self.model.train()
         # An iteration is never left half done.
         with self.run.metrics(self.done) as metrics, held_back() as interrupted:
             while self.done < total and not interrupted():
-                starts, ends = self.replay.batch(self.done, self.config.batch)
-                self.recent.append(self.step(starts, ends))
+                self.recent.append(self.step(*replay.batch(self.done, config.batch)))
                 began = time.monotonic()
-                self.replay.advance()
+                replay.advance()
                 making += time.monotonic() - began
                 self.done += 1
                 if self.done % LOG_EVERY == 0 or self.done == total:
                     loss = sum(self.recent) / len(self.recent)
                     self.recent = []
                     if not loss < float("inf"):
-                        raise diverged(self.run.path, self.done, self.config.learning_rate)
+                        raise diverged(self.run.path, self.done, config.learning_rate)
                     took = time.monotonic() - since
                     simulated = making / took
-                    speed = {"time/pairs_a_second": LOG_EVERY * self.config.batch / took}
+                    speed = {"time/pairs_a_second": LOG_EVERY * config.batch / took}
                     metrics.write(self.done, {"loss/train": loss, **speed, "time/simulation": simulated})
                     since, making = time.monotonic(), 0.0
                 tell(TrainingProgress(self.done, total, loss, simulated))
@@ -260,11 +241,12 @@ class _Trainer:
 
     def step(self, starts: Tensor, ends: Tensor) -> float:
         """One step of Adam; the loss before it: cross-entropy a cell, in nats."""
-        with torch.autocast("cuda", torch.bfloat16, enabled=self.cuda):
+        cuda = torch.device(self.machine.device).type == "cuda"
+        with torch.autocast("cuda", torch.bfloat16, enabled=cuda):
             logits = self.forward(starts)
-        if logits.shape != (len(starts), self.slots, *starts.shape[1:]):
-            expected = [len(starts), self.slots, *starts.shape[1:]]
-            raise ValueError(f"the network must give logits {expected}, found {list(logits.shape)}")
+        expected = (len(starts), self.slots, *starts.shape[1:])
+        if logits.shape != expected:
+            raise ValueError(f"the network must give logits {list(expected)}, found {list(logits.shape)}")
         loss = F.cross_entropy(logits.float(), ends.long())
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -272,12 +254,10 @@ class _Trainer:
         return loss.item()
 
     def save(self) -> None:
-        state = {
-            "model": self.model.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "recent": list(self.recent),
-        }
-        self.run.save_checkpoint(self.done, state)
+        model, optimizer = self.model.state_dict(), self.optimizer.state_dict()
+        self.run.save_checkpoint(
+            self.done, {"model": model, "optimizer": optimizer, "recent": [*self.recent]}
+        )
 
 
 def load_rules_of(config: DataConfig, palette: Palette) -> Ruleset:
@@ -346,7 +326,7 @@ def check_palette(folder: Path, palette: Palette, rules: Ruleset) -> None:
             f"train with `--slots {len(palette) + lacking}` to leave room for packs that come later",
             "or teach the network those packs: `powderdsl wm finetune RUN --packs PACK`",
         )
-        raise failure("PD623", f"{folder} does not fit", notes=tuple(why), helps=helps if lacking else ())
+        raise does_not_fit(folder, *why, helps=helps if lacking else ())
 
 
 def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False) -> None:
@@ -358,13 +338,18 @@ def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False)
     Raises:
         CompileError: PD623 if they are those of another network.
     """
-    state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
+    found = _weights(checkpoint)
     try:
-        found = dict(state) if isinstance(state, dict) else {}
         model.load_state_dict(_grown(found, model) if grow else found)
     except (RuntimeError, TypeError, AttributeError) as error:
         words = [line.strip()[:200] for line in str(error).splitlines()[:4]]
         raise does_not_fit(checkpoint.path, "its weights are those of another network", *words) from None
+
+
+def _weights(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The weights in a checkpoint, which may hold anything; none if it has no weights."""
+    state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
+    return dict(state) if isinstance(state, dict) else {}
 
 
 def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:
@@ -405,9 +390,7 @@ def load_trained(
     try:
         config, palette = TrainConfig.of(run.config), _recorded_palette(run)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise failure(
-            "PD620", f"{run.path} is not a run that can be used here", notes=(str(error),)
-        ) from None
+        raise no_run(run.path, str(error)) from None
     checkpoint = run.checkpoint(device)
     if network is None:
         _check_size(run, config, palette, checkpoint)
@@ -421,14 +404,10 @@ def _check_size(
 ) -> None:
     """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError."""
     if type(config.width) is not int or not 1 <= config.width <= MAX_WIDTH or not 1 <= len(palette) <= 256:
-        why = "its network has sizes that no training gives"
-        raise failure("PD620", f"{run.path} is not a run that can be used here", notes=(why,))
+        raise no_run(run.path, "its network has sizes that no training gives")
     with torch.device("meta"):
         wanted = {name: one.shape for name, one in UNet(len(palette), config.width).state_dict().items()}
-    state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
-    found = (
-        {name: getattr(one, "shape", None) for name, one in state.items()} if isinstance(state, dict) else {}
-    )
+    found = {name: getattr(one, "shape", None) for name, one in _weights(checkpoint).items()}
     if wanted != found:
         raise does_not_fit(checkpoint.path, "its weights are those of another network")
 

@@ -13,7 +13,7 @@ import click
 
 from powderdsl.diagnostics import CompileError, Label, Reporter, Span
 from powderdsl.experiments.studies.paths import TEXT, confined
-from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, Study, StudyStep
+from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, Study, StudyStep, maker
 
 Values = Mapping[str, str]
 """The value of each name."""
@@ -87,10 +87,7 @@ class Places:
 
     def maker(self, step: StudyStep) -> StudyStep:
         """The step whose run is meant by a step's ``on``."""
-        found = self.steps[step.on or ""]
-        while not found.makes_run and found.on_step:
-            found = self.steps[found.on or ""]
-        return found
+        return maker(self.steps, step.on or "")
 
     def names_of(self, step: StudyStep) -> set[str]:
         """The names that a step uses, and what it works on."""

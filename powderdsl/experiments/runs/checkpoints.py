@@ -15,7 +15,7 @@ import torch
 
 from powderdsl.system.pickles import checked
 from powderdsl.system.reading import read_bytes
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.writing import failure, not_writable, replacing
 
 NAME = re.compile(r"([0-9]{12})-([0-9a-f]{16})\.pt")
 
@@ -50,7 +50,7 @@ def save_checkpoint(folder: Path, step: int, state: Any) -> Path:
             os.fsync(file.fileno())
         _sync(folder)
     except OSError as error:
-        raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
+        raise not_writable(path, error) from None
     others = [(number, old) for number, _, old in _named(folder) if old != path]
     # Later ones are left by a run that had to go back; they must not be taken for newer.
     spare = next((old for number, old in others if number < step), None)

@@ -22,7 +22,7 @@ from powderdsl.experiments.runs.checkpoints import Checkpoint, latest_checkpoint
 from powderdsl.experiments.runs.metrics import Metrics
 from powderdsl.system.reading import check_links, read_json
 from powderdsl.system.scratch import sweep
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.writing import failure, not_writable, replacing
 
 ABOUT = "run.json"
 FORMAT = 2
@@ -63,7 +63,7 @@ class RunFolder:
         """The same, for those who need one. Raises CompileError (PD620)."""
         found = self.latest_checkpoint(device)
         if found is None:
-            raise _no_run(self.path, "it has no checkpoint that can be read")
+            raise no_run(self.path, "it has no checkpoint that can be read")
         return found
 
     def save_checkpoint(self, step: int, state: Any) -> Path:
@@ -142,7 +142,7 @@ def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
             helps=("wait for it, or choose another folder",),
         ) from None
     except OSError as error:
-        raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
+        raise not_writable(folder, error) from None
     try:
         sweep(folder)
         for inner in sorted(folder.iterdir()):
@@ -162,7 +162,7 @@ def new_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         others = sorted(name for name in os.listdir(folder) if not name.startswith("."))
     except OSError as error:
-        raise failure("PD613", f"cannot write {folder}", notes=(error.strerror or str(error),)) from None
+        raise not_writable(folder, error) from None
     if others:
         raise failure(
             "PD621",
@@ -180,16 +180,16 @@ def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
     """
     folder = Path(path)
     if not (folder / ABOUT).exists():
-        raise _no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
+        raise no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
     check_folder(folder)
     about = read_json(folder / ABOUT)
     whole = isinstance(about, dict) and isinstance(about.get("kind"), str)
     if not whole or not isinstance(about.get("config"), dict):
-        raise _no_run(folder, f"its {ABOUT} is damaged")
+        raise no_run(folder, f"its {ABOUT} is damaged")
     if about.get("format") not in (FIRST_FORMAT, FORMAT):
-        raise _no_run(folder, f"its format is {about.get('format')!r}; this version reads {FORMAT}")
+        raise no_run(folder, f"its format is {about.get('format')!r}; this version reads {FORMAT}")
     if kind is not None and about["kind"] != kind:
-        raise _no_run(folder, f"it is a run of the kind `{about['kind']}`; `{kind}` is needed here")
+        raise no_run(folder, f"it is a run of the kind `{about['kind']}`; `{kind}` is needed here")
     return RunFolder(folder, about["kind"], about["config"], about)
 
 
@@ -200,7 +200,7 @@ def find_run(text: str | Path, kind: str | None = None) -> RunFolder:
         if (kept / text / ABOUT).exists():
             return read_run(kept / text, kind)
         names = sorted(one.parent.name for one in kept.glob(f"*/{ABOUT}"))
-        raise _no_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
+        raise no_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
     return read_run(folder, kind)
 
 
@@ -213,9 +213,14 @@ def check_folder(folder: Path) -> None:
         raise failure("PD112", f"{error.filename}: {error.strerror}", helps=helps) from None
 
 
-def does_not_fit(folder: Path, *why: str) -> CompileError:
-    """What to raise where a run's model or data was made for something else (PD623)."""
-    return failure("PD623", f"{folder} does not fit", notes=why)
+def does_not_fit(folder: Path, *why: str, helps: tuple[str, ...] = ()) -> CompileError:
+    """The error for a run whose model or data was made for something else (PD623)."""
+    return failure("PD623", f"{folder} does not fit", notes=why, helps=helps)
+
+
+def no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
+    """The error for a folder that is not a run, or one that cannot be used (PD620)."""
+    return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)
 
 
 def versions() -> dict[str, str]:
@@ -242,7 +247,7 @@ def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise failure("PD613", f"cannot write {path}", notes=(error.strerror or str(error),)) from None
+        raise not_writable(path, error) from None
     return path
 
 
@@ -267,7 +272,3 @@ def _flat(config: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, st
             yield from _flat(value, f"{within}{name}.")
         else:
             yield within + name, json.dumps(value)
-
-
-def _no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
-    return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)

@@ -21,6 +21,7 @@ from powderdsl.experiments.studies.study import (
     Study,
     StudyStep,
     filled,
+    maker,
 )
 from powderdsl.model.schema import Key, Reader
 from powderdsl.syntax import yaml_tree
@@ -294,9 +295,7 @@ class _StudyReader:
         steps = {step.name: step for step in self.steps}
         made = [name for name, step in steps.items() if step.makes_run]
         if of.text in steps and of.text not in made:
-            judged = steps[of.text]
-            while judged.on_step and not judged.makes_run:
-                judged = steps[str(judged.on)]
+            judged = maker(steps, of.text)
             fix = f"`of: {judged.name}`: what is found is kept with the run" if judged.makes_run else ""
             helps = (f"write {fix}",) if fix else suggest(of.text, made, "steps")
             self.reporter.error("PD806", f"the step `{of.text}` makes no run", of.span, helps=helps)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 from powderdsl.compiler import shipped, shipped_rules
@@ -24,25 +23,16 @@ def confined(means: str, text: str, folder: Path, results: Path) -> str:
     """
     if "\0" in text:
         raise ValueError("it has control characters")
-    return _WORDS[means](text, folder, results)
-
-
-def _file(text: str, folder: Path, results: Path) -> str:
-    return str(inside(results, text))
-
-
-def _task(text: str, folder: Path, results: Path) -> str:
-    return str(inside(folder, text)) if is_path(text) else text
-
-
-def _run_or_task(text: str, folder: Path, results: Path) -> str:
-    if not is_path(text) and (shipped("tasks") / f"{text}.yaml").is_file():
-        return text
-    return str(inside(folder, text))
-
-
-def _rules(text: str, folder: Path, results: Path) -> str:
-    return "+".join(_pack(part, folder) for part in text.split("+"))
+    if means == FILE:
+        return str(inside(results, text))
+    if means == RULES:
+        return "+".join(_pack(part, folder) for part in text.split("+"))
+    if means == RUN_OR_TASK:
+        named = not is_path(text) and (shipped("tasks") / f"{text}.yaml").is_file()
+        means = TASK if named else RUN
+    if means == RUN or (means == TASK and is_path(text)):
+        return str(inside(folder, text))
+    return text
 
 
 def _pack(text: str, folder: Path) -> str:
@@ -51,14 +41,3 @@ def _pack(text: str, folder: Path) -> str:
     if text.split("-")[0] not in shipped_rules() and os.path.isfile(text):
         raise ValueError("a name without `/` or `.yaml` means shipped rules, and there are none of this name")
     return text
-
-
-_WORDS: dict[str, Callable[[str, Path, Path], str]] = {
-    TEXT: lambda text, folder, results: text,
-    FLAG: lambda text, folder, results: text,
-    FILE: _file,
-    TASK: _task,
-    RUN: lambda text, folder, results: str(inside(folder, text)),
-    RUN_OR_TASK: _run_or_task,
-    RULES: _rules,
-}

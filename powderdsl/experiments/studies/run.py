@@ -19,7 +19,7 @@ from typing import Any
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, write_json
 from powderdsl.experiments.studies.paths import FLAG, TEXT, confined
-from powderdsl.experiments.studies.study import Measure, Point, Study, StudyStep, filled
+from powderdsl.experiments.studies.study import Measure, Point, Study, StudyStep, filled, maker
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
@@ -61,11 +61,13 @@ class StudyRun:
         Raises:
             CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
         """
+        # What its words mean follows from a step's command.
+        steps = [asdict(step) for step in self.study.steps]
         decides: dict[str, Any] = {
             "study": self.study.name,
             "size": self.size,
             "varied": [axis.name for axis in self.study.axes],
-            "steps": [_decides(step) for step in self.study.steps],
+            "steps": [{name: value for name, value in step.items() if name != "means"} for step in steps],
         }
         decides = json.loads(json.dumps(decides))  # as it will be read
         if self.folder.is_dir():
@@ -158,8 +160,11 @@ class StudyRun:
         """The words of a step's command for a point whose runs lie in `place`."""
         words = list(step.command)
         if step.on is not None:
+            steps = {one.name: one for one in self.study.steps}
             words.append(
-                str(place / self._maker(step.on)) if step.on_step else self._word(step, "on", step.on, point)
+                str(place / maker(steps, step.on).name)
+                if step.on_step
+                else self._word(step, "on", step.on, point)
             )
         for name, values in step.options:
             for value in values:
@@ -178,14 +183,6 @@ class StudyRun:
         except ValueError as error:
             notes = (f"in the step `{step.name}`: {error}",)
             raise failure("PD112", f"the path `{word}` leaves the study's folder", notes=notes) from None
-
-    def _maker(self, name: str) -> str:
-        """The step whose run a step means: itself, or what it works on, if it makes no run."""
-        steps = {step.name: step for step in self.study.steps}
-        step = steps[name]
-        while not step.makes_run and step.on is not None and step.on_step:
-            step = steps[step.on]
-        return step.name
 
     def _step(self, step: StudyStep, point: Point, place: Path) -> str | None:
         """Run a step; what went wrong, if something did."""
@@ -229,11 +226,6 @@ class StudyRun:
                     return
             except CompileError:
                 continue
-
-
-def _decides(step: StudyStep) -> dict[str, Any]:
-    """What decides what a step does: not what its words mean, which follows from the command."""
-    return {name: value for name, value in asdict(step).items() if name != "means"}
 
 
 def value_of(measure: Measure, run: Path, point: Point, size: str) -> float:

@@ -106,3 +106,11 @@ def filled(text: str, point: Point, size: str) -> str:
     return Template(text).safe_substitute(
         {**dict(point.values), **dict(point.sets), SEED: str(point.seed), SIZE: size}
     )
+
+
+def maker(steps: Mapping[str, StudyStep], name: str) -> StudyStep:
+    """The step whose run is meant by a step's name: the step itself, or what it works on if it makes no run."""
+    step = steps[name]
+    while not step.makes_run and step.on_step:
+        step = steps[str(step.on)]
+    return step
