@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,8 +13,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from powderdsl.datasets.manifest import Manifest, Recipe, damaged, differences, many_damaged, read_manifest
-from powderdsl.datasets.recipes import check_count, recipe_of
+from powderdsl.datasets.manifest import (
+    Manifest,
+    Recipe,
+    check_count,
+    damaged,
+    differences,
+    many_damaged,
+    read_manifest,
+    recipe_of,
+)
 from powderdsl.datasets.shards import DTYPES, Shard, open_shard, row_shape
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
@@ -24,9 +32,9 @@ from powderdsl.system.writing import failure
 Array = NDArray[Any]
 
 MAX_OPEN = 4096
-"""Shards that are mapped at once."""
+"""Shards that are mapped at once, at most."""
 MEANING = ("observation", "channels", "shape", "palette", "action_nvec", "choices")
-"""What of a recipe says what the numbers of observations and actions mean."""
+"""Fields of a recipe that define what the numbers of observations and actions mean."""
 
 
 class Batch(NamedTuple):
@@ -105,12 +113,12 @@ class Dataset:
         return partial(Dataset.open, memory=self.memory), (str(self.folder),)
 
     def __len__(self) -> int:
-        """How many episodes there are."""
+        """The number of episodes."""
         return self.recipe.episodes
 
     @property
     def steps(self) -> int:
-        """How many transitions there are."""
+        """The number of transitions."""
         return self.manifest.transitions
 
     def require(self, env: TensorEnv, *, same_rules: bool = False) -> None:
@@ -157,7 +165,7 @@ class Dataset:
         return all(bool(known[rows[at : at + 256]].all()) for at in range(0, len(rows), 256))
 
     def episode(self, number: int) -> Episode:
-        """One episode. Raises IndexError for a number that there is not."""
+        """One episode. Raises IndexError."""
         if not 0 <= number < len(self):
             raise IndexError(f"no episode {number}: there are {len(self)}")
         shard = self._shard(number // self.recipe.shard)
@@ -178,7 +186,8 @@ class Dataset:
         Minibatch n depends on `seed` and n alone. `start` is the first one's number, to continue where one stopped.
         """
         _check_draw(batch, seed, start)
-        return self._batches(1, self._ends, batch, seed, device, start, lambda found: found[:, 0])
+        found = self._batches(1, self._ends, batch, seed, device, start)
+        return (Batch(*(value[:, 0] for value in one)) for one in found)
 
     def sequences(
         self, length: int, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
@@ -195,24 +204,17 @@ class Dataset:
         if not ends[-1]:
             longest = max(int(one.max()) for one in self._lengths)
             raise ValueError(f"no episode has {length} actions; the longest has {longest}")
-        return self._batches(length, ends, batch, seed, device, start, lambda found: found)
+        return self._batches(length, ends, batch, seed, device, start)
 
     # Drawing
 
     def _batches(
-        self,
-        length: int,
-        ends: Array,
-        batch: int,
-        seed: int,
-        device: str | torch.device,
-        start: int,
-        shape: Callable[[Tensor], Tensor],
+        self, length: int, ends: Array, batch: int, seed: int, device: str | torch.device, start: int
     ) -> Iterator[Batch]:
         """Minibatches of windows of `length` transitions; `ends` says how many windows there are up to each shard."""
         while True:
             found = self._gather(drawn(seed, start, batch, int(ends[-1])), ends, length)
-            yield Batch(*(shape(torch.from_numpy(value)).to(device) for value in found))
+            yield Batch(*(torch.from_numpy(value).to(device) for value in found))
             start += 1
 
     def _gather(self, windows: Array, ends: Array, length: int) -> list[Array]:
@@ -245,7 +247,7 @@ class Dataset:
         ]
 
     def _shard(self, number: int) -> Shard:
-        """A shard, kept as long as there is room."""
+        """A shard, which stays open while there is room."""
         if number not in self._shards:
             row = self.manifest.shards[number]
             self._shards[number] = open_shard(self.folder, self.recipe, row)

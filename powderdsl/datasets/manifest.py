@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
+from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.reading import check_links, parse_json, read_bytes
 from powderdsl.system.writing import failure, replacing
+from powderdsl.tasks.task import BLOW, NO_CHANGE
+
+if TYPE_CHECKING:
+    from powderdsl.envs.tensor_env import TensorEnv
 
 FORMAT = "powderdsl-dataset"
 VERSION = 2
 """Version 1 had other fingerprints, which are read as unknown."""
 FILE = "dataset.json"
+KINDS = ("ids", "compact")
+"""Observations that are recorded. The others follow from these."""
+USUAL_SHARD = 256
+USUAL_SHARD_BYTES = 1 << 28
 MAX_BYTES = 1 << 24
 """Of a manifest's text."""
 MAX_VALUES = 1 << 19
@@ -183,12 +193,12 @@ def shard_file(number: int) -> str:
 
 
 def new_manifest(recipe: Recipe) -> Manifest:
-    """Of a dataset without shards."""
+    """The manifest of a dataset without shards."""
     return Manifest(recipe, datetime.now(UTC).isoformat(timespec="seconds"), ())
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write it whole or not at all. Raises CompileError (PD613)."""
+    """Write a manifest whole or not at all. Raises CompileError (PD613)."""
     data = {"format": FORMAT, "version": VERSION, **asdict(manifest)}
     with replacing(folder / FILE) as temporary:
         temporary.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -239,7 +249,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def check_place(folder: Path) -> None:
-    """Fail before long work where no dataset can be recorded.
+    """Check, before long work, that a dataset can be recorded in a folder.
 
     Raises:
         CompileError: PD613: the folder around it is not there; PD630: it holds something else.
@@ -262,7 +272,7 @@ def damaged(message: str, reason: str, *helps: str) -> CompileError:
 
 
 def many_damaged(path: Path, problems: list[str]) -> CompileError:
-    """PD630, one for each problem; of very many the first ones."""
+    """PD630, one for each problem, 20 at most."""
     return CompileError(
         [Diagnostic("PD630", f"{path} is damaged", Label(None), notes=(one,)) for one in problems[:20]]
     )
@@ -272,9 +282,9 @@ FINGERPRINTS = ("task_fingerprint", "ruleset_fingerprint")
 
 
 def differences(old: Recipe, new: Recipe) -> list[str]:
-    """Where two recipes differ, with both values. An unknown fingerprint differs from none.
+    """The differences of two recipes, with both values. An unknown fingerprint differs from none.
 
-    Rules that differ in their name alone are the same: names say what is loaded, which they once did not.
+    Rules that differ in their name alone are the same: older names did not list all loaded packs.
     """
     found = []
     for one in fields(Recipe):
@@ -296,13 +306,87 @@ _TOP = {
 }
 
 
+def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
+    """Raises ValueError if a value is not an integer from `least` to `most`."""
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ValueError(f"{name} must be an integer from {least} to {most}, found {value!r}")
+
+
+def recipe_of(
+    env: TensorEnv,
+    *,
+    policy: str = "random",
+    episodes: int = 1,
+    seed: int = 0,
+    compress: bool = False,
+    shard: int | None = None,
+) -> Recipe:
+    """What is recorded of an environment's task, split, rules and observations. `shard` as in `record`.
+
+    Raises:
+        ValueError: a shard may become too large.
+    """
+    task, ruleset = env.task, env.task.ruleset
+    names = {element.id: element.qualified for element in ruleset.elements}
+    names |= {BLOW: "blow", NO_CHANGE: "nothing"}
+    recipe = Recipe(
+        task=task.name,
+        split=env.split,
+        knobs={knob.name: knob.value for knob in task.knobs},
+        params={param.name: float(param.default) for param in ruleset.params},
+        task_fingerprint=fingerprint(task),
+        ruleset=ruleset.name,
+        ruleset_fingerprint=fingerprint(ruleset),
+        powderdsl=sys.modules["powderdsl"].__version__,
+        policy=policy,
+        seed=seed,
+        worlds=env.worlds,
+        episodes=episodes,
+        shard=1,
+        compress=compress,
+        observation=env.observation.kind,
+        channels=tuple(env.observation.channels),
+        shape=tuple(int(one) for one in env.observation.space.shape),
+        palette={str(element.id): element.qualified for element in ruleset.elements},
+        action_nvec=env.action_nvec,
+        choices=tuple(names[choice] for choice in task.agent.choices),
+        actions=env.actions,
+        last_action="terminates" if env.last_action_terminates else "truncates",
+    )
+    return replace(recipe, shard=_shard_size(recipe, shard))
+
+
+def _shard_size(recipe: Recipe, given: int | None) -> int:
+    """Episodes a shard. Raises ValueError if they may not fit into one."""
+    each = episode_bytes(recipe)
+    if given is None:
+        size = USUAL_SHARD
+        while size > 1 and size * each > USUAL_SHARD_BYTES:
+            size //= 2
+        size = max(size, -(-recipe.episodes // MAX_SHARDS))
+    else:
+        check_count("shard", given, MAX_EPISODES)
+        size = given
+    if size * each > MAX_SHARD_BYTES:
+        raise ValueError(
+            f"a shard of {size} episodes may take {size * each:,} bytes, more than {MAX_SHARD_BYTES:,}: "
+            "record fewer episodes a shard, or shorter ones with max_episode_steps"
+        )
+    if -(-recipe.episodes // size) > MAX_SHARDS:
+        raise ValueError(
+            f"{recipe.episodes:,} episodes in shards of {size} are more than {MAX_SHARDS:,} shards: "
+            f"record at least {-(-recipe.episodes // MAX_SHARDS)} episodes a shard"
+        )
+    return size
+
+
 def episode_bytes(recipe: Recipe) -> int:
     """Bytes that the arrays of an episode take, at most."""
     return (recipe.actions + 1) * (prod(recipe.shape) + 32)
 
 
 def _misfits(recipe: Recipe) -> list[str]:
-    """What does not fit together."""
+    """Contradictions between the values of a recipe."""
     found = []
     if len(recipe.channels) != recipe.shape[0]:
         found.append(f"{len(recipe.channels)} channels, but observations of the shape {list(recipe.shape)}")
@@ -316,7 +400,7 @@ def _misfits(recipe: Recipe) -> list[str]:
 
 
 def _rows(recipe: Recipe, data: list[Any], problems: list[str]) -> list[ShardRow]:
-    """The rows of shards, ascending; what is wrong is added to `problems`."""
+    """The rows of shards, ascending; problems are added to `problems`."""
     rows: dict[int, ShardRow] = {}
     rules = _rules_of(ShardRow)
     for place, one in enumerate(data):

@@ -1,4 +1,4 @@
-"""Recording episodes of a task. What is recorded follows from the recipe alone: see `Recipe`."""
+"""Recording episodes of a task. The recipe alone decides the data: see `Recipe`."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ from torch import Tensor
 from powderdsl.datasets.dataset import Dataset
 from powderdsl.datasets.manifest import (
     FILE,
+    KINDS,
     MAX_EPISODES,
     Manifest,
     Recipe,
+    check_count,
     check_place,
     differences,
     episode_bytes,
     new_manifest,
     read_manifest,
+    recipe_of,
     write_manifest,
 )
-from powderdsl.datasets.recipes import KINDS, check_count, recipe_of
 from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
 from powderdsl.envs.acting import Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
@@ -38,10 +40,10 @@ from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
 
 Array = NDArray[Any]
 Progress = Callable[[float, int], None]
-"""Is told how many episodes have been played, those under way as fractions, and how many there will be."""
+"""Called with the number of episodes played, unfinished ones as fractions, and the number of all."""
 
 PLAYING_BYTES = 1 << 30
-"""Of the episodes that are being played, at most."""
+"""Memory limit for the episodes that are being played."""
 
 
 def nothing_policy(program: TaskProgram) -> Policy:
@@ -140,7 +142,7 @@ def record(
 
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
-    """The folder, there and ours alone."""
+    """Make the folder and lock it."""
     check_place(folder)
     try:
         folder.mkdir(exist_ok=True)
@@ -151,7 +153,7 @@ def _held(folder: Path) -> Iterator[None]:
 
 
 def _begun(folder: Path, recipe: Recipe) -> Manifest:
-    """The manifest to continue with: a new one, or that of the same recipe with the shards that are whole."""
+    """The manifest to continue with: a new one, or the one of the same recipe with its intact shards."""
     for left in sorted([*folder.glob(".shard-*.npz"), *folder.glob(".dataset-*.json")]):
         left.unlink(missing_ok=True)  # of a process that was killed
     if not (folder / FILE).exists():

@@ -36,7 +36,7 @@ DTYPES = {
     "world": "<i8",
 }
 LEVEL = 1
-"""Of deflate. Higher levels take three to five times as long for a quarter less."""
+"""Compression level of deflate. Higher levels take three to five times as long for a quarter less."""
 
 
 def row_shape(recipe: Recipe, name: str) -> tuple[int, ...]:
@@ -91,7 +91,7 @@ class Shard:
 
     arrays: dict[str, Array]
     loaded: int
-    """Bytes of these arrays that are in memory, and not mapped."""
+    """Bytes of these arrays that are in memory rather than mapped."""
 
     @cached_property
     def starts(self) -> Array:
@@ -101,7 +101,7 @@ class Shard:
 
 
 def is_whole(folder: Path, row: ShardRow) -> bool:
-    """Whether a shard's file is there, and what the manifest says it is."""
+    """Whether a shard's file exists and has the size and digest of the manifest."""
     try:
         with open_regular(folder / row.file) as file:
             if os.fstat(file.fileno()).st_size != row.bytes:
@@ -112,7 +112,7 @@ def is_whole(folder: Path, row: ShardRow) -> bool:
 
 
 def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
-    """A shard, after looking at every byte of it once.
+    """A shard, after checking every byte of it.
 
     Raises:
         CompileError: PD630, naming the shard and what is wrong with it.
@@ -139,7 +139,7 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
 
 
 class _Wrong(Exception):
-    """What is wrong with a shard."""
+    """A defect of a shard."""
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]]) -> Shard:

@@ -1,6 +1,6 @@
-"""The backend `auto` on the CPU: arrays at once, native code as soon as it is there. Both give the same worlds, bit for bit.
+"""The backend `auto` on the CPU: it starts on arrays and switches to native code. Both give the same worlds, bit for bit.
 
-Code that was compiled before is loaded when the program is made. Otherwise arrays run, and once the work done and asked
+Code that was compiled before is loaded when the program is made. Otherwise arrays run; once the work done and asked
 for is worth it, a thread compiles in the background. The change comes between two steps: long calls are cut into slices
 for it. Short scripts never start a compiler.
 """
@@ -20,15 +20,15 @@ from powderdsl.targets.job import Job, Runnable
 from powderdsl.targets.profiling import profile_of
 
 WORTH = 2.0
-"""Seconds of arrays, done or still to come in the call that runs, from which native code is compiled. Compiling takes
-longer than that, but on a processor of its own, and only once: what comes out is kept."""
+"""Native code is compiled once work on arrays, done or expected in the current call, exceeds this many seconds.
+Compiling takes longer, but runs in another thread, and its result is cached."""
 
 SLICE = 0.25
-"""Seconds of arrays between two looks at whether native code is there."""
+"""Seconds on arrays between two checks for native code."""
 
 
 class Build:
-    """Native code on its way, in a thread that waits for the compiler and ends with the process."""
+    """Native code being compiled, in a thread that waits for the compiler and ends with the process."""
 
     def __init__(self, make: Callable[[], Runnable]):
         self._make = make
@@ -50,17 +50,17 @@ class Build:
 
     @property
     def seconds(self) -> float:
-        """How long it took, or has taken so far."""
+        """How long the build took, or has taken so far."""
         return time.perf_counter() - self._began if self._took is None else self._took
 
     @property
     def lost(self) -> bool:
-        """Whether nothing will come of it: a fork has its parent's memory, but not its threads."""
+        """Whether the build's thread is gone: a fork has its parent's memory, but not its threads."""
         return self._took is None and not self._thread.is_alive()
 
 
 class AutoProgram:
-    """Arrays until native code is there.
+    """Runs on arrays until native code has been compiled.
 
     Args:
         arrays: gives the program on arrays, the same at each call.
@@ -94,7 +94,7 @@ class AutoProgram:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What ran, and why, in sentences for people."""
+        """Sentences about which backend ran, and why."""
         native, steps, build = self._arrived(), self._steps, self._build
         found = []
         if native is not None and build is None:
@@ -139,11 +139,11 @@ class AutoProgram:
                 return state
 
     def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps`, of what runs now."""
+        """Seconds by pass over `job.steps` on the backend that runs now."""
         return profile_of(self._arrived() or self._arrays(), job)
 
     def _slice(self, job: Job, left: int) -> int:
-        """How many steps to make on arrays before looking again: one while nobody knows how long they take."""
+        """The number of steps to run on arrays before the next check: one until their speed is known."""
         if self._problem:
             return left
         cells = job.state["element"].numel()
@@ -152,13 +152,13 @@ class AutoProgram:
         return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
 
     def _account(self, job: Job, count: int, left: int, seconds: float) -> None:
-        """Take note of steps made on arrays, and begin to compile if that has become worth it."""
+        """Count steps that ran on arrays, and start to compile once that is worth it."""
         if count == 0:
             return
         self._steps["arrays"] += count
         self._spent += seconds
         cells = job.state["element"].numel()
-        # The first step makes what later ones use again: how long it takes says nothing of them.
+        # The first step makes what later ones reuse: its duration does not predict theirs.
         first = self._pace is None or self._pace[0] != cells
         self._pace = (cells, seconds / count)
         expected = 0.0 if first else left * self._pace[1]
@@ -166,7 +166,7 @@ class AutoProgram:
             self._begin()
 
     def _begin(self) -> None:
-        """Start to compile, unless that has been done. Threads that come at the same time do not wait."""
+        """Start to compile, unless a build has started. Concurrent callers do not wait."""
         if self._problem or not self._beginning.acquire(blocking=False):
             return
         try:
@@ -176,7 +176,7 @@ class AutoProgram:
             self._beginning.release()
 
     def _arrived(self) -> Runnable | None:
-        """The native program if it is there."""
+        """The native program, or None until it has been compiled."""
         build = self._build
         if self._native is None and build is not None:
             self._native, self._problem = build.program, build.problem or self._problem

@@ -18,13 +18,13 @@ Array = Any
 """A NumPy array or a torch tensor. Torch is imported only once a tensor is given."""
 
 MOTION_COLOR = (200, 100, 100)
-"""What a cell is tinted toward where its motion is not 0."""
+"""The color toward which moving cells are tinted."""
 
 MAX_TINT = 0.5
-"""The tint at speed 1 and above; slower cells are tinted in proportion."""
+"""The weight of the tint at speed 1 and above; slower cells are tinted in proportion."""
 
 OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
-"""Colors of regions, in their order in the file; of more than four the first comes again."""
+"""Colors of regions, in their order in the file; they repeat after the fourth."""
 
 Colors = Sequence[str] | NDArray[np.uint8]
 """Colors by element id: ``#RRGGBB`` each, or uint8 [n, 3]."""
@@ -75,7 +75,7 @@ def _steps(ramp: ColorRamp) -> tuple[NDArray[Any], NDArray[np.uint8]]:
 
 
 def _first_values(change: int, ramp: ColorRamp) -> list[int | np.float32]:
-    """The first values, as the field can hold them, at which a channel has changed by 1, 2, … to `change`.
+    """The first values, as the field stores them, at which a channel has changed by 1, 2, … to `change`.
 
     In proportion that is so far along the range: (j - 1/2) / |change|. What falls by more than a half is rounded down.
     """
@@ -196,7 +196,7 @@ def outline(
 
 
 def to_numpy(image: Array) -> NDArray[Any]:
-    """An array or tensor, wherever it is, as a NumPy array."""
+    """An array, or a tensor on any device, as a NumPy array."""
     return image.detach().cpu().numpy() if _is_tensor(image) else np.asarray(image)
 
 

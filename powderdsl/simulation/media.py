@@ -1,4 +1,4 @@
-"""Pictures and animations on disk: PNG, GIF, MP4. Frames are uint8 [H, W, 3]. Files appear whole or not."""
+"""Pictures and animations on disk: PNG, GIF, MP4. Frames are uint8 [H, W, 3]. Files are written whole or not at all."""
 
 from __future__ import annotations
 

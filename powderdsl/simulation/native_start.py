@@ -1,6 +1,6 @@
-"""From a checked model to running native code: at once if the same has been compiled before, else by lowering it.
+"""From a checked model to native code: cached code if the same model has been compiled before, else by lowering it.
 
-What is remembered depends on the model, on every source file that turns models into C++, on the compiler and the
+The cache's key depends on the model, on every source file that turns models into C++, on the compiler and the
 processor. Values of parameters are inputs of a step, so they take no part.
 """
 
@@ -27,13 +27,13 @@ from powderdsl.targets.job import Runnable
 from powderdsl.targets.torch.mixed import mixed_program
 
 Lowered = Callable[[], Program]
-"""Gives a ruleset in IR; the work is done when it is first called."""
+"""Returns a ruleset in IR; the first call does the work."""
 
 SOURCES = ("compiler.py", "simulation/native_start.py", "model", "analysis", "ir", "schedule", "targets")
 
 
 def start_key(ruleset: Ruleset) -> str:
-    """What native code of a ruleset is remembered under. Raises NoCompiler if none could be made here."""
+    """The cache's key for the native code of a ruleset. Raises NoCompiler if there is no compiler."""
     compiler = find_compiler()
     params = tuple(replace(param, default=0, about="") for param in ruleset.params)
     said = fingerprint(replace(ruleset, params=params))
@@ -42,7 +42,7 @@ def start_key(ruleset: Ruleset) -> str:
 
 @lru_cache(maxsize=1)
 def generator() -> str:
-    """A hash of the source files that take part in making C++."""
+    """A hash of the source files that generate C++."""
     here = Path(__file__).resolve().parents[1]
     found = hashlib.sha256()
     for name in SOURCES:
@@ -53,13 +53,13 @@ def generator() -> str:
 
 
 def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable | None:
-    """A program that has been compiled before, None if there is none. Raises NoCompiler if none could be made."""
+    """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
     code = recall(start_key(ruleset))
     return None if code is None else _whole(code, lowered, threads)
 
 
 def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable:
-    """A program compiled unless it has been before; passes that planes cannot carry run on cells.
+    """A program, from the cache or compiled now; passes that do not fit bit planes run on cells.
 
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.

@@ -55,7 +55,7 @@ class ReferenceProgram:
 
 
 def find_device(name: str | torch.device) -> torch.device:
-    """The torch device of a name. Raises CompileError (PD701) if it is not there."""
+    """The torch device of a name. Raises CompileError (PD701) if it is not available."""
     try:
         device = torch.device(name)
         if device.type == "meta":
@@ -84,10 +84,10 @@ class CompiledProgram:
 
 
 def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: int = 1) -> Runnable:
-    """The program of a ruleset on a backend, for a device that is there.
+    """The program of a ruleset on a backend, for an available device.
 
     Raises:
-        CompileError: PD701 if the backend needs what is not there.
+        CompileError: PD701 if the backend is not available.
     """
     if backend == "reference":
         return ReferenceProgram(ruleset)
@@ -128,7 +128,7 @@ def _torch_program(program: Program, device: torch.device) -> Runnable:
 
 
 def _array_program(program: Program, device: torch.device) -> Runnable:
-    """On the CPU only; passes that planes cannot carry run on torch tensors."""
+    """On the CPU only; passes that do not fit bit planes run on torch tensors."""
     from powderdsl.targets.arrays.program import ArrayProgram
     from powderdsl.targets.torch.mixed import packed_program
 

@@ -5,7 +5,7 @@ All arrays are torch tensors on the simulator's device, in the storage dtypes of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import index
@@ -87,7 +87,7 @@ class World:
         return self.sim.observer.rgb(self.state, out)
 
     def compact(self, out: Tensor | None = None) -> Tensor:
-        """All that lasts, in small numbers: uint8 [B, C, H, W]; `sim.observer.compact_names` says what they are."""
+        """Everything that lasts from step to step, as bytes: uint8 [B, C, H, W]. `sim.observer.compact_names` has their names."""
         return self.sim.observer.compact(self.state, out)
 
     def planes(self, out: Tensor | None = None) -> Tensor:
@@ -121,7 +121,7 @@ class Simulator:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """For ``auto``: what ran and why, in sentences."""
+        """For ``auto``: sentences about which backend ran, and why."""
         return tuple(getattr(self._program, "notes", ()))
 
     @property
@@ -175,7 +175,7 @@ class Simulator:
         )
 
     def _fresh(self, slot: Slot, ids: Tensor) -> Tensor:
-        """A slot's tensor as new cells of these elements have it."""
+        """A slot's values in new cells of these elements."""
         if slot.name == "element":
             return ids.clone()
         prop = self.ruleset.property(slot.name)
@@ -296,9 +296,7 @@ class Simulator:
         if element is not None:
             found = self.ruleset.element(element)
             if found is None:
-                raise KeyError(
-                    f"no element `{element}`; {'; '.join(suggest(element, self.elements, 'elements'))}"
-                )
+                raise _unknown("element", element, self.elements)
             element_ids = torch.full_like(world.ids, found.id)
             world = replace(world, state=self._renewed(world.state, element_ids, mask))
         for name, value in fields.items():
@@ -345,7 +343,7 @@ class Simulator:
         steps = _count(steps, "steps")
         unknown = [name for name in passes or () if name not in self.passes]
         if unknown:
-            raise KeyError(f"no pass `{unknown[0]}`; {'; '.join(suggest(unknown[0], self.passes, 'passes'))}")
+            raise _unknown("pass", unknown[0], self.passes, "passes")
         draws = self._draws(random or {}, world)
         chosen = None if passes is None else frozenset(passes)
         clock = (world.seed, world.index, world.step)
@@ -376,7 +374,7 @@ class Simulator:
         draws = {}
         for name, value in random.items():
             if name not in bits:
-                raise KeyError(f"no stream `{name}`; {'; '.join(suggest(name, bits, 'streams'))}")
+                raise _unknown("stream", name, bits)
             tensor = self._shaped(value, f"random[{name!r}]", world.shape, False).to(torch.float64)
             if not bool(((tensor >= 0) & (tensor < 1)).all()):
                 raise ValueError(f"random[{name!r}] must lie in [0, 1)")
@@ -396,7 +394,7 @@ class Simulator:
         values = dict(self._default_params(batch))
         for name, value in params.items():
             if name not in known:
-                raise KeyError(f"no parameter `{name}`; {'; '.join(suggest(name, known, 'parameters'))}")
+                raise _unknown("parameter", name, known)
             kind = known[name].kind
             lo, hi = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
             tensor = self._tensor(value, name).to(torch.float64)
@@ -408,6 +406,10 @@ class Simulator:
                 raise ValueError(f"{name} takes integers")
             values[name] = tensor.expand(batch).clone()
         return values
+
+
+def _unknown(kind: str, name: str, known: Iterable[str], kinds: str = "") -> KeyError:
+    return KeyError(f"no {kind} `{name}`; {'; '.join(suggest(name, known, kinds or f'{kind}s'))}")
 
 
 def _where(slot: Slot, cells: Tensor, yes: Tensor, no: Tensor) -> Tensor:
@@ -438,7 +440,7 @@ def compile(
         threads: for native code, which shares a batch out among them. Torch has its own setting.
 
     Raises:
-        CompileError: PD701 if the backend or the device is not there.
+        CompileError: PD701 if the backend or the device is not available.
     """
     model = load(ruleset) if isinstance(ruleset, str) else ruleset
     if not isinstance(model, Ruleset):

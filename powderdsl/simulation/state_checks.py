@@ -1,4 +1,4 @@
-"""Whether values can be held by cells, some cells at a time: a check takes many times the memory of what it checks."""
+"""Checks of values for cells, in parts: a check takes many times the memory of what it checks."""
 
 from __future__ import annotations
 

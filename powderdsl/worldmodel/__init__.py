@@ -7,8 +7,15 @@ other: a callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
 from powderdsl.worldmodel.pairs import DataConfig, TaskWorlds, Worlds, pairs_of, task_worlds, unseen_seeds
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.scores import Score, Tested, evaluate, frequent, outcomes, score, still
-from powderdsl.worldmodel.training import PRESETS, Machine, TrainConfig, Trained, load_trained, train
-from powderdsl.worldmodel.transfer import finetuned
+from powderdsl.worldmodel.training import (
+    PRESETS,
+    Machine,
+    TrainConfig,
+    Trained,
+    finetuned,
+    load_trained,
+    train,
+)
 from powderdsl.worldmodel.unet import UNet, fresh_unet
 
 __all__ = [

@@ -56,14 +56,14 @@ class DataConfig:
     refresh: int = setting(256, low=1)
 
     def __post_init__(self) -> None:
-        """Raises ValueError for numbers that cannot be."""
+        """Raises ValueError for values out of range."""
         check_bounds(self)
         if self.states > TEST_SEEDS:
             raise ValueError(f"states must be at most {TEST_SEEDS:,}: tests begin there")
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> DataConfig:
-        """From what JSON gave back. Raises TypeError, ValueError."""
+        """The configuration in a run's JSON. Raises TypeError, ValueError."""
         variety = Variety.of(values.get("variety", {}))
         return DataConfig(**{**values, "only": tuple(values.get("only", ())), "variety": variety})
 

@@ -22,7 +22,7 @@ TOGETHER = 1 << 20
 STORES = ("auto", "memory", "disk")
 
 _BATCH, _FIRST = 0x57A7, 0x0FF5
-"""Which hashes: those that choose a batch, and the one that chooses the first world."""
+"""The numbers of the hashes that choose batches and the first world."""
 
 
 class Replay:
@@ -61,7 +61,7 @@ class Replay:
         self._live: HasIds | None = None
 
     def go_to(self, iteration: int) -> None:
-        """Make the buffer as it is before an iteration, counted from 0, whatever it was."""
+        """Make the buffer's contents before an iteration, counted from 0."""
         config = self.config
         back = -(-self.size // config.refresh)  # what older iterations brought has been overwritten
         begin = max(0, iteration - back) // config.pairs * config.pairs
@@ -72,7 +72,7 @@ class Replay:
             self.advance()
 
     def advance(self) -> None:
-        """On to the next iteration: `refresh` worlds continue by some steps, and their pairs replace the oldest."""
+        """Go to the next iteration: `refresh` worlds continue by some steps, and their pairs replace the oldest."""
         if self.iteration < 0:
             raise ValueError("the buffer is empty: `go_to` fills it")
         if not self.all_fit:
@@ -95,7 +95,7 @@ class Replay:
         return self.starts[chosen].to(self.device), self.ends[chosen].to(self.device)
 
     def close(self) -> None:
-        """Remove what lies on disk."""
+        """Delete the files."""
         del self.starts, self.ends
         for path in self._files:
             path.unlink(missing_ok=True)
@@ -121,7 +121,7 @@ class Replay:
     def _write(self, place: Tensor, pair: Pairs) -> None:
         place = place.to(self.starts.device)
         for room, ids in zip((self.starts, self.ends), pair, strict=True):
-            # Where one iteration brings more than there is room for, the newest stay.
+            # If one iteration brings more pairs than fit, the newest stay.
             kept = slice(max(0, len(place) - self.size), None)
             room[place[kept]] = ids[kept].to(room.device)
 

@@ -1,4 +1,4 @@
-"""What stands for rules on the command line, with packs added and left out: ``ruleset-pack+pack``."""
+"""Rules as written on the command line, with packs added and left out: ``ruleset-pack+pack``."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def keep(rules: str, packs: Sequence[str]) -> str:
 
 
 def _known(rules: str) -> tuple[str, ...]:
-    """The packs that rules name, those that are left out among them."""
+    """The packs that rules name, including those that are left out."""
     return _names_of(*split_names(rules)[0])
 
 

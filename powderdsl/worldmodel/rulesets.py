@@ -26,7 +26,7 @@ from powderdsl.tasks.task import Task
 from powderdsl.worldmodel.watched import SplitWorlds, watched
 
 TRIES = 8
-"""How often a swap or a selection of packs is drawn again where the rules would contradict themselves."""
+"""How often a swap or a selection of packs is drawn again if the rules are inconsistent."""
 
 MAX_RULESETS = 1024
 """Each is checked before the first step, and each structure compiled."""
@@ -35,7 +35,7 @@ UNSEEN_RULESETS = 1 << 32
 """The first number of rulesets that models are tested on. Training takes numbers below it."""
 
 _DRAW = 0x9F1D
-"""Which hash: the one that rulesets are drawn by."""
+"""The number of the hash by which rulesets are drawn."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Variety:
     leave_out: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raises ValueError for numbers that cannot be."""
+        """Raises ValueError for values out of range."""
         if not 1 <= self.chances <= 1e6:
             raise ValueError(f"chances is a factor from 1 to 1,000,000, found {self.chances}")
         if not 0 <= self.leave_out < 1:
@@ -60,7 +60,7 @@ class Variety:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> Variety:
-        """From what JSON gave back. Raises TypeError, ValueError."""
+        """The configuration in a run's JSON. Raises TypeError, ValueError."""
         return Variety(**{**values, "swaps": tuple(values.get("swaps", ()))})
 
 
@@ -75,7 +75,7 @@ class Drawn:
 
     @property
     def structure(self) -> tuple[Any, ...]:
-        """What has to be compiled; parameters are given to each world of a batch."""
+        """What decides the compiled code; parameters are inputs of each world."""
         return self.left_out, self.swapped
 
 
@@ -269,7 +269,7 @@ class VariedWorlds(SplitWorlds):
 
     def _program(self, drawn: Drawn) -> TaskProgram:
         if drawn.structure not in self._programs:
-            # A world that needs what was left out is another world here: rules with packs left out draw from what is there.
+            # Rules without some packs draw from the remaining elements; worlds that need others are replaced.
             found = watched(self._task, self.split, self.source.model(drawn), self.only, partly=True)
             self._programs[drawn.structure] = compile_task(found.task, split=self.split, **self._machine)
         return self._programs[drawn.structure]

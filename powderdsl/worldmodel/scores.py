@@ -67,7 +67,7 @@ class Score:
 
 
 def score(predict: Network, pairs: Iterable[Pairs], slots: int) -> Score:
-    """What a network, or any callable from ids to logits [B, slots, H, W], makes of some pairs."""
+    """The score of a network, or of any callable from ids to logits [B, slots, H, W], on some pairs."""
     total = Score(0.0, torch.zeros(slots, slots, dtype=torch.int64), 0, 0)
     for starts, ends in pairs:
         few = max(1, TOGETHER // (starts.shape[1] * starts.shape[2]))
@@ -138,7 +138,7 @@ def frequent(counts: Tensor, ids: Sequence[int]) -> Table:
 
 @dataclass(frozen=True)
 class Tested:
-    """What was tested on: names of worlds, each with its score by predictor; `missing` says which could not be."""
+    """The results of a test: by world, the score of each predictor; `missing` has the worlds that could not be tested."""
 
     rules: str
     task: str

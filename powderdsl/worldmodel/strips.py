@@ -1,4 +1,4 @@
-"""What was, what came, what was predicted, and where that was wrong: a row of pictures for each test."""
+"""A row of pictures for each test: start, end, prediction and its errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from powderdsl.worldmodel.rulesets import VariedWorlds
 from powderdsl.worldmodel.training import Network
 
 RIGHT, WRONG = (235, 235, 235), (200, 30, 30)
-"""Colors of cells that were predicted as they came, and of others."""
+"""Colors of cells that were predicted correctly, and of others."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Strip:
 
     @property
     def wrong(self) -> int:
-        """How many cells were predicted wrongly."""
+        """The number of cells that were predicted wrongly."""
         return int((self.truth != self.predicted).sum())
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
 from powderdsl.worldmodel.replay import Replay
+from powderdsl.worldmodel.rule_words import add, pack_names
 from powderdsl.worldmodel.unet import UNet, fresh_unet
 
 KIND = "worldmodel"
@@ -48,7 +49,7 @@ Network = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """All that decides which weights come out (on one kind of device). The defaults are the paper's.
+    """Everything that decides the weights (on one kind of device). The defaults are the paper's.
 
     `parent` is the name of the checkpoint that a fine-tuned network starts from; without it weights are random.
     `palette` has the qualified name of the element of each of the network's slots, or None; empty: those of the task's
@@ -66,7 +67,7 @@ class TrainConfig:
     palette: tuple[str | None, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raises ValueError for numbers that cannot be."""
+        """Raises ValueError for values out of range."""
         check_bounds(self)
         if not 0 < self.learning_rate < float("inf"):
             raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
@@ -75,7 +76,7 @@ class TrainConfig:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
-        """From what JSON gave back; what belongs to the run besides is left out. Raises TypeError, ValueError."""
+        """The configuration in a run's JSON, without the run's other settings. Raises TypeError, ValueError."""
         own = {one.name: values[one.name] for one in fields(TrainConfig) if one.name in values}
         return TrainConfig(**{**own, "data": DataConfig.of(own["data"]), "palette": ()})
 
@@ -93,7 +94,7 @@ PRESETS = {"paper": PAPER, "small": SMALL}
 
 @dataclass(frozen=True)
 class Machine:
-    """Where a run is computed. It takes no part in what a run is: one may continue elsewhere.
+    """Where a run is computed. A run may continue on another machine.
 
     `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`.
     """
@@ -106,7 +107,7 @@ class Machine:
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """What `task_worlds` is given of it."""
+        """The settings that `task_worlds` takes."""
         return {"device": self.device, "threads": self.threads, "backend": self.backend}
 
 
@@ -369,7 +370,7 @@ def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Trained:
-    """A network out of a run: what it was trained on, and its slots."""
+    """A network from a run, with its configuration and its slots."""
 
     run: RunFolder
     config: TrainConfig
@@ -413,10 +414,43 @@ def _check_size(
 
 
 def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:
-    """What to raise where the loss is no longer finite (PD624)."""
+    """The error for a loss that is no longer finite (PD624)."""
     return failure(
         "PD624",
         f"the loss is no longer finite after {done:,} iterations",
         notes=(f"in {folder}",),
         helps=(f"choose a smaller learning rate than {learning_rate:g}",),
     )
+
+
+# Transfer: packs that a network has not seen are added to its rules, and it continues from its weights
+
+SIMPLER = "kinds"
+"""The knob that says how many elements are drawn: other packs' elements come after all of these."""
+
+
+def finetuned(
+    trained: Trained, packs: Sequence[str], *, iterations: int = 100, **changes: Any
+) -> TrainConfig:
+    """The configuration that continues from a network, on worlds in which elements of `packs` alone are drawn.
+
+    The rules are those of the run with the packs added. Elements that the network knows keep their slots; others get
+    its free slots, and where none are left the network grows. A knob for the number of elements is left at its default,
+    for its list may end before the packs' elements. Rulesets are not varied.
+
+    Args:
+        packs: names of shipped packs or of packs that the run left out, or files.
+        changes: other fields of `TrainConfig`.
+
+    Raises:
+        CompileError: what `load` raises.
+    """
+    config = trained.config
+    data = config.data
+    own = data.rules or "+".join(load_task(data.task).rules)
+    rules, names = add(own, packs), pack_names(own, packs)
+    knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
+    data = replace(data, rules=rules, only=names, knobs=knobs, rulesets=0)
+    palette = extended_palette(trained.palette, load_rules_of(data, trained.palette))
+    values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
+    return replace(config, data=data, palette=palette, **values)

@@ -1,4 +1,4 @@
-"""A task as worlds to watch: under other rules, with fewer elements to draw, and nobody who acts."""
+"""A task as worlds without an agent: under other rules, and with fewer elements to draw."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from powderdsl.diagnostics import CompileError, Reporter, Span
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
-from powderdsl.tasks.task import NO_CHANGE, Drawing, Generator, Goal, Group, Split, Stamp, Task
+from powderdsl.tasks.task import NO_CHANGE, Drawing, Generator, Goal, Split, Stamp, Task
 
 NOTHING = 255
 """In stamps: leave the cell as it is."""
@@ -28,7 +28,7 @@ class Watched:
 
 
 class SplitWorlds:
-    """What is known of the worlds of a task's split under some rules before any of them starts."""
+    """The worlds of a task's split under some rules, before any of them starts."""
 
     def __init__(self, found: Watched, device: torch.device):
         self.found = found
@@ -64,7 +64,7 @@ def watched(
     given = task.split(split)
     kept, missing = [], []
     for variant in given.variants:
-        narrowing = _Narrowing(task.ruleset, rules, frozenset(only))
+        narrowing = _Narrowing(task.ruleset, rules, only)
         found = narrowing.generator(variant)
         if narrowing.missing:
             missing.append((variant.name, tuple(dict.fromkeys(narrowing.missing)), narrowing.span))
@@ -79,40 +79,32 @@ def watched(
 
 
 class _Narrowing:
-    """Generators with the ids of other rules. What is missing there is collected."""
+    """Generators with the ids of other rules. Names of elements that these rules lack are collected."""
 
-    def __init__(self, own: Ruleset, rules: Ruleset, only: frozenset[str]):
-        self.ids = {
-            element.id: other.id
-            for element in own.elements
-            if (other := rules.element(element.qualified)) is not None
-        }
+    def __init__(self, own: Ruleset, rules: Ruleset, only: Collection[str]):
+        others = {element.id: rules.element(element.qualified) for element in own.elements}
+        self.ids = {number: other.id for number, other in others.items() if other is not None}
         self.names = {element.id: element.name for element in own.elements}
-        only = only & {element.pack for element in rules.elements}
-        self.drawn = {
-            element.id
-            for element in own.elements
-            if element.id in self.ids and (not only or element.pack in only)
-        }
+        packs = {element.pack for element in rules.elements}
+        chosen = (packs & {*only}) or packs
+        self.drawn = {one.id for one in own.elements if one.id in self.ids and one.pack in chosen}
         self.added = tuple(
-            element.id
-            for element in rules.elements
-            if element.pack not in own.packs and (not only or element.pack in only)
+            one.id for one in rules.elements if one.pack not in own.packs and one.pack in chosen
         )
         self.missing: list[str] = []
         self.span: Span | None = None
 
     def generator(self, given: Generator) -> Generator:
+        drawn = {drawing.stamp for group in given.groups for drawing in group.drawings}
         return replace(
             given,
-            fill=self.id(given.fill, None),
-            groups=tuple(self.group(group) for group in given.groups),
-            stamps=tuple(self.stamp(one) for one in given.stamps if one.name in _stamps_of(given)),
+            fill=self.id(given.fill),
+            groups=tuple(
+                replace(group, drawings=tuple(map(self.drawing, group.drawings))) for group in given.groups
+            ),
+            stamps=tuple(self.stamp(one) for one in given.stamps if one.name in drawn),
             targets=(),
         )
-
-    def group(self, group: Group) -> Group:
-        return replace(group, drawings=tuple(self.drawing(one) for one in group.drawings))
 
     def drawing(self, drawing: Drawing) -> Drawing:
         if len(drawing.ids) > 1:
@@ -127,12 +119,10 @@ class _Narrowing:
         return replace(drawing, ids=ids, over=over)
 
     def stamp(self, stamp: Stamp) -> Stamp:
-        rows = tuple(
-            tuple(one if one == NOTHING else self.id(one, None) for one in row) for row in stamp.rows
-        )
+        rows = tuple(tuple(one if one == NOTHING else self.id(one) for one in row) for row in stamp.rows)
         return replace(stamp, rows=rows)
 
-    def id(self, one: int, span: Span | None) -> int:
+    def id(self, one: int, span: Span | None = None) -> int:
         if one not in self.ids:
             self.lack((one,), span)
         return self.ids.get(one, 0)
@@ -140,10 +130,6 @@ class _Narrowing:
     def lack(self, ids: Sequence[int], span: Span | None) -> None:
         self.missing += [self.names[one] for one in ids]
         self.span = self.span or span
-
-
-def _stamps_of(given: Generator) -> set[str | None]:
-    return {drawing.stamp for group in given.groups for drawing in group.drawings}
 
 
 def _lacking(

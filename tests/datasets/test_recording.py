@@ -13,8 +13,7 @@ from filelock import FileLock
 from torch import Tensor
 
 from powderdsl.datasets import Dataset, record
-from powderdsl.datasets.manifest import MAX_SHARDS, read_manifest
-from powderdsl.datasets.recipes import recipe_of
+from powderdsl.datasets.manifest import MAX_SHARDS, read_manifest, recipe_of
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
 from powderdsl.envs.acting import action_keys, random_policy

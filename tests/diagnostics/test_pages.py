@@ -33,7 +33,7 @@ from powderdsl.diagnostics.explain import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.experiments.runs import does_not_fit, find_run, open_run
 from powderdsl.experiments.studies.file import load_study
-from powderdsl.experiments.studies.paths import TEXT
+from powderdsl.experiments.studies.study import TEXT
 from powderdsl.rl import preset
 from powderdsl.system.writing import replacing
 from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics

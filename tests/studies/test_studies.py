@@ -11,12 +11,18 @@ import pytest
 
 from powderdsl.cli.commands.study import commands
 from powderdsl.diagnostics import CompileError, Reporter, Source
-from powderdsl.experiments.studies.figure import write_figure
 from powderdsl.experiments.studies.file import load_study, read_study, shipped_studies
-from powderdsl.experiments.studies.paths import FILE, RUN_OR_TASK, TASK, TEXT
-from powderdsl.experiments.studies.results import Interval, as_data, as_markdown, findings, interval, shown
+from powderdsl.experiments.studies.results import (
+    Interval,
+    as_data,
+    as_markdown,
+    findings,
+    interval,
+    shown,
+    write_figure,
+)
 from powderdsl.experiments.studies.run import Outcome, StudyRun
-from powderdsl.experiments.studies.study import Point, Study
+from powderdsl.experiments.studies.study import FILE, RUN_OR_TASK, TASK, TEXT, Point, Study
 
 KNOWN: Mapping[tuple[str, ...], Mapping[str, str]] = {
     ("train",): {"on": TASK, **dict.fromkeys(("run", "seed", "steps", "knob"), TEXT)},

@@ -10,8 +10,8 @@ import pytest
 from powderdsl.cli.commands.study import CALLED, MEANS, commands
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.studies.file import load_study
-from powderdsl.experiments.studies.paths import FILE, RULES, RUN_OR_TASK, TASK, confined
 from powderdsl.experiments.studies.run import StudyRun
+from powderdsl.experiments.studies.study import FILE, RULES, RUN_OR_TASK, TASK, confined
 from tests.cli.commands import powderdsl
 
 STUDY = """

@@ -18,9 +18,19 @@ from powderdsl.cli.output import counted, progress
 from powderdsl.cli.study.checks import check_study
 from powderdsl.diagnostics.printable import printable
 from powderdsl.experiments.studies.file import load_study, shipped_studies
-from powderdsl.experiments.studies.paths import FILE, FLAG, RULES, RUN, RUN_OR_TASK, TASK, TEXT
 from powderdsl.experiments.studies.run import Outcome, StudyRun
-from powderdsl.experiments.studies.study import SIZES, Point, Study
+from powderdsl.experiments.studies.study import (
+    FILE,
+    FLAG,
+    RULES,
+    RUN,
+    RUN_OR_TASK,
+    SIZES,
+    TASK,
+    TEXT,
+    Point,
+    Study,
+)
 
 CALLED: tuple[tuple[str, ...], ...] = (
     ("train",),
@@ -152,8 +162,7 @@ def _with_progress(run: StudyRun, points: list[Point], jobs: int) -> list[Outcom
 
 def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> None:
     from powderdsl.experiments.runs.folder import write_json
-    from powderdsl.experiments.studies.figure import write_figure
-    from powderdsl.experiments.studies.results import as_data, as_markdown
+    from powderdsl.experiments.studies.results import as_data, as_markdown, write_figure
     from powderdsl.system.writing import write_text
 
     text = printable(as_markdown(study, size, outcomes), lines=True)  # somebody will `cat` it

@@ -150,8 +150,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 
     RUN is a run's folder, or its name in runs/. The result is a new run.
     """
-    from powderdsl.worldmodel.training import load_trained
-    from powderdsl.worldmodel.transfer import finetuned
+    from powderdsl.worldmodel.training import finetuned, load_trained
 
     if not packs:
         raise BadInput("--packs names what is to be learned")

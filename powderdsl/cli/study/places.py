@@ -12,8 +12,7 @@ from typing import Any
 import click
 
 from powderdsl.diagnostics import CompileError, Label, Reporter, Span
-from powderdsl.experiments.studies.paths import TEXT, confined
-from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, Study, StudyStep, maker
+from powderdsl.experiments.studies.study import SEED, SIZE, SIZES, TEXT, Study, StudyStep, confined, maker
 
 Values = Mapping[str, str]
 """The value of each name."""

@@ -1,4 +1,4 @@
-"""Run folders: what a training run is, how far it got, and what it measured. Whatever a kill leaves behind can be read."""
+"""Run folders: what a training run is, how far it got, and what it measured. A killed process leaves a readable folder."""
 
 from powderdsl.experiments.runs.checkpoints import Checkpoint
 from powderdsl.experiments.runs.folder import RunFolder, does_not_fit, find_run, no_run, open_run, read_run

@@ -1,4 +1,4 @@
-"""Checkpoints: files that are there whole or not at all, and carry their own digest in their names."""
+"""Checkpoints: files that are written whole or not at all, with their digest in their names."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _named(folder: Path) -> list[tuple[int, str, Path]]:
 
 
 def _sync(folder: Path) -> None:
-    """Make the new name last: without it, a power cut may leave the old one."""
+    """Make a new name durable: without this, a power cut may undo it."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # some file systems cannot

@@ -1,4 +1,4 @@
-"""A run's folder: `run.json` says what it is; checkpoints and metrics how far it got."""
+"""A run's folder: `run.json` describes the run; checkpoints and metrics have its progress."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ABOUT = "run.json"
 FORMAT = 2
 FIRST_FORMAT = 1
 FINGERPRINTS = ("rules_fingerprint", "task_fingerprint", "worlds")
-"""Settings that are hashes of what files said."""
+"""Settings that are hashes of files."""
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
 
 
@@ -56,11 +56,11 @@ class RunFolder:
             yield
 
     def latest_checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint | None:
-        """The newest checkpoint that is whole; None if there is none."""
+        """The newest intact checkpoint, or None."""
         return latest_checkpoint(self.path / "checkpoints", device)
 
     def checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint:
-        """The same, for those who need one. Raises CompileError (PD620)."""
+        """The newest intact checkpoint. Raises CompileError (PD620) if there is none."""
         found = self.latest_checkpoint(device)
         if found is None:
             raise no_run(self.path, "it has no checkpoint that can be read")
@@ -86,7 +86,7 @@ class RunFolder:
 def open_run(
     path: str | Path, kind: str, config: Mapping[str, Any], *, note: Mapping[str, Any] | None = None
 ) -> RunFolder:
-    """Begin a run, or come back to it with the same configuration.
+    """Begin a run, or resume it with the same configuration.
 
     Args:
         config: what JSON can hold. note: more to keep in ``run.json``, which takes no part in the comparison.
@@ -123,7 +123,7 @@ def open_run(
 
 @contextmanager
 def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
-    """Keep other processes from writing to a folder. What killed ones have left there is removed.
+    """Keep other processes from writing to a folder. Leftovers of killed processes are deleted.
 
     Args:
         patience: seconds to wait for another process.
@@ -173,7 +173,7 @@ def new_folder(folder: Path) -> None:
 
 
 def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
-    """A run that is there already.
+    """An existing run.
 
     Raises:
         CompileError: PD620 if there is none, it is damaged, or of another kind than `kind`.
@@ -224,7 +224,7 @@ def no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
 
 
 def versions() -> dict[str, str]:
-    """What a run's numbers may depend on: Python, the system, and packages that are installed."""
+    """Versions that a run's numbers may depend on: Python, the system, and installed packages."""
     found = {
         "powderdsl": str(sys.modules["powderdsl"].__version__),  # our own package, so it has been imported
         "python": platform.python_version(),

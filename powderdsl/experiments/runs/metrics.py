@@ -1,4 +1,4 @@
-"""What a run measures as it goes: JSON lines for programs, TensorBoard for people."""
+"""What a run measures: JSON lines for programs, TensorBoard for people."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study's file -> a checked `Study`. Everything that is wrong is reported at once."""
+"""A study's file -> a checked `Study`. All mistakes are reported at once."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from string import Template
 
 from powderdsl.compiler import shipped
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
-from powderdsl.experiments.studies.paths import FLAG, TEXT, confined
 from powderdsl.experiments.studies.study import (
     EXPECTED,
+    FLAG,
     SCALES,
     SEED,
     SIZE,
     SIZES,
+    TEXT,
     Axis,
     Measure,
     Study,
     StudyStep,
+    confined,
     filled,
     maker,
 )
@@ -115,7 +117,7 @@ class _StudyReader:
         self.set_names: list[str] = []
         self.steps: list[StudyStep] = []
         self.words: list[tuple[str, str, Span]] = []
-        """What a word of a command is, the word, and where it stands."""
+        """The meaning, text and location of each word of a command."""
         self.places: dict[tuple[str, ...], Span] = {}
 
     def study(self, tree: yaml_tree.Node, text: str) -> Study:

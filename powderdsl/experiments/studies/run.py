@@ -1,4 +1,4 @@
-"""Running a study: each point is a chain of commands in processes of their own. What is done is not done again."""
+"""Running a study: each point is a chain of commands in processes of their own. Finished steps are not repeated."""
 
 from __future__ import annotations
 
@@ -18,8 +18,17 @@ from typing import Any
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, write_json
-from powderdsl.experiments.studies.paths import FLAG, TEXT, confined
-from powderdsl.experiments.studies.study import Measure, Point, Study, StudyStep, filled, maker
+from powderdsl.experiments.studies.study import (
+    FLAG,
+    TEXT,
+    Measure,
+    Point,
+    Study,
+    StudyStep,
+    confined,
+    filled,
+    maker,
+)
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
@@ -30,7 +39,7 @@ LOG_LINES = 6
 
 @dataclass(frozen=True)
 class Outcome:
-    """A point that is finished: its measures by name, or why there are none."""
+    """A finished point: its measures by name, or the problem."""
 
     point: Point
     values: Mapping[str, float]
@@ -38,7 +47,7 @@ class Outcome:
 
 
 class Canceled(Exception):
-    """Somebody asked to stop."""
+    """The study was stopped."""
 
 
 class StudyRun:
@@ -53,10 +62,10 @@ class StudyRun:
         self._stopped = threading.Event()
         self._running: set[subprocess.Popen[bytes]] = set()
         self._starting = threading.Lock()
-        """Held while a process is started or all are ended: none slips through in between."""
+        """Held while a process is started or all are ended, so that none escapes."""
 
     def prepare(self) -> None:
-        """Make the folder, or come back to it. Values, seeds and measures may have changed since, but no step.
+        """Make the folder, or resume in it. Values, seeds and measures may have changed, but no step.
 
         Raises:
             CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
@@ -86,7 +95,7 @@ class StudyRun:
     def run(
         self, points: Sequence[Point], jobs: int, told: Callable[[Outcome], None] | None = None
     ) -> list[Outcome]:
-        """Bring points to their end, `jobs` at a time. Signals end all processes; the same call resumes them.
+        """Run points to their end, `jobs` at a time. Signals end all processes; the same call resumes them.
 
         Raises:
             CompileError: PD622 if another process runs a study in this folder.
@@ -110,7 +119,7 @@ class StudyRun:
         return sorted(done, key=lambda outcome: order[outcome.point])
 
     def _end_all(self, pool: ThreadPoolExecutor) -> None:
-        """End all processes and wait for them: they save where they are. A second signal does not wait."""
+        """End all processes and wait for them to save. A second signal does not wait."""
         self._signal(signal.SIGTERM)
         try:
             end = time.monotonic() + GRACE
@@ -185,7 +194,7 @@ class StudyRun:
             raise failure("PD112", f"the path `{word}` leaves the study's folder", notes=notes) from None
 
     def _step(self, step: StudyStep, point: Point, place: Path) -> str | None:
-        """Run a step; what went wrong, if something did."""
+        """Run a step. Returns the problem if it failed, else None."""
         if step.makes_run:
             self._wait_for_last_call(place / step.name)
         log = place / f"{step.name}.log"

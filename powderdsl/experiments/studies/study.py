@@ -1,14 +1,17 @@
-"""What a study is, once checked."""
+"""Checked studies, and the paths that they may name."""
 
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from string import Template
 
+from powderdsl.compiler import shipped, shipped_rules
 from powderdsl.diagnostics import Span
+from powderdsl.system.reading import inside, is_path
 
 SIZES = ("small", "paper")
 EXPECTED = ("rises", "falls")
@@ -21,7 +24,7 @@ class StudyStep:
     """A call of a command: what it works on, and its options as text, in which ``$NAME`` stands for a value.
 
     `on` is the argument of the command: a step before it, whose run is meant, or text. `means` says what the argument
-    (``on``) and each option are: see `powderdsl.experiments.studies.paths`.
+    (``on``) and each option are: see `confined`.
     """
 
     name: str
@@ -114,3 +117,40 @@ def maker(steps: Mapping[str, StudyStep], name: str) -> StudyStep:
     while not step.makes_run and step.on_step:
         step = steps[str(step.on)]
     return step
+
+
+# Paths. A study comes from a file: what it names lies beside that file, and what it writes in its results
+
+TEXT, FLAG, FILE, TASK, RUN, RUN_OR_TASK, RULES = "text", "flag", "file", "task", "run", "run|task", "rules"
+"""The meaning of an argument or option of a command: text, a flag, a file to write, a task, a run, either, or rules."""
+
+
+def confined(means: str, text: str, folder: Path, results: Path) -> str:
+    """A word for a command, from what a study says.
+
+    Args:
+        means: one of the above. folder: where the study's file lies. results: where files that it names are written.
+
+    Raises:
+        ValueError: it names a path that leads out of `folder`, or of `results` for a file to write.
+    """
+    if "\0" in text:
+        raise ValueError("it has control characters")
+    if means == FILE:
+        return str(inside(results, text))
+    if means == RULES:
+        return "+".join(_pack(part, folder) for part in text.split("+"))
+    if means == RUN_OR_TASK:
+        named = not is_path(text) and (shipped("tasks") / f"{text}.yaml").is_file()
+        means = TASK if named else RUN
+    if means == RUN or (means == TASK and is_path(text)):
+        return str(inside(folder, text))
+    return text
+
+
+def _pack(text: str, folder: Path) -> str:
+    if is_path(text):
+        return str(inside(folder, text))
+    if text.split("-")[0] not in shipped_rules() and os.path.isfile(text):
+        raise ValueError("a name without `/` or `.yaml` means shipped rules, and there are none of this name")
+    return text
