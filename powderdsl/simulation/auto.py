@@ -17,7 +17,6 @@ from torch import Tensor
 
 from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
 from powderdsl.targets.job import Job, Runnable
-from powderdsl.targets.profiling import profile_of
 
 WORTH = 2.0
 """Native code is compiled once work on arrays, done or expected in the current call, exceeds this many seconds.
@@ -122,6 +121,8 @@ class AutoProgram:
         if job.draws or job.passes is not None:
             self._steps["asked"] += job.steps
             return self._arrays().run(job)
+        if job.timing is not None:
+            return (self._arrived() or self._arrays()).run(job)
         seed, index, start = job.clock
         state, done = job.state, 0
         while True:
@@ -137,10 +138,6 @@ class AutoProgram:
             self._account(job, count, job.steps - done, time.perf_counter() - began)
             if done == job.steps:
                 return state
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps` on the backend that runs now."""
-        return profile_of(self._arrived() or self._arrays(), job)
 
     def _slice(self, job: Job, left: int) -> int:
         """The number of steps to run on arrays before the next check: one until their speed is known."""

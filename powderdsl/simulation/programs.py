@@ -16,7 +16,6 @@ from powderdsl.model import reference
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
 from powderdsl.targets.job import Job, Runnable
-from powderdsl.targets.profiling import PassClock, no_clock, profile_of
 
 
 class ReferenceProgram:
@@ -27,16 +26,7 @@ class ReferenceProgram:
         self._bits = {stream.name: stream.bits for stream in ruleset.streams}
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        return self._run(job, no_clock)
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps`. The first pass is charged with what a step begins with."""
-        clock = PassClock(torch.device("cpu"))
-        self._run(job, clock)
-        return clock.passes()
-
-    def _run(self, job: Job, tick: Callable[[str], None]) -> Mapping[str, Tensor]:
+        """The state `job.steps` later. The time before a step's first pass counts for that pass."""
         device = job.state["element"].device
         seed, index, start = (part.cpu().numpy() for part in job.clock)
         arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
@@ -47,9 +37,9 @@ class ReferenceProgram:
         }
         for i in range(job.steps):
             at = reference.Clock(seed, index, start + i)
-            tick("")
+            job.tick("")
             arrays = reference.step(
-                self.ruleset, arrays, at, numbers, passes=job.passes, draws=given, tick=tick
+                self.ruleset, arrays, at, numbers, passes=job.passes, draws=given, tick=job.tick
             )
         return {name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()}
 
@@ -77,10 +67,6 @@ class CompiledProgram:
         """The state `job.steps` later."""
         runnable = self._rest() if job.draws or job.passes is not None else self._native
         return runnable.run(job)
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps`, of the native code."""
-        return profile_of(self._native, job)
 
 
 def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: int = 1) -> Runnable:

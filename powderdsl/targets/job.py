@@ -8,6 +8,8 @@ from typing import Protocol
 
 from torch import Tensor
 
+from powderdsl.targets.profiling import PassClock
+
 Clock = tuple[Tensor, Tensor, Tensor]
 """Seed, world index and step of each world: int64 [B]."""
 
@@ -28,6 +30,13 @@ class Job:
     passes: frozenset[str] | None
     reuse: bool = False
     """Whether `state` may be overwritten because nothing reads it afterwards."""
+    timing: PassClock | None = None
+    """Measures the time of passes, in programs that can report it."""
+
+    def tick(self, name: str) -> None:
+        """Called by programs after each pass, and with ``""`` before the first one of a step."""
+        if self.timing is not None:
+            self.timing.tick(name)
 
 
 class Runnable(Protocol):

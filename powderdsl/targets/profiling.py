@@ -5,25 +5,32 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 
-from powderdsl.targets.job import Job
+if TYPE_CHECKING:
+    from powderdsl.targets.job import Job, Runnable
 
 
 class PassClock:
-    """A clock that is called with a name after each piece of work. Work before the first pass has the name ``""``."""
+    """Seconds by pass. Work before the first pass has the name ``""``."""
 
     def __init__(self, device: torch.device):
         self._device = device
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._last = self._now()
 
-    def __call__(self, name: str) -> None:
+    def tick(self, name: str) -> None:
+        """Count the time since the last call for a pass."""
         now = self._now()
         self._seconds[name] += now - self._last
         self._last = now
+
+    def add(self, name: str, seconds: float) -> None:
+        """Count time that a program measured itself."""
+        self._seconds[name] += seconds
 
     def passes(self) -> dict[str, float]:
         """Seconds by pass."""
@@ -36,19 +43,8 @@ class PassClock:
         return time.perf_counter()
 
 
-def no_clock(name: str) -> None:
-    """Replaces `PassClock` where time is not measured."""
-
-
-@runtime_checkable
-class Profiled(Protocol):
-    """A program that can report the time of its passes."""
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps`."""
-        ...
-
-
-def profile_of(program: object, job: Job) -> Mapping[str, float]:
+def profile_of(program: Runnable, job: Job) -> Mapping[str, float]:
     """Seconds by pass over `job.steps`; empty if a program cannot report them."""
-    return program.profile(job) if isinstance(program, Profiled) else {}
+    clock = PassClock(job.clock[0].device)
+    program.run(replace(job, timing=clock))
+    return clock.passes()

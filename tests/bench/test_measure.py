@@ -259,8 +259,8 @@ def test_profiling_runs_what_running_runs(rules, torch):
     seen = []
     program = sim._program
     job_seen = []
-    original = program._run
-    program._run = lambda job, tick: job_seen.append(original(job, tick)) or job_seen[-1]
+    original = program.run
+    program.run = lambda job: job_seen.append(original(job)) or job_seen[-1]
     sim.profile(world, 2)
     seen.append(sim.step(world, 2).ids)
     assert len(job_seen) == 2

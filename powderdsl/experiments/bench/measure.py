@@ -116,7 +116,8 @@ class _Run:
         import torch
 
         torch.set_num_threads(self.threads)
-        self.sim.profile(self.world, 1)  # what has to be compiled for it is compiled now
+        if not self.sim.profile(self.world, 1):  # what has to be compiled for it is compiled now
+            return ()
         seconds = dict.fromkeys(self.sim.passes, 0.0)
         for _ in range(self.calls):
             for name, spent in self.sim.profile(self.world, self.steps).items():

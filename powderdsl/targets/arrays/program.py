@@ -15,7 +15,6 @@ from powderdsl.targets.arrays.source import pass_source
 from powderdsl.targets.arrays.words import Array, pack, unpack
 from powderdsl.targets.codec import pieces
 from powderdsl.targets.job import Job
-from powderdsl.targets.profiling import PassClock, no_clock
 from powderdsl.targets.torch.source import load_source
 
 State = dict[str, Array]
@@ -53,15 +52,6 @@ class ArrayProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes."""
-        return self._run(job, no_clock)
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds that each pass takes over `job.steps`."""
-        clock = PassClock(torch.device("cpu"))
-        self._run(job, clock)
-        return clock.passes()
-
-    def _run(self, job: Job, tick: Callable[[str], None]) -> Mapping[str, Tensor]:
         batch, height, width = job.state["element"].shape
         result = {name: torch.empty_like(old) for name, old in job.state.items()}
         chunk = max(CHUNK // (height * width), 1)
@@ -75,10 +65,10 @@ class ArrayProgram:
                 for i in range(job.steps):
                     kernels.begin(first + i)
                     self._reset(state, kernels)
-                    tick("")
+                    job.tick("")
                     for name, function in functions:
                         state.update(function(kernels, state))
-                        tick(name)
+                        job.tick(name)
                 self._pack(state, result, some, kernels)
         return result
 

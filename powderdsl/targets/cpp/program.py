@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from powderdsl.targets.codec import parameters
 from powderdsl.targets.cpp.build import load_library
 from powderdsl.targets.cpp.code import NativeCode
 from powderdsl.targets.job import Job
+from powderdsl.targets.profiling import PassClock
 
 
 class PackedState(Mapping[str, Tensor]):
@@ -127,7 +129,7 @@ class NativeProgram:
     """A program as compiled C++.
 
     Args:
-        with_clocks: makes the same code with a clock for each pass; called by `profile`.
+        with_clocks: makes the same code with a clock for each pass; called when passes are timed.
     """
 
     def __init__(self, code: NativeCode, threads: int, with_clocks: Callable[[], NativeCode]):
@@ -142,6 +144,8 @@ class NativeProgram:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         assert not job.draws
         assert job.passes is None
+        if job.timing is not None:
+            return self._timed(job, job.timing)
         seed, index, start = (part.contiguous() for part in job.clock)
         batch = len(seed)
         if isinstance(job.state, PackedState) and job.state.program is self:
@@ -163,8 +167,8 @@ class NativeProgram:
         )
         return packed
 
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds of processor time by pass over `job.steps`, on one thread.
+    def _timed(self, job: Job, clock: PassClock) -> Mapping[str, Tensor]:
+        """Run on one thread and count processor time by pass.
 
         The first call compiles the program once more, with clocks in it. Raises NoCompiler if that fails.
         """
@@ -173,9 +177,11 @@ class NativeProgram:
         seconds = (ctypes.c_double * len(self._passes))()
         library = self._with_clocks.library
         library.pd_profile(seconds)  # discard what earlier runs left
-        self._with_clocks.run(job)
+        state = self._with_clocks.run(replace(job, timing=None))
         library.pd_profile(seconds)
-        return dict(zip(self._passes, seconds, strict=True))
+        for name, spent in zip(self._passes, seconds, strict=True):
+            clock.add(name, spent)
+        return state
 
     def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
         """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""

@@ -12,7 +12,6 @@ from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.job import Job, Runnable
-from powderdsl.targets.profiling import profile_of
 from powderdsl.targets.torch.program import TorchProgram
 
 MakePacked = Callable[[Program, Program], Runnable]
@@ -33,19 +32,6 @@ class MixedProgram:
             for part in self.parts:
                 state = part.run(replace(job, state=state, clock=(seed, index, start + i), steps=1))
         return state
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds by pass over `job.steps`; packing and unpacking between the parts is not counted."""
-        seed, index, start = job.clock
-        state = job.state
-        seconds: dict[str, float] = {}
-        for i in range(job.steps):
-            for part in self.parts:
-                turn = replace(job, state=state, clock=(seed, index, start + i), steps=1)
-                for name, spent in profile_of(part, turn).items():
-                    seconds[name] = seconds.get(name, 0.0) + spent
-                state = part.run(turn)
-        return seconds
 
 
 @collection_paused()

@@ -17,7 +17,6 @@ from powderdsl.system.random import base_keys
 from powderdsl.targets import random
 from powderdsl.targets.codec import limits, pieces
 from powderdsl.targets.job import Job
-from powderdsl.targets.profiling import PassClock, no_clock
 from powderdsl.targets.torch.source import load_source, pass_source
 
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
@@ -180,15 +179,6 @@ class TorchProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes; no host sync."""
-        return self._run(job, no_clock)
-
-    def profile(self, job: Job) -> Mapping[str, float]:
-        """Seconds that each pass takes over `job.steps`."""
-        clock = PassClock(self.device)
-        self._run(job, clock)
-        return clock.passes()
-
-    def _run(self, job: Job, tick: Callable[[str], None]) -> Mapping[str, Tensor]:
         seed, index, start = job.clock
         batch, height, width = job.state["element"].shape
         kernels = Kernels(
@@ -204,11 +194,11 @@ class TorchProgram:
                         planes[name] = torch.full(
                             kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
                         )
-                tick("")
+                job.tick("")
                 for name, function in self._functions:
                     if job.passes is None or name in job.passes:
                         planes.update(function(kernels, planes))
-                        tick(name)
+                        job.tick(name)
         return self._pack(planes, job.state, kernels)
 
     def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
