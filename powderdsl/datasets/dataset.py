@@ -211,7 +211,7 @@ class Dataset:
     def _batches(
         self, length: int, ends: Array, batch: int, seed: int, device: str | torch.device, start: int
     ) -> Iterator[Batch]:
-        """Minibatches of windows of `length` transitions; `ends` says how many windows there are up to each shard."""
+        """Minibatches of windows of `length` transitions; `ends` are the numbers of windows up to each shard."""
         while True:
             found = self._gather(drawn(seed, start, batch, int(ends[-1])), ends, length)
             yield Batch(*(torch.from_numpy(value).to(device) for value in found))

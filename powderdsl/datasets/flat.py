@@ -1,4 +1,4 @@
-"""The flat layouts of D4RL and OGBench, which offline learners take. Everything is in memory then."""
+"""The flat layouts of D4RL and OGBench, which offline learners take. They hold everything in memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LAYOUTS = ("d4rl", "ogbench")
 
 
 def flat(dataset: Dataset, layout: str = "d4rl") -> dict[str, NDArray[Any]]:
-    """All episodes behind one another.
+    """All episodes, concatenated.
 
     Args:
         layout: ``d4rl``: N rows of `observations`, `actions`, `rewards`, `next_observations`, `terminals` and

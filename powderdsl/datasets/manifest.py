@@ -30,11 +30,11 @@ KINDS = ("ids", "compact")
 USUAL_SHARD = 256
 USUAL_SHARD_BYTES = 1 << 28
 MAX_BYTES = 1 << 24
-"""Of a manifest's text."""
+"""Size limit of a manifest."""
 MAX_VALUES = 1 << 19
-"""In a manifest."""
+"""Limit of values in a manifest."""
 MAX_SHARD_BYTES = 1 << 32
-"""Of the arrays of one shard, unpacked."""
+"""Size limit of the unpacked arrays of one shard."""
 MAX_EPISODES = 1 << 32
 MAX_SHARDS = 1 << 16
 MAX_SIDE = 1 << 20
@@ -144,7 +144,7 @@ class Recipe:
     )
     choices: tuple[str, ...] = _ruled(_TEXTS)
     actions: int = _ruled(_integer(1, 1_000_000))
-    """Of an episode, at most."""
+    """The most actions of an episode."""
     last_action: str = _ruled(_one_of("truncates", "terminates"))
     """How an episode ends when it runs out of actions."""
 
@@ -178,7 +178,7 @@ class Manifest:
     created: str
     """When recording began, ISO 8601."""
     shards: tuple[ShardRow, ...]
-    """Those that have been recorded, ascending."""
+    """The recorded shards, ascending."""
 
     @property
     def transitions(self) -> int:
@@ -357,7 +357,7 @@ def recipe_of(
 
 
 def _shard_size(recipe: Recipe, given: int | None) -> int:
-    """Episodes a shard. Raises ValueError if they may not fit into one."""
+    """The number of episodes per shard. Raises ValueError if they may not fit into one."""
     each = episode_bytes(recipe)
     if given is None:
         size = USUAL_SHARD
@@ -381,7 +381,7 @@ def _shard_size(recipe: Recipe, given: int | None) -> int:
 
 
 def episode_bytes(recipe: Recipe) -> int:
-    """Bytes that the arrays of an episode take, at most."""
+    """The most bytes that the arrays of an episode take."""
     return (recipe.actions + 1) * (prod(recipe.shape) + 32)
 
 

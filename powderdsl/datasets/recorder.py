@@ -47,13 +47,13 @@ PLAYING_BYTES = 1 << 30
 
 
 def nothing_policy(program: TaskProgram) -> Policy:
-    """The same action again and again, as `still_action` has it. Raises ValueError where there is none."""
+    """A policy that repeats `still_action`. Raises ValueError if the task has none."""
     action = torch.tensor(still_action(program.task), device=program.simulator.device)
     return lambda observed, keys: action.expand(len(observed), 5)
 
 
 def still_action(task: Task) -> tuple[int, int, int, int, int]:
-    """The action ``nothing``; where agents have no such one but can blow, still air into the first bin.
+    """The action ``nothing``; if agents lack it but can blow, blowing still air into the first bin.
 
     Raises:
         ValueError: the task has neither.
@@ -225,7 +225,7 @@ class _Recording:
                 observed = self.end(ended, observed)
 
     def act(self, observed: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
-        """Take an action in every slot and keep what came of it: the next observations, and which episodes ended."""
+        """Take and record an action in every slot. Returns the next observations, and which episodes ended."""
         env, tape, every = self.env, self.tape, np.arange(len(self.taken))
         episode, taken = (torch.from_numpy(one.copy()).to(env.device) for one in (self.episode, self.taken))
         assert env.episodes is not None
@@ -241,7 +241,7 @@ class _Recording:
         return observed, (terminated | truncated).cpu().numpy()
 
     def end(self, ended: NDArray[np.bool_], observed: Tensor) -> Tensor:
-        """Keep the episodes that ended and begin the next ones: the observations after that."""
+        """Keep the episodes that ended and begin the next ones. Returns the observations after that."""
         for slot in np.flatnonzero(ended & self.playing).tolist():
             episode, length = int(self.episode[slot]), int(self.taken[slot])
             self.finished[episode] = {
@@ -265,7 +265,7 @@ class _Recording:
         return observed
 
     def write(self, number: int) -> None:
-        """Write a shard of finished episodes, which are dropped, and the manifest that has it."""
+        """Write a shard of finished episodes, and the manifest with it. The episodes leave memory."""
         numbers = self.recipe.episodes_of(number)
         episodes = [self.finished.pop(episode) for episode in numbers]
         parts = {name: [one[name] for one in episodes] for name in episodes[0]}

@@ -54,7 +54,7 @@ def shapes(recipe: Recipe, number: int, transitions: int) -> dict[str, tuple[int
 def write_shard(
     folder: Path, number: int, parts: Mapping[str, Sequence[Array]], *, compress: bool
 ) -> ShardRow:
-    """Write a shard, each array in parts one behind another. Equal arrays make equal files.
+    """Write a shard from arrays in parts, which are concatenated. Equal arrays make equal files.
 
     Raises:
         CompileError: PD613 if the place cannot be written, or the disk is full.
@@ -143,7 +143,7 @@ class _Wrong(Exception):
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]]) -> Shard:
-    """The arrays of an archive that has just the expected ones."""
+    """The arrays of an archive. Raises if it does not have exactly the expected ones."""
     arrays: dict[str, Array] = {}
     loaded = 0
     whole = np.memmap(path, np.uint8, "r")
@@ -174,14 +174,14 @@ def _read(path: Path, expected: dict[str, tuple[int, ...]]) -> Shard:
 
 
 def _data_offset(whole: Array, entry: zipfile.ZipInfo) -> int:
-    """Where a member's bytes begin: behind its local header, whose name and extra field have lengths of their own."""
+    """The offset of a member's bytes, after its local header, whose name and extra field vary in length."""
     at = entry.header_offset
     name, extra = np.frombuffer(whole[at + 26 : at + 30].tobytes(), "<u2").tolist()
     return int(at + 30 + name + extra)
 
 
 def _check_episodes(arrays: dict[str, Array], recipe: Recipe) -> None:
-    """Whether episodes end where they should, and actions are actions."""
+    """Check that episodes end where their lengths say, and that actions are in range."""
     length, action = arrays["length"].astype(np.int64), arrays["action"]
     if length.min() < 1 or length.max() > recipe.actions or length.sum() != len(action):
         raise _Wrong("the lengths of its episodes do not fit")

@@ -32,8 +32,8 @@ MAX_CELLS = 1 << 31
 class World:
     """A batch of worlds of one ruleset.
 
-    `state` has one tensor a slot; `seed`, `index` and `step` (int64 [B]) are what the random numbers depend on: the
-    same three give the same future, whatever stands beside a world in its batch.
+    `state` has one tensor a slot; `seed`, `index` and `step` (int64 [B]) decide the random numbers: the same three
+    give the same future, alone or in any batch.
     """
 
     sim: Simulator
@@ -126,17 +126,17 @@ class Simulator:
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names in id order."""
+        """The elements' names in id order."""
         return tuple(element.name for element in self.ruleset.elements)
 
     @property
     def passes(self) -> tuple[str, ...]:
-        """Names in the order they run."""
+        """The passes' names in the order they run."""
         return tuple(p.name for p in self.ruleset.passes)
 
     @property
     def slots(self) -> tuple[Slot, ...]:
-        """What a world's state holds."""
+        """The arrays of a world's state."""
         return tuple(self._slots.values())
 
     # Making worlds
@@ -359,7 +359,7 @@ class Simulator:
             raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
 
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
-        """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot say.
+        """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot report them.
 
         Native code counts processor time on one thread, and is compiled once more for it.
         """
@@ -369,7 +369,7 @@ class Simulator:
         return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
     def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Tensor]:
-        """Draws as integers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
+        """Given draws as integers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
         bits = {stream.name: stream.bits for stream in self.ruleset.streams}
         draws = {}
         for name, value in random.items():
@@ -382,14 +382,14 @@ class Simulator:
         return draws
 
     def _default_params(self, batch: int) -> dict[str, Tensor]:
-        """The defaults as [B] tensors; the same tensors for the same batch size, which programs may rely on."""
+        """The defaults as [B] tensors: the same tensors for the same batch size, as programs may rely on."""
         if self._defaults is None or self._defaults[0] != batch:
             full = partial(torch.full, (batch,), dtype=torch.float64, device=self.device)
             self._defaults = (batch, {p.name: full(float(p.default)) for p in self.ruleset.params})
         return self._defaults[1]
 
     def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Tensor]:
-        """All parameters as float64 [B], those given as they are. Raises KeyError, TypeError, ValueError."""
+        """All parameters as float64 [B]: given values, and defaults. Raises KeyError, TypeError, ValueError."""
         known = {param.name: param for param in self.ruleset.params}
         values = dict(self._default_params(batch))
         for name, value in params.items():

@@ -51,7 +51,7 @@ class DataConfig:
     """How many rulesets are drawn around `rules`; world s runs under number `first_ruleset` + s mod `rulesets`. 0: none."""
     first_ruleset: int = setting(0, low=0)
     variety: Variety = field(default_factory=Variety)
-    """How they differ."""
+    """The differences between the rulesets."""
     capacity: int = setting(1024 * 256, low=1)
     refresh: int = setting(256, low=1)
 
@@ -69,7 +69,7 @@ class DataConfig:
 
 
 class HasIds(Protocol):
-    """A batch of worlds, as far as pairs need to know it: `World` is one."""
+    """A batch of worlds, for instance `World`."""
 
     @property
     def ids(self) -> Tensor:
@@ -77,19 +77,19 @@ class HasIds(Protocol):
 
 
 class Worlds(Protocol):
-    """What gives worlds: `TaskWorlds`, or your own. The same seed gives the same world and the same future."""
+    """A source of worlds: `TaskWorlds`, or your own. The same seed gives the same world and the same future."""
 
     rules: Ruleset
-    """Has all elements that worlds hold."""
+    """The rules, with all elements of the worlds."""
 
     size: tuple[int, int]
     """Rows and columns."""
 
     def start(self, seeds: Tensor) -> Any:
-        """The worlds of seeds, int64 [B], as something that `HasIds`."""
+        """The worlds of seeds, int64 [B], as a `HasIds`."""
 
     def later(self, world: Any, steps: int) -> Any:
-        """The worlds some steps later; `world` stays as it was."""
+        """The worlds some steps later; `world` does not change."""
 
 
 class TaskWorlds(SplitWorlds):
@@ -117,7 +117,7 @@ def task_worlds(
     partly: bool = False,
     palette: Palette | None = None,
 ) -> TaskWorlds | VariedWorlds:
-    """The worlds that a configuration speaks of, ready to run.
+    """The worlds of a configuration, ready to run.
 
     Args:
         partly: leave out worlds that the rules cannot have; `TaskWorlds.found.missing` says which.
@@ -145,7 +145,7 @@ def task_worlds(
 
 
 def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[Pairs]:
-    """The pairs of some worlds in the order of time: `pairs` times a pair a world."""
+    """The pairs of some worlds in the order of time: `pairs` batches of one pair per world."""
     world: HasIds = worlds.start(seeds)
     for _ in range(pairs):
         start = world.ids
@@ -154,7 +154,7 @@ def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[
 
 
 def unseen_seeds(count: int, variants: int = 1) -> Tensor:
-    """Seeds that no training takes, int64 [count·variants]: `count` of each variant, all of a variant together."""
+    """Seeds that training never uses, int64 [count·variants]: `count` of each variant, all of a variant together."""
     first = -(-TEST_SEEDS // variants) * variants
     grid = torch.arange(count)[None, :] * variants + torch.arange(variants)[:, None]
     return (first + grid).flatten()

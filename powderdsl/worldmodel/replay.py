@@ -17,7 +17,7 @@ from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.worldmodel.pairs import DataConfig, HasIds, Pairs, Worlds, pairs_of
 
 TOGETHER = 1 << 20
-"""Cells of the worlds that are run together when the buffer is filled."""
+"""The most cells that are simulated together when the buffer is filled."""
 
 STORES = ("auto", "memory", "disk")
 
@@ -115,7 +115,7 @@ class Replay:
                 self._write(place[inside], (pair[0][inside], pair[1][inside]))
 
     def _seeds(self, first: int, count: int) -> Tensor:
-        """The seeds of worlds by their number in the run: every state comes as often as every other."""
+        """The seeds of worlds by their number in the run: all states come equally often."""
         return (self._first + first + torch.arange(count)) % self.config.states
 
     def _write(self, place: Tensor, pair: Pairs) -> None:
@@ -145,7 +145,7 @@ class Replay:
 
 
 def memory_of(device: torch.device) -> int:
-    """Bytes that a device has."""
+    """The memory of a device in bytes."""
     if device.type == "cuda":
         return int(torch.cuda.get_device_properties(device).total_memory)
     try:

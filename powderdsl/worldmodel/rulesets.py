@@ -1,4 +1,4 @@
-"""Rulesets drawn from a distribution: other chances, swapped properties, packs left out. A number decides each."""
+"""Rulesets drawn from a distribution: other chances, swapped properties, packs left out. A number determines each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TRIES = 8
 """How often a swap or a selection of packs is drawn again if the rules are inconsistent."""
 
 MAX_RULESETS = 1024
-"""Each is checked before the first step, and each structure compiled."""
+"""The most rulesets of a run: each is checked before the first step, and each structure compiled."""
 
 UNSEEN_RULESETS = 1 << 32
 """The first number of rulesets that models are tested on. Training takes numbers below it."""
@@ -108,7 +108,7 @@ class RulesetSource:
                 raise failure("PD301", f"the rules {self.base.name} have no property `{name}`", helps=helps)
 
     def draw(self, number: int) -> Drawn:
-        """Ruleset `number`, 0 or more. One whose rules would contradict themselves is drawn again."""
+        """Ruleset `number`, 0 or more. Inconsistent rulesets are drawn again."""
         draws = _draws(number)
         for _ in range(TRIES):
             left_out = self._left_out(draws)
@@ -122,10 +122,10 @@ class RulesetSource:
         return Drawn(number, (), (), self._chances(draws, self.base))
 
     def model(self, drawn: Drawn) -> Ruleset:
-        """The checked model of a ruleset, with parameters as they were before.
+        """The checked model of a ruleset, with the base's parameters.
 
         Raises:
-            CompileError: the rules contradict themselves.
+            CompileError: the rules are inconsistent.
         """
         return self._model(drawn.left_out, drawn.swapped)
 
@@ -151,7 +151,7 @@ class RulesetSource:
         return model
 
     def _left_out(self, draws: Iterator[float]) -> tuple[str, ...]:
-        """Packs drawn one at a time; those that another one needs stay."""
+        """The packs that are left out, drawn one at a time; packs that others need stay."""
         if not self.variety.leave_out:
             return ()
         needed = {name.text for pack in self.packs for name in pack.needs}
@@ -159,7 +159,7 @@ class RulesetSource:
         return tuple(name for name in loose if next(draws) < self.variety.leave_out)
 
     def _swapped(self, draws: Iterator[float], left_out: tuple[str, ...]) -> tuple[tuple[str, str, str], ...]:
-        """For each property, two elements that say different things about it."""
+        """For each property, two elements with different values."""
         found = []
         for prop in self.variety.swaps:
             written = _written((pack for pack in self.packs if pack.name.text not in left_out), prop)
@@ -169,7 +169,7 @@ class RulesetSource:
         return tuple(found)
 
     def _chances(self, draws: Iterator[float], model: Ruleset) -> tuple[tuple[str, float], ...]:
-        """Every chance of the base by a factor; of these, the ones that the model has."""
+        """The chances of the model, each multiplied by a factor. All chances of the base draw one."""
         if self.variety.chances == 1:
             return ()
         spread, there = math.log(self.variety.chances), {param.name for param in model.params}
@@ -276,7 +276,7 @@ class VariedWorlds(SplitWorlds):
 
 
 def _draws(number: int) -> Iterator[float]:
-    """Endless numbers in 0..1 that depend on `number` alone."""
+    """Endless numbers from 0 to 1 that depend on `number` alone."""
     keys = base_keys(torch.tensor([number]), torch.tensor([_DRAW]))
     key, count = int(mix(keys[0] ^ keys[1])[0]), 0
     while True:
@@ -285,7 +285,7 @@ def _draws(number: int) -> Iterator[float]:
 
 
 def _written(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
-    """What elements say about a property, as syntax by name."""
+    """The values of a property as elements declare them, by name."""
     return {
         element.name.text: syntax
         for pack in packs
@@ -296,7 +296,7 @@ def _written(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
 
 
 def _exchanged(packs: Sequence[PackDecl], prop: str, one: str, other: str) -> list[PackDecl]:
-    """Packs in which two elements have exchanged what they say about a property."""
+    """Packs in which two elements have exchanged their values of a property."""
     written = _written(packs, prop)
     new = {one: written[other], other: written[one]}
 

@@ -1,4 +1,4 @@
-"""How well worlds are predicted: networks and baselines by the same measure."""
+"""Scores of predictions: networks and baselines by the same measure."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, VariedWorlds
 from powderdsl.worldmodel.training import HERE, Machine, Network, Trained, check_palette, load_rules_of
 
 TOGETHER = 1 << 17
-"""Cells that a network sees at once."""
+"""The most cells that a network is given at once."""
 
 FIT_WORLDS = 64
-"""Training worlds that baselines are fitted on; all of them where there are fewer."""
+"""The most training worlds that baselines are fitted on."""
 
 MODEL, STILL, FREQUENT = "model", "nothing changes", "most frequent outcome"
 
@@ -186,10 +186,10 @@ class TestedOn(TypedDict, total=False):
 def evaluate(
     trained: Trained, *, worlds: int | None = None, machine: Machine = HERE, **tested_on: Unpack[TestedOn]
 ) -> Tested:
-    """Test a network beside both baselines, on worlds that no training takes.
+    """Test a network and both baselines on worlds that training never uses.
 
     Args:
-        worlds: worlds of a split, or random futures of each of its stands; 32 and 4 unless said otherwise.
+        worlds: worlds of a split, or random futures of each of its stands; by default 32 and 4.
         split: ``designed`` unless another is given.
         task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
         rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
@@ -245,7 +245,7 @@ def _data_of(
     knobs: Mapping[str, int] | None = None,
     rulesets: int = 0,
 ) -> DataConfig:
-    """The training data's configuration with what is given in its place."""
+    """The training data's configuration with the given changes."""
     data = trained.config.data
     return replace(
         data,

@@ -1,4 +1,4 @@
-"""A trace as plain data for JSON. `SCHEMA` rises when a key changes its meaning or goes; new keys may come."""
+"""A trace as plain data for JSON. `SCHEMA` increases when a key changes its meaning or is removed."""
 
 from __future__ import annotations
 

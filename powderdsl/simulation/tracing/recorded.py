@@ -56,7 +56,7 @@ class RecordedSubstep:
     table: dict[str, Slot]
     """Slots of the state, and scratch fields of the pass."""
     lets: dict[str, tuple[Let, reference.Context]]
-    """Where each value of the pass was fixed so far, and what was read there."""
+    """For each `let` of the pass so far, its expression and what that read."""
     masks: dict[int, Array]
     """Where each rule happened, by `id` of the rule."""
 
@@ -75,7 +75,7 @@ class RecordedSubstep:
 
 @dataclass
 class RecordedStep:
-    """The substeps of a step in order, the state that it began with, and the one that it left.
+    """The substeps of a step in order, and the states before and after it.
 
     States are the reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
     """
@@ -176,7 +176,7 @@ def _differences(
     cell: Cell,
     how: str,
 ) -> Iterator[Write]:
-    """What changed without a rule between two substeps."""
+    """The changes between two substeps that no rule made."""
     for name, array in now.items():
         if name in held and not np.array_equal(held[name], pick(array, cell)):
             yield Write(table[name], held[name], pick(array, cell), how, substep)
@@ -233,7 +233,7 @@ class _Replay:
 
 
 def anchors(rule: Rule, cell: Cell, substep: RecordedSubstep, slot: str) -> tuple[Cell, ...]:
-    """Where the rule's condition would have to hold for it to write a slot of the cell."""
+    """The cells in which a rule's condition must hold for it to write a slot of this cell."""
     found: list[Offset] = []
     if isinstance(rule, Assign):
         found += [rule.offset] if rule.field == slot else []
@@ -245,7 +245,7 @@ def anchors(rule: Rule, cell: Cell, substep: RecordedSubstep, slot: str) -> tupl
 
 
 def _arrivals(substep: RecordedSubstep, rule: Rule, cell: Cell) -> Iterator[tuple[Cell, Cell]]:
-    """Where a rule's condition held that moves something here, and where that stood."""
+    """If a rule moved something here: where its condition held, and where the content came from."""
     if not isinstance(rule, (Swap, Move)):
         return
     behind = substep.behind(cell, rule.offset)
@@ -264,7 +264,7 @@ def _assigned_value(substep: RecordedSubstep, write: Assign, anchor: Cell, old: 
 
 
 def _after_assignments(substep: RecordedSubstep, cell: Cell) -> dict[str, Any]:
-    """What a cell holds once the substep's assignments are done: that is what moves."""
+    """The values of a cell after the substep's assignments, which are the values that move."""
     held = {name: pick(array, cell) for name, array in substep.at.state.items()}
     for rule in substep.moment.rules:
         if isinstance(rule, Assign):
@@ -275,7 +275,7 @@ def _after_assignments(substep: RecordedSubstep, cell: Cell) -> dict[str, Any]:
 
 
 def _fresh(substep: RecordedSubstep, name: str, identity: int) -> Any:
-    """What a new cell of an element holds in a slot."""
+    """The value of a slot in a new cell of an element."""
     prop = substep.ruleset.property(name)
     if name == "element":
         value: Any = identity

@@ -14,14 +14,14 @@ from powderdsl.simulation.tracing.recorded import HOW, Cell
 from powderdsl.simulation.tracing.trace import Cause, Miss, Part, Read, Trace, show_at_cell
 
 MAX_MISSES = 12
-"""Rules that nearly happened which a text shows, unless all are asked for."""
+"""The most rules that nearly happened in a text, unless all are asked for."""
 
 MAX_CELLS = 9
-"""Cells that a count names in a text."""
+"""The most cells that a count names in a text."""
 
 
 def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -> str:
-    """The whole trace. Ends without a line break."""
+    """The whole trace, without a line break at its end."""
     blocks, again = [_head(trace)], []
     for _, group in groupby(trace.causes, key=_event):
         causes = list(group)
@@ -41,7 +41,7 @@ def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -
 
 
 def _event(cause: Cause) -> tuple[int, int, object]:
-    """What the writes of one rule in one substep have in common."""
+    """A key that is equal for all writes of one rule in one substep."""
     write = cause.write
     if write.rule is None:
         return id(write.substep), 0, write.how

@@ -85,7 +85,7 @@ class Part:
 
     @property
     def about_itself(self) -> bool:
-        """Whether it only asks which element the cell is: if not one of them, the rule is about other cells."""
+        """Whether it only asks which element the cell is. If that fails, the rule is about other cells."""
         return self.expr.op == "member" and self.expr.args[0].op == "element"
 
 
@@ -211,7 +211,7 @@ def _cause(write: Write) -> Cause:
 
 
 def _misses(step: RecordedStep, cell: Cell, slots: Sequence[str], every_rule: bool) -> list[Miss]:
-    """Rules that did not happen where they would have written the cell; those of one line once a place, unless all are asked."""
+    """Rules that did not happen where they would have written the cell. Unless all are asked for, a line counts once a cell."""
     found: dict[Any, Miss] = {}
     for substep in step.substeps:
         for rule in substep.rules:
@@ -243,7 +243,7 @@ def _nearly(parts: Sequence[Part]) -> bool:
 
 
 def _parts(rule: Rule, substep: RecordedSubstep, cell: Cell) -> tuple[Part, ...]:
-    """A rule's condition in one cell, taken apart at its `and`s, also in flags fixed by `let`, as they were fixed."""
+    """A rule's condition in one cell, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
     assert rule.mask is not None
     return tuple(_apart(Part(rule.mask, substep.at, "", substep, cell)))
 
@@ -261,7 +261,7 @@ def _apart(part: Part) -> Iterator[Part]:
 
 
 def _written(name: str) -> str:
-    """A let's name as it is written: copies under loops are numbered."""
+    """The name of a `let` in the file: copies under loops are numbered."""
     return name.partition("#")[0]
 
 
