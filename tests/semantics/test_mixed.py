@@ -8,7 +8,7 @@ import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, whole
+from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, integer
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
@@ -109,7 +109,7 @@ def test_what_planes_refuse_and_rules_cannot_say() -> None:
     """Sets of large numbers, and numbers that float32 rounds: rule files have neither, the IR could."""
     build = Builder()
     build.place = "made.yaml:7"
-    number = build.input("number", whole(0, 1 << 25))
+    number = build.input("number", integer(0, 1 << 25))
     slots = (SlotType("number", number.type, 0, False), SlotType("found", FLAG, 0, False))
     rare = build.in_set(number, frozenset({3, 1 << 20}))
     rounded = build.compare("lt", build.to_real(number), build.real(2.5))
