@@ -110,8 +110,6 @@ class Simulator:
         self._slots: dict[str, Slot] = self.observer.slots
         self._program = make_program(ruleset, backend, self.device, threads)
         self._defaults: tuple[int, dict[str, Tensor]] | None = None
-        self._known = torch.zeros(256, dtype=torch.bool, device=self.device)
-        self._known[[element.id for element in ruleset.elements]] = True
 
     @property
     def running(self) -> str:
@@ -160,7 +158,7 @@ class Simulator:
         check_sides(self.ruleset, (int(tensor.shape[1]), int(tensor.shape[2])))
         if tensor.numel() > MAX_CELLS:
             raise ValueError(f"{tensor.numel():,} cells are more than {MAX_CELLS:,}")
-        check_ids(tensor, self._known, "ids", self.ruleset)
+        check_ids(tensor, "ids", self.ruleset)
         element = tensor.to(torch.uint8)
         batch = len(element)
         seeds = self._integers(seed, "seed")
@@ -239,7 +237,7 @@ class Simulator:
         if "ids" in fields or "element" in fields:
             given = fields.pop("ids", None) if "ids" in fields else fields.pop("element")
             ids = self._shaped(self._integers(given, "ids"), "ids", world.shape, False)
-            check_ids(ids, self._known, "ids", self.ruleset)
+            check_ids(ids, "ids", self.ruleset)
             element = ids.to(torch.uint8)
             state = self._renewed(state, element, element != state["element"])
         for name, value in fields.items():
@@ -277,7 +275,7 @@ class Simulator:
         if slot.is_real:
             return checked_reals(tensor, slot)
         usual = None if self.ruleset.property(slot.name) is None else self.observer.table(slot.name)
-        return checked_integers(tensor, ids, slot, usual, self._known, self.ruleset)
+        return checked_integers(tensor, ids, slot, usual, self.ruleset)
 
     def paint(self, world: World, *, where: Any, element: str | None = None, **fields: Any) -> World:
         """Set cells of a mask: fresh cells of an element, and values of fields.

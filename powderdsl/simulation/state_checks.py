@@ -15,17 +15,18 @@ CHUNK = 1 << 20
 """Cells that are looked at together."""
 
 
-def check_ids(ids: Tensor, known: Tensor, name: str, ruleset: Ruleset) -> None:
-    """Raises ValueError for ids that a ruleset does not have. `known`: bool [256]."""
-    start = 0
-    for part in ids.reshape(-1).split(CHUNK):
-        values = part.to(torch.int64)
+def check_ids(ids: Tensor, name: str, ruleset: Ruleset) -> None:
+    """Raises ValueError for ids that a ruleset does not have."""
+    known = torch.zeros(256, dtype=torch.bool, device=ids.device)
+    known[[element.id for element in ruleset.elements]] = True
+    flat = ids.reshape(-1)
+    for start in range(0, len(flat), CHUNK):
+        values = flat[start : start + CHUNK].to(torch.int64)
         good = (values >= 0) & (values < 256) & known[values.clamp(0, 255)]
         if not bool(good.all()):
             at = int((~good).nonzero()[0])
             place = [int(one) for one in np.unravel_index(start + at, tuple(ids.shape))]
             raise ValueError(f"{name}{place} is {int(values[at])}: no element of {ruleset.name} has this id")
-        start += len(part)
 
 
 def looked_up(table: Tensor, ids: Tensor, dtype: torch.dtype) -> Tensor:
@@ -60,41 +61,39 @@ def checked_reals(tensor: Tensor, slot: Slot) -> Tensor:
 
 
 def checked_integers(
-    tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, known: Tensor, ruleset: Ruleset
+    tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, ruleset: Ruleset
 ) -> Tensor:
     """Values [B, H, W] as a slot of integers holds them, in memory of their own.
 
     Args:
-        ids: of the cells. usual: what cells have that cannot hold a value of their own, [256] by id; None for the
-            slot's default. known: bool [256], the ids of the ruleset.
+        ids: the elements of the cells.
+        usual: the value in cells that cannot hold one of their own, [256] by id; None for the slot's default.
 
     Raises:
         TypeError, ValueError: values that the slot cannot hold, or not in these cells.
     """
     out = torch.empty(tensor.shape, dtype=getattr(torch, slot.dtype), device=ids.device)
     for rows in _rows(ids):
-        out[:, rows] = _integers(tensor[:, rows], ids[:, rows], slot, usual, known, ruleset)
+        out[:, rows] = _integers(tensor[:, rows], ids[:, rows], slot, usual, ruleset)
     return out
 
 
-def _integers(
-    tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, known: Tensor, ruleset: Ruleset
-) -> Tensor:
+def _integers(tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, ruleset: Ruleset) -> Tensor:
     kind = slot.kind
     if tensor.dtype.is_floating_point and not bool((tensor == tensor.round()).all()):
         raise TypeError(f"{slot.name} takes integers, found {tensor.dtype}")
-    whole = tensor.to(torch.int64)
+    values = tensor.to(torch.int64)
     if kind.name == "element":
-        check_ids(whole, known, slot.name, ruleset)
+        check_ids(values, slot.name, ruleset)
     lo, hi = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(kind.name, (kind.lo, kind.hi))
-    if bool(((whole < lo) | (whole > hi)).any()):
-        raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {int(whole.min())}..{int(whole.max())}")
+    if bool(((values < lo) | (values > hi)).any()):
+        raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {int(values.min())}..{int(values.max())}")
     prop = ruleset.property(slot.name)
     limited = prop.stored if prop is not None else slot.of
     if limited is not None:
-        default = torch.full_like(whole, int(slot.default)) if usual is None else usual[ids.int()].long()
+        default = torch.full_like(values, int(slot.default)) if usual is None else usual[ids.int()].long()
         holders = torch.isin(ids.long(), torch.tensor(sorted(limited), device=ids.device))
-        if bool(((whole != default) & ~holders).any()):
+        if bool(((values != default) & ~holders).any()):
             names = ", ".join(e.name for e in ruleset.elements if e.id in limited)
             raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
-    return whole
+    return values
