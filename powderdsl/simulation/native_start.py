@@ -55,7 +55,7 @@ def generator() -> str:
 def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable | None:
     """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
     code = recall(start_key(ruleset))
-    return None if code is None else _whole(code, lowered, threads)
+    return None if code is None else _recalled(code, lowered, threads)
 
 
 def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable:
@@ -66,27 +66,27 @@ def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable
     """
     key = start_key(ruleset)
     code = recall(key)
-    if code is not None:
-        return _whole(code, lowered, threads)
-    with turn(current().place(), key):
-        code = recall(key)  # from another process, while this one waited
-        if code is not None:
-            return _whole(code, lowered, threads)
-        found = segments(lowered())
-        if len(found) == 1 and found[0].planes is not None:
-            code = compile_program(found[0].program, found[0].planes)
-            remember(key, code)
-            return _whole(code, lowered, threads)
-        return mixed_program(
-            found, torch.device("cpu"), lambda cells, planes: _compiled(cells, planes, threads)
-        )
+    if code is None:
+        with turn(current().place(), key):
+            code = recall(key)  # from another process, while this one waited
+            if code is None:
+                found = segments(lowered())
+                if len(found) > 1 or found[0].planes is None:
+                    return mixed_program(
+                        found, torch.device("cpu"), lambda cells, planes: _compiled(cells, planes, threads)
+                    )
+                code = compile_program(found[0].program, found[0].planes)
+                remember(key, code)
+    return _recalled(code, lowered, threads)
 
 
-def _whole(code: NativeCode, lowered: Lowered, threads: int) -> Runnable:
+def _recalled(code: NativeCode, lowered: Lowered, threads: int) -> Runnable:
+    """The program of code for a whole ruleset, which is only lowered if its passes are timed."""
+
     def with_clocks() -> NativeCode:
-        (whole,) = segments(lowered())
-        assert whole.planes is not None
-        return compile_program(whole.program, whole.planes, clocks=True)
+        (segment,) = segments(lowered())
+        assert segment.planes is not None
+        return compile_program(segment.program, segment.planes, clocks=True)
 
     return NativeProgram(code, threads, with_clocks)
 

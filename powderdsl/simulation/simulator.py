@@ -20,7 +20,7 @@ from powderdsl.model.state import Slot, check_sides
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.programs import find_device, make_program
-from powderdsl.simulation.state_checks import check_ids, checked_integers, checked_reals, looked_up
+from powderdsl.simulation.state_checks import check_ids, checked_floats, checked_integers, looked_up
 from powderdsl.system.writing import failure
 from powderdsl.targets.job import Job
 from powderdsl.targets.profiling import profile_of
@@ -273,7 +273,7 @@ class Simulator:
         if tensor.dtype.is_complex:
             raise TypeError(f"{slot.name} takes floats, found {tensor.dtype}")
         if slot.is_real:
-            return checked_reals(tensor, slot)
+            return checked_floats(tensor, slot)
         usual = None if self.ruleset.property(slot.name) is None else self.observer.table(slot.name)
         return checked_integers(tensor, ids, slot, usual, self.ruleset)
 

@@ -50,14 +50,14 @@ def _rows(ids: Tensor) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, height, step))
 
 
-def checked_reals(tensor: Tensor, slot: Slot) -> Tensor:
+def checked_floats(tensor: Tensor, slot: Slot) -> Tensor:
     """Values as a float32 slot holds them, in memory of their own. Raises ValueError."""
     if not bool(torch.isfinite(tensor).all()):
         raise ValueError(f"{slot.name} has values that are not finite")
-    real = tensor.to(torch.float32).clamp(slot.kind.lo, slot.kind.hi).contiguous()
-    for part in real.view(-1).split(CHUNK):
+    floats = tensor.to(torch.float32).clamp(slot.kind.lo, slot.kind.hi).contiguous()
+    for part in floats.view(-1).split(CHUNK):
         part.masked_fill_(part.abs() < SNAP, 0)
-    return real
+    return floats
 
 
 def checked_integers(
