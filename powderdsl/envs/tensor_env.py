@@ -15,7 +15,14 @@ from torch import Tensor
 from powderdsl.envs.observations import observation_of
 from powderdsl.simulation.simulator import MAX_CELLS
 from powderdsl.system.random import MASK, mix
-from powderdsl.tasks.episodes import Episodes, TaskProgram, check_actions, compile_task, load_task
+from powderdsl.tasks.episodes import (
+    Episodes,
+    TaskProgram,
+    check_actions,
+    compile_task,
+    integer_tensor,
+    load_task,
+)
 from powderdsl.tasks.task import Task
 
 Info = dict[str, Any]
@@ -147,7 +154,7 @@ class TensorEnv:
             base = torch.where(mask, base, self._base)
         worlds = world_seeds(base, episode, self.worlds)
         if "worlds" in given:
-            worlds = self._numbers(given["worlds"], "worlds")
+            worlds = self._worlds(given["worlds"])
         if self.episodes is None:
             self.episodes = self.program.start(worlds)
         else:
@@ -197,15 +204,13 @@ class TensorEnv:
             raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
         return mask
 
-    def _numbers(self, value: Any, name: str) -> Tensor:
-        tensor = torch.as_tensor(value, device=self.device)
-        if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
-            raise TypeError(f"{name} must be integers, found {tensor.dtype}")
+    def _worlds(self, value: Any) -> Tensor:
+        tensor = integer_tensor("worlds", value, self.device)
         if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) != self.num_envs):
-            raise ValueError(f"{name} takes one number or {self.num_envs}, found shape {list(tensor.shape)}")
+            raise ValueError(f"worlds takes one number or {self.num_envs}, found shape {list(tensor.shape)}")
         if bool((tensor < 0).any()):
-            raise ValueError(f"{name} must be 0 or more")
-        return tensor.to(torch.int64).expand(self.num_envs).clone()
+            raise ValueError("worlds must be 0 or more")
+        return tensor.expand(self.num_envs).clone()
 
     def _new_params(self, given: Any, mask: Tensor) -> dict[str, Tensor]:
         """The parameters after a reset of `mask`."""

@@ -163,13 +163,11 @@ def evaluate(
     names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
     for name in names:
         check_split(task, name)
-    there = [one for one in POLICIES if run is not None or one != "trained"]
-    chosen = there if policies is None else [one for one in there if one in policies]
-    unknown = [one for one in policies or () if one not in there]
-    if unknown or not chosen or not names:
-        raise ValueError(f"policies are {', '.join(there)}; found {unknown[0] if unknown else 'none'}")
-    if episodes < 1:
-        raise ValueError(f"episodes is {episodes}: it takes an integer from 1")
+    chosen = _chosen(policies, POLICIES if run is not None else BASELINES)
+    if episodes < 1 or not names:
+        raise ValueError(
+            f"episodes is {episodes}: it takes an integer from 1" if names else "splits are empty"
+        )
     backend, device = backend or config.backend, device or config.device
     first = compile_task(task, split=names[0], backend=backend, device=device, threads=config.threads)
     acts: dict[str, Policy | None] = {"random": random_policy(first.action_nvec), "nothing": None}
@@ -192,6 +190,15 @@ def evaluate(
     if run is not None:
         run.write_json(EVALUATION, found.as_json())
     return found
+
+
+def _chosen(policies: Sequence[str] | None, known: Sequence[str]) -> list[str]:
+    """The policies to play, in the order of those that are known. Raises ValueError."""
+    chosen = [one for one in known if policies is None or one in policies]
+    unknown = [one for one in policies or () if one not in known]
+    if unknown or not chosen:
+        raise ValueError(f"policies are {', '.join(known)}; found {unknown[0] if unknown else 'none'}")
+    return chosen
 
 
 def _play_all(

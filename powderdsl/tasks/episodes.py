@@ -285,21 +285,26 @@ def compile_task(
     return TaskProgram(found, split, simulator)
 
 
+def integer_tensor(name: str, values: Any, device: torch.device | None = None) -> Tensor:
+    """Values from outside as int64. Raises TypeError if they are not integers."""
+    try:
+        tensor = torch.as_tensor(values, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
+    if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
+        raise TypeError(f"{name} must be integers, found {tensor.dtype}")
+    return tensor.to(torch.int64)
+
+
 def check_actions(program: TaskProgram, actions: Any) -> Tensor:
     """Actions from outside as int64 [B, 5] on the program's device; invalid ones are refused.
 
     Raises:
         TypeError: they are not integers. ValueError: a wrong shape, or a number out of range, with its index.
     """
-    try:
-        tensor = torch.as_tensor(actions)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"actions: {' '.join(str(error).split())}") from None
-    if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
-        raise TypeError(f"actions must be integers, found {tensor.dtype}")
+    tensor = integer_tensor("actions", actions)
     if tensor.ndim != 2 or tensor.shape[1] != 5:
         raise ValueError(f"actions must have the shape [episodes, 5], found {list(tensor.shape)}")
-    tensor = tensor.to(torch.int64)
     bounds = torch.tensor(program.action_nvec, device=tensor.device)
     bad = (tensor < 0) | (tensor >= bounds)
     if bool(bad.any()):
