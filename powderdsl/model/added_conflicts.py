@@ -1,7 +1,7 @@
-"""Rules of one pack that meet only because of packs that somebody added: what becomes of them, and whose tags do it.
+"""Conflicts between rules of one pack that arise only because other packs were added, and the tags that cause them.
 
-The author of the rules could not know of the added packs, and who adds them cannot change the rules. So the rule that
-stands first holds, as with `conflicts: first_wins`, where that changes nothing for the packs that the author knew.
+The author of the rules could not know the added packs, and users who add packs cannot change the rules. So the first
+rule wins, as with `conflicts: first_wins`, where that changes nothing for the packs that the author knew.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class Given:
 
 @dataclass
 class AddedPacks:
-    """Which packs were added to which, in the eyes of their authors."""
+    """Finds conflicts that a pack has only because other packs were added to it."""
 
     composition: Composition
     check_alone: CheckAlone
     _conflicts: dict[tuple[str, ...], frozenset[Span] | None] = field(default_factory=dict)
 
     def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Given, ...]:
-        """What added packs do to some elements, if without them the rules of `pack` do not meet; else nothing.
+        """The changes by added packs that cause a conflict in `pack`; empty if it has the conflict without them.
 
         Args:
             place: where the conflict is reported. ids: elements with which the rules meet.
@@ -76,7 +76,7 @@ class AddedPacks:
         return self._conflicts[scope]
 
     def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Given]:
-        """What packs outside a scope give an element: tags that stand in some words, else such values, else itself."""
+        """The tags among some words that packs outside a scope give an element, else such values, else the element itself."""
         composition = self.composition
         named = composition.element_decls[element]
         entries = [(pack, entry) for pack, name, entry in composition.entries() if name == element]
@@ -111,7 +111,7 @@ def report_added(
     code: str, rules: Sequence[Span], notes: Sequence[str], causes: Sequence[Given], pass_name: str, settled: bool,
     assigns: bool, reporter: Reporter,
 ) -> None:  # fmt: skip
-    """Report rules that meet because of added packs, at what these do: a warning where the conflict is settled.
+    """Report a conflict that added packs cause, at their change: a warning if `settled`, because one rule wins.
 
     Args:
         rules: what the rules claim. assigns: whether they assign a field.

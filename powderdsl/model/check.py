@@ -47,12 +47,12 @@ def resolve_names(
     reporter: Reporter,
     palette: Palette | None = None,
 ) -> tuple[Typer, list[tuple[str, int, Span]]]:
-    """What checks expressions against all names of some packs, and where elements' own values stand.
+    """A typer that knows all names of some packs, and the locations of elements' own property values.
 
     Raises CompileError where names clash.
     """
     composition = compose(packs, ruleset, reporter, palette)
-    reporter.raise_if_errors()  # with names that clash or packs that lack, rules would only be misread
+    reporter.raise_if_errors()  # with clashing names or missing packs, rules would only be misread
     typer = Typer(base_symbols(composition), reporter)
     return typer, define_symbols(typer)
 
@@ -136,7 +136,7 @@ def check(
 
 
 def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None:
-    """What checks expressions where only some of these packs are loaded."""
+    """A typer that knows only some of these packs; None if they cannot be composed."""
     try:
         return resolve_names([pack for pack in packs if pack.name.text in names], None, Reporter())[0]
     except CompileError:

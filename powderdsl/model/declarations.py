@@ -1,4 +1,4 @@
-"""What a rule file declares, shapes and literals checked, names not yet: the value between reading and composing."""
+"""Declarations of rule files: shapes and literals are checked, names are not resolved."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 Pair = tuple[Scalar, Syntax]
-"""A name and what stands behind it."""
+"""A name and its value."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ElementDecl:
 
 @dataclass(frozen=True)
 class AlsoDecl:
-    """What a pack adds to an element of another pack."""
+    """Tags, values and a ramp that a pack adds to an element of another pack."""
 
     name: Scalar
     tags: tuple[Scalar, ...] = ()
@@ -137,7 +137,7 @@ class TestDecl:
     fields: tuple[tuple[Scalar, Scalar], ...]
     expect_fields: tuple[tuple[Scalar, Scalar], ...]
     often: tuple[tuple[Syntax, Syntax], ...]
-    """What becomes of cells, as `before -> after`, and how likely."""
+    """Changes of cells, as `before -> after`, and their chances."""
 
 
 Definition = TagDecl | TypedDecl | StreamDecl | KernelDecl | SetDecl | ElementDecl | PassDecl
@@ -168,14 +168,14 @@ class PackDecl:
 
     @property
     def definitions(self) -> tuple[Definition, ...]:
-        """What it defines for all packs, but for passes: a pass and an element may have one name."""
+        """All its definitions in the shared namespace; passes have a namespace of their own."""
         tables: tuple[Sequence[Definition], ...]
         tables = self.tags, self.properties, self.fields, self.streams, self.kernels, self.sets, self.elements
         return tuple(chain.from_iterable(tables))
 
     @property
     def entries(self) -> tuple[ElementDecl | AlsoDecl, ...]:
-        """What it says of single elements."""
+        """Its entries for single elements."""
         return (*self.elements, *self.also)
 
     @property
@@ -210,7 +210,7 @@ class RulesetDecl:
 
     @property
     def members(self) -> tuple[str, ...]:
-        """Names of the packs that it is made of: those of its base that it keeps, then its own."""
+        """Names of its packs: the packs of its base that it keeps, then its own."""
         gone = {scalar.text for scalar in self.without}
         kept = [name for name in self.base.members if name not in gone] if self.base else []
         return tuple(dict.fromkeys([*kept, *(scalar.text for scalar in self.packs)]))
@@ -225,7 +225,7 @@ class RulesetDecl:
 
     @property
     def lineage(self) -> tuple[RulesetDecl, ...]:
-        """It, the rulesets that it extends and those beside it, each once: what inherits comes after what it extends."""
+        """This ruleset, all that it extends and all beside it, each once, bases first."""
         found: dict[str, RulesetDecl] = {}
         for one in (*self.beside, self.base):
             if one is not None:
@@ -240,12 +240,12 @@ class RulesetDecl:
 
     @property
     def placed(self) -> tuple[str, ...]:
-        """The packs of that ruleset; not those in whose place others of the same name are listed."""
+        """The packs of that ruleset, except packs that others of the same name replace."""
         sources = {one.source.name for one in self.placing.lineage}
         listers = {name: self.lister(name) for name in self.placing.members}
         return tuple(name for name, one in listers.items() if one is None or one.source.name in sources)
 
     @property
     def renames(self) -> tuple[tuple[Scalar, Scalar], ...]:
-        """Its own and those that it inherits; the last one for a name counts."""
+        """Its own renames after the inherited ones; the last one for a name counts."""
         return tuple(pair for one in self.lineage for pair in one.rename)

@@ -1,4 +1,4 @@
-"""What packs define, as written -> symbols of the checker: kernels, parameters, properties, fields, sets, with their values."""
+"""Declarations -> symbols of the checker: kernels, parameters, properties, fields and sets, with their values."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _param(named: Named[TypedDecl], typer: Typer) -> Param:
 
 
 def _ruleset_params(composition: Composition) -> Iterator[tuple[Scalar, Syntax]]:
-    """The values that rulesets give to parameters, those of a base first; none for packs that are left out."""
+    """The values that rulesets give to parameters, bases first; values for packs that are left out are skipped."""
     loaded = {pack.name.text for pack in composition.packs}
     for ruleset in composition.lineage:
         for key, syntax in ruleset.params:

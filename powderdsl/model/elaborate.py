@@ -68,7 +68,7 @@ ORIENTATIONS: dict[str | None, tuple[Matrix, ...]] = {
 
 @dataclass
 class Elaborated:
-    """What came of the passes, besides the passes: facts that later checks and stages need."""
+    """The checked passes, and facts about them that later checks need."""
 
     passes: list[Pass] = field(default_factory=list)
     streams: dict[str, Stream] = field(default_factory=dict)
@@ -359,7 +359,7 @@ class Elaborator:
         return name, operand.kind, offset
 
     def _assigned(self, syntax: Syntax, scope: Scope) -> tuple[Operand, Offset]:
-        """What stands left of an assignment, and at which neighbor."""
+        """The operand left of an assignment, and the offset of the neighbor that it belongs to."""
         if syntax.kind == "optional_attribute":
             syntax = self.typer.certain(syntax, scope)
         if syntax.kind != "attribute":

@@ -50,7 +50,7 @@ TRENDS = {"rises": "never rises", "falls": "never falls", "changes": "constant"}
 def check_invariants(
     composition: Composition, typer: Typer, typer_of: Callable[[tuple[str, ...]], Typer | None]
 ) -> tuple[Invariant, ...]:
-    """The invariants of all packs and of the ruleset. Those that need a pack which is not loaded are left out.
+    """The invariants of all packs and of the ruleset, except invariants that need a pack which is not loaded.
 
     Args:
         typer_of: what checks expressions against the names of some packs alone; None if they make no ruleset.
@@ -89,7 +89,7 @@ def check_invariants(
 
 
 def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]]:
-    """What a line says, and the elements without which worlds start. Raises Poisoned or Unresolved."""
+    """The claim of a line, and the elements that start worlds must not hold. Raises Poisoned or Unresolved."""
     typer.absent.clear()
     typer.start_rule(line.span)
     where = Scope(pack, {})
@@ -110,7 +110,7 @@ def _can_hold(typer: Typer | None, line: Syntax, pack: str) -> bool:
 
 
 def _without(typer: Typer, what: Syntax, scope: Scope) -> frozenset[int]:
-    """The elements that a world starts without. Those that are absent are not there anyway."""
+    """The elements that a world starts without; elements of packs that are not loaded are ignored."""
     ids = frozenset(typer.set_of(typer.evaluate(what, scope), what.span).ids)
     if ids == frozenset(typer.symbols.ids):
         raise typer.fail("PD511", "this invariant cannot hold", what.span, "no world is without all of these")
@@ -118,7 +118,7 @@ def _without(typer: Typer, what: Syntax, scope: Scope) -> frozenset[int]:
 
 
 def _words(typer: Typer, words: tuple[Syntax, ...], wanted: tuple[tuple[str, ...], ...]) -> None:
-    """Report the first word that is none of those wanted in its place."""
+    """Report the first word that is not one of the words wanted in its position."""
     for word, options in zip(words, wanted, strict=True):
         if word.text not in options:
             listed = " or ".join(f"`{option}`" for option in options)

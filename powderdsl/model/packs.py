@@ -1,4 +1,4 @@
-"""Located YAML -> declarations of one pack or ruleset file. Shapes and literals are checked here, names are not."""
+"""Located YAML -> declarations of one pack or ruleset file. Checks shapes and literals, not names."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MAX_WEIGHTS = 2 * MAX_RADIUS + 1
 
 
 def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | None:
-    """Parse and shape-check a rule file. Reports everything it can; None where nothing can be made of it."""
+    """Parse and shape-check a rule file. Reports everything it can; None if the file is unusable."""
     tree = parse_yaml(source, reporter)
     if tree is None:
         if not reporter.has_errors:
@@ -70,7 +70,7 @@ class _PackReader(Reader):
             "elements": ("an element", self.element),
             "passes": ("a pass", self.pass_),
         }
-        """What an entry of a section of a pack is, and how it is read: None after reporting that it makes no sense."""
+        """For each section of a pack: a noun for its entries and their reader, which returns None after an error."""
 
     # Files
 
@@ -94,7 +94,7 @@ class _PackReader(Reader):
                 yield key, value
 
     def needs_no_base(self, tree: Mapping, without: tuple[Scalar, ...]) -> None:
-        """Report what is missing in a ruleset that extends none, or has no sense there."""
+        """Report missing and meaningless keys of a ruleset that extends none."""
         if tree.get("packs") is None:
             start = tree.span.start
             self.reporter.error(
@@ -233,7 +233,7 @@ class _PackReader(Reader):
         return values | {"ramp": RampDecl(key, found["field"], start, end, found.get("over"))}
 
     def color(self, values: dict[str, Any], key: str) -> str | None:
-        """The color under a key, ``#RRGGBB``; None where there is none, which is reported if it should be one."""
+        """The color under a key, ``#RRGGBB``; None if it is absent, or after reporting that it is not a color."""
         color = values.get(key)
         if color is None or re.fullmatch(r"#[0-9A-Fa-f]{6}", color.text):
             return color.text.upper() if color else None
@@ -383,7 +383,7 @@ class _PackReader(Reader):
 
 
 def _row_fault(row: list[str], width: int, kernel: str) -> tuple[str, str, str] | None:
-    """What is wrong with a row of weights: a message, a label, a fix. `width` is that of the first row."""
+    """The fault of a row of weights as a message, a label and a fix. `width` is the length of the first row."""
     count = len(row)
     if not row or not all(re.fullmatch(r"-?[0-9]{1,3}", weight) for weight in row):
         fix = 'write "1 0 1", numbers up to 999 with blanks between them'

@@ -1,4 +1,4 @@
-"""Which element's color follows which field: the ramps of packs, checked."""
+"""Declared color ramps -> checked ones: elements whose color follows a field."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
 
 
 def _field(pack: str, decl: RampDecl, typer: Typer) -> Field | None:
-    """The field that a ramp follows; None where its pack is absent, or after reporting that there is none."""
+    """The field that a ramp follows; None if its pack is absent, or after reporting that it does not exist."""
     symbols, composition = typer.symbols, typer.symbols.composition
     word = decl.field.word
     owner, _, base = word.rpartition(".")

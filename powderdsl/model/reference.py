@@ -44,12 +44,12 @@ WIDE: dict[str, Any] = {
     "chance": np.float64,
     "number": np.float64,
 }
-"""The dtype in which values of a kind are computed; int64 where there is none."""
+"""The dtype in which values of a kind are computed; int64 for other kinds."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """What the random numbers of a batch depend on: arrays [B] of seed (64 bits), world index and step."""
+    """The inputs of a batch's random numbers: arrays [B] of seed (64 bits), world index and step."""
 
     seed: Array
     index: Array
@@ -143,7 +143,7 @@ def neighborhood(value: Array, kernel: Kernel) -> Array:
 
 @dataclass
 class Context:
-    """What an expression reads: the world as the substep finds it, values fixed earlier, draws, parameters."""
+    """Everything an expression reads: the world as the substep finds it, values fixed earlier, draws, parameters."""
 
     ruleset: Ruleset
     state: State
@@ -186,7 +186,7 @@ def _property(expr: Expr, at: Context) -> Array:
 
 
 def _of_elements(prop: Property, ids: Array, at: Context) -> Array:
-    """What a property is for each of some elements, by id."""
+    """The values of a property for cells of these ids."""
     result = _as_kind(prop.kind.name, 0, at.shape)
     for identity, value in enumerate(prop.values):
         one = (

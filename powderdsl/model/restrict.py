@@ -1,4 +1,4 @@
-"""Some of the packs of a ruleset alone: what invariants and tests speak of, without the packs that others added."""
+"""Models of some packs of a ruleset alone: the scopes of invariants and tests, without added packs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Difference:
 
 
 def restricted(ruleset: Ruleset, packs: Iterable[str]) -> Ruleset | None:
-    """The model of some of a ruleset's packs, with its parameters; None if they make no ruleset of their own."""
+    """The model of some of a ruleset's packs, with its parameters; None if they are not a ruleset of their own."""
     found = _checked(ruleset, packs, Reporter())
     if found is None:
         return None
@@ -50,7 +50,7 @@ def restricted(ruleset: Ruleset, packs: Iterable[str]) -> Ruleset | None:
 
 
 def remarks_alone(ruleset: Ruleset, packs: Iterable[str]) -> tuple[Diagnostic, ...] | None:
-    """What checking some packs alone remarks; None if they make no ruleset of their own."""
+    """The diagnostics of checking some packs alone; None if they are not a ruleset of their own."""
     reporter = Reporter()
     return None if _checked(ruleset, packs, reporter) is None else reporter.diagnostics
 
@@ -67,7 +67,7 @@ def _checked(ruleset: Ruleset, packs: Iterable[str], reporter: Reporter) -> Rule
 
 
 def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
-    """The model without one pack and those that need it; None if the rest is not a ruleset."""
+    """The model without one pack and the packs that need it; None if the rest is not a ruleset."""
     assert ruleset.declared is not None
     return restricted(
         ruleset, [name for name, needs in needs_of(ruleset.declared.packs).items() if pack not in needs]

@@ -19,7 +19,7 @@ from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
 
 @dataclass(frozen=True)
 class Key:
-    """A key: one line for the docs, whether it must be there, and the shape of its value.
+    """A key: the shape of its value, one line for the docs, and whether it is required.
 
     Shapes: ``text word words number flag mapping list line lines statements block any``. A word may have to be one of
     some `options`; a number lies within `bounds`.
@@ -163,12 +163,12 @@ OPEN = {
     "property": "an element",
     "field": "an element",
 }
-"""Mappings that take further keys, and what those name."""
+"""Mappings that take further keys, and what these keys name."""
 
 VALUES = ("word", "number", "flag", "line")
 
 SECTIONS = ("text", "mapping", "words", "list", "statements", "any")
-"""Shapes of which there is no empty value."""
+"""Shapes without an empty value."""
 
 PREFIXES = {"pass": ("for ", "repeat "), "block": ("for ", "repeat ")}
 """Keys that are read as lines: `for side in (left, right)`, `repeat 2`."""
@@ -198,7 +198,7 @@ def first_line(node: Node) -> Span:
 
 
 def comment_after(scalar: Scalar) -> Span | None:
-    """What YAML takes for a comment behind a key or a value on its line."""
+    """The comment that YAML sees after a key or a value on its line."""
     text, start = scalar.span.source.text, scalar.span.end
     end = text.find("\n", start)
     rest = text[start : end if end >= 0 else len(text)]
@@ -208,7 +208,7 @@ def comment_after(scalar: Scalar) -> Span | None:
 
 
 Entries = dict[str, tuple[Scalar, Node]]
-"""The entries of a mapping by key: the key as it stands in the file, and what it has."""
+"""The entries of a mapping by key: the key with its location, and its value."""
 
 
 class Reader:
@@ -231,7 +231,7 @@ class Reader:
         return self.values(self.mapping(node, context, what), context)
 
     def values(self, entries: Entries, context: str) -> dict[str, Any]:
-        """The values of entries, each read as the table says; those of keys that the table leaves open as `values`."""
+        """The values of entries, each read as the table says; entries with open keys are under `values`."""
         table = self.keys[context]
         found = {key: self._value(entries, key, table[key]) for key in entries if key in table}
         if context in OPEN:
@@ -306,7 +306,7 @@ class Reader:
         return entries
 
     def _is_empty(self, key: Scalar, value: Node, row: Key) -> bool:
-        """Whether a key has no value where it needs one, which is reported: YAML may take the value for a comment."""
+        """Report a key that lacks its value, which YAML may take for a comment. Returns whether it does."""
         if not isinstance(value, Scalar) or value.style != "plain" or value.text:
             return False
         comment = comment_after(key)
@@ -360,7 +360,7 @@ class Reader:
                 yield key, value
 
     def pairs(self, node: Node | None, wanted: str, help_text: str = "") -> tuple[tuple[Scalar, Node], ...]:
-        """Entries of a mapping, none where there is no node; reports another shape."""
+        """Entries of a mapping; none for None, or after reporting another shape."""
         if isinstance(node, Mapping):
             return node.entries
         if node is not None:

@@ -1,4 +1,4 @@
-"""What a world of a ruleset holds, a slot for the elements, each stored property, and each field; and its sides."""
+"""The state of a ruleset's worlds: slots for the elements, stored properties and fields; and their sides."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def fits(ruleset: Ruleset, size: tuple[int, ...]) -> bool:
 
 
 def size_problem(ruleset: Ruleset, size: tuple[int, ...]) -> str:
-    """What is wrong with a size that does not fit."""
+    """The message for a size that does not fit."""
     sides = f"rows and columns must be a multiple of {ruleset.side_multiple} each"
     return f"a world of {size[-2]}×{size[-1]} cells: with {ruleset.name}, {sides}"
 

@@ -273,7 +273,7 @@ class _Printer:
         return str(expr.value), _ATOM
 
     def kernel(self, kernel: Kernel) -> str:
-        """Its name; those that share one, as copies under a symmetry do, are numbered."""
+        """The kernel's name, numbered if several share it, as copies under a symmetry do."""
         if kernel not in self.kernels:
             copies = sum(other.name == kernel.name for other in self.kernels)
             self.kernels[kernel] = f"{kernel.name}#{copies + 1}" if copies else kernel.name

@@ -26,7 +26,7 @@ Value = int | float | Fraction | tuple[float, float]
 
 @dataclass(frozen=True)
 class Kind:
-    """What a value is. `lo` and `hi` are inclusive bounds of ``int``, ``real`` and ``vec2`` components.
+    """The type of a value. `lo` and `hi` are inclusive bounds of ``int``, ``real`` and ``vec2`` components.
 
     ``flag``        a mask over cells
     ``int``         lo..hi
@@ -268,7 +268,7 @@ class Pass:
 
 
 Cell = tuple[tuple[float, float], ...] | None
-"""What a drawn field says of a cell: lowest and highest value of each component (the same but in ranges that are
+"""The drawn value of a cell: lowest and highest value of each component (the same but in ranges that are
 expected); () is what a fresh cell of its element has, None is anything."""
 
 
@@ -313,7 +313,7 @@ class Example:
     expect_fields: tuple[FieldGrid, ...] = ()
     often: tuple[Often, ...] = ()
     scope: tuple[str, ...] = field(default=(), compare=False)
-    """The packs that it speaks of. With other packs added it may come out differently."""
+    """The packs that it is about. With other packs added its result may differ."""
 
 
 @dataclass(frozen=True)
@@ -337,7 +337,7 @@ class Total:
 
 @dataclass(frozen=True)
 class Never:
-    """In no cell the condition comes to hold after so many steps in a row, where it did not hold at the start."""
+    """In no cell does the condition hold after `steps` steps in a row if it did not hold at the start."""
 
     condition: Expr
     steps: int
@@ -345,7 +345,7 @@ class Never:
 
 @dataclass(frozen=True)
 class Local:
-    """What a cell holds after a step depends on nothing farther than so many cells away, rows or columns."""
+    """A cell after a step depends only on cells at most `radius` rows and columns away."""
 
     radius: int
 
@@ -371,9 +371,9 @@ Claim = Unchanging | Total | Never | Local | Symmetric | Bounded
 
 @dataclass(frozen=True)
 class Invariant:
-    """What a pack says of every world that starts without some elements, in cells and fields; mostly there are none.
+    """A claim of a pack about every world that starts without the elements `without`, in cells and fields.
 
-    `pack` is the ruleset's name where the ruleset says it.
+    `pack` is the ruleset's name if a ruleset makes the claim.
     """
 
     claim: Claim
@@ -381,7 +381,7 @@ class Invariant:
     pack: str
     span: Span = field(compare=False, repr=False)
     scope: tuple[str, ...] = field(default=(), compare=False)
-    """The packs that it speaks of. With other packs added it may no longer hold."""
+    """The packs that it is about. With other packs added it may no longer hold."""
 
 
 @dataclass(frozen=True)
@@ -424,13 +424,13 @@ class Ruleset:
     passes: tuple[Pass, ...]
     matrix: tuple[MatrixChannel, ...]
     order: tuple[str, ...] = ()
-    """What a cell holds besides its element, as `model/composition/layout.py` orders it."""
+    """The names of all that a cell holds besides its element, as `model/composition/layout.py` orders it."""
     tests: tuple[Example, ...] = field(default=(), metadata=UNMEANING)
     invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
     side_multiple: int = field(default=1, metadata=UNMEANING)
     """The rows and columns of all worlds are multiples of this number."""
     declared: Declared | None = field(default=None, compare=False, repr=False)
-    """What it was checked from."""
+    """The files that it was checked from."""
 
     def added_to(self, scope: tuple[str, ...]) -> tuple[str, ...]:
         """The loaded packs that lie outside a scope, in load order."""

@@ -1,1 +1,1 @@
-"""Declarations of several packs -> one composition: names, ids, orders, and who speaks of what."""
+"""Declarations of several packs -> one composition: names, ids, orders, and the scopes of claims."""

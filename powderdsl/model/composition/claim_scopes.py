@@ -1,4 +1,4 @@
-"""What invariants and tests speak of: the packs that their authors knew of. Packs that others add lie outside."""
+"""Scopes of invariants and tests: the packs that their authors knew. Added packs lie outside."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from powderdsl.syntax.ast import Syntax
 
 
 class ClaimScopes:
-    """The scopes of what loaded packs and rulesets claim. A scope is a tuple of loaded packs, in load order."""
+    """The scopes of the claims of loaded packs and rulesets. A scope is a tuple of loaded packs, in load order."""
 
     def __init__(self, packs: Sequence[PackDecl], ruleset: RulesetDecl | None, names: Names) -> None:
         self._packs = [pack.name.text for pack in packs]
@@ -38,12 +38,12 @@ class ClaimScopes:
 
 
 def title_of(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
-    """What is loaded, in words: a ruleset, what is left out of it, what is added: ``ruleset-pack+pack``."""
+    """The title of what is loaded: a ruleset, packs left out of it, packs added: ``ruleset-pack+pack``."""
     loaded = [pack.name.text for pack in packs]
     if ruleset is None:
         return "+".join(loaded)
     named = [ruleset]
-    for one in reversed(ruleset.beside):  # those that a later one takes over say nothing of their own
+    for one in reversed(ruleset.beside):  # a ruleset that a later one extends has no title of its own
         if all(one.source.name not in {base.source.name for base in known.lineage} for known in named):
             named.insert(0, one)
     members = list(dict.fromkeys(name for one in named for name in one.members))
@@ -53,7 +53,7 @@ def title_of(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
 
 
 def names_left_out(ruleset: RulesetDecl | None) -> frozenset[str]:
-    """What the packs define that are left out of a ruleset: its own lines may ask for it as if there were a `?`."""
+    """The names defined by packs that a ruleset leaves out: its own lines may use them as if they ended in `?`."""
     left_out = ruleset.left_out if ruleset else ()
     return frozenset(decl.name.text for pack in left_out for decl in pack.definitions)
 
@@ -67,7 +67,7 @@ def with_optional(syntax: Syntax, names: frozenset[str]) -> Syntax:
 
 
 def words_of(syntax: Syntax) -> Iterator[str]:
-    """All words of an expression, without the `?` of those that may be absent."""
+    """All words of an expression, without the `?` of optional names."""
     waiting = [syntax]
     while waiting:
         one = waiting.pop()

@@ -69,7 +69,7 @@ class Composition:
 
     @cached_property
     def scopes(self) -> ClaimScopes:
-        """What invariants and tests speak of."""
+        """The scopes of invariants and tests."""
         return ClaimScopes(self.packs, self.ruleset, self.names)
 
     @cached_property
@@ -92,7 +92,7 @@ class Composition:
         return self.ruleset.lineage if self.ruleset else ()
 
     def entries(self) -> Iterator[tuple[str, str, ElementDecl | AlsoDecl]]:
-        """What packs say of each element: the pack, the element (global; an absent one as written), what it says.
+        """The entries of all elements: the pack, the element's global name (as written if absent), the entry.
 
         In rising precedence: the elements' own entries, then those under `also`, each pack after those that it needs.
         """
@@ -131,7 +131,7 @@ def compose(
     `palette` has ids that were recorded earlier.
     """
     _check_needs(packs, reporter)
-    reporter.raise_if_errors()  # every name of a pack that lacks would be a mistake of its own
+    reporter.raise_if_errors()  # every name of a missing pack would be reported too
     renames = ruleset.renames if ruleset else ()
     book = NameBook(packs, renames, reporter, RESERVED | reserved_words() | {"elements"})
     passes_book = NameBook(packs, renames, reporter)
@@ -193,7 +193,7 @@ def _slots(
 ) -> int:
     """How many ids a ruleset or a palette asks for. Reports an id of the ruleset's own packs beyond its slots."""
     wanted = (ruleset.placing.slots if ruleset else None) or 0
-    # The packs of the ruleset that says so must fit its slots; packs loaded on top of them add slots.
+    # The packs of the ruleset that declares `slots` must fit; packs loaded on top of them add slots.
     own = ruleset.placed if ruleset and wanted else ()
     top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
     if top and ruleset and palette is None and top.id >= wanted:
@@ -230,7 +230,7 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
                     "PD306",
                     f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together",
                     other.span,
-                    "says so",
+                    "declared here",
                     secondary=[Label(loaded[other.text].name.span, "loaded too")],
                     helps=["leave one of them out"],
                 )
@@ -259,7 +259,7 @@ def _need_helps(need: str, needing: Sequence[str], loaded: Iterable[str]) -> lis
 def _versions(
     packs: Sequence[PackDecl], book: NameBook, reporter: Reporter
 ) -> dict[str, list[Named[ElementDecl]]]:
-    """By global name, in load order: the declaration of an element that holds, then those that it overrides."""
+    """The declarations of each element by global name, in load order: the effective one first, then the overridden ones."""
     found: dict[str, list[Named[ElementDecl]]] = {}
     for pack in packs:
         for decl in pack.elements:
@@ -302,8 +302,8 @@ def _check_same_id(decl: ElementDecl, before: Sequence[Named[ElementDecl]], repo
 def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
     """The packs whose elements and channels are placed together, one group after the other.
 
-    A ruleset's own packs come first, those that are left out among them, for their places stay reserved. Then comes
-    each further pack by itself, after those that it needs: the order in which packs are named decides little.
+    A ruleset's own packs come first, packs that it leaves out included, because their positions stay reserved. Each
+    further pack follows by itself, after the packs that it needs: the order in which packs are named matters little.
     """
     own = ruleset.placed if ruleset else ()
     left_out = ruleset.left_out if ruleset else ()
@@ -316,7 +316,7 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
 def _claims(
     groups: Sequence[Sequence[PackDecl]], own: bool, versions: Mapping[str, list[Named[ElementDecl]]]
 ) -> list[Claim]:
-    """All elements in the order in which ids are decided. In each group those that ask for an id come first.
+    """All elements in the order in which ids are decided. In each group, elements that ask for an id come first.
 
     `own` says that the first group is a ruleset's.
     """
@@ -333,9 +333,9 @@ def _claims(
 def _claim(
     pack: str, decl: ElementDecl, versions: Sequence[Named[ElementDecl]] | None, own: bool
 ) -> Claim | None:
-    """The claim of an element that a pack defines first. What overrides it speaks for it."""
+    """The claim of an element, as its last override states it; None for a declaration that is an override itself."""
     if versions is None:
-        qualified = f"{pack}.{decl.name.text}"  # of a pack that is left out: its id stays reserved
+        qualified = f"{pack}.{decl.name.text}"  # defined by a pack that is left out: the id stays reserved
         return None if decl.override else Claim(f"-{qualified}", qualified, pack, decl, own, is_loaded=False)
     names = [f"{one.pack}.{one.decl.name.text}" for one in versions]
     final, asking = versions[0], _asking(versions) or versions[0].decl

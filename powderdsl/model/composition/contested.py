@@ -1,4 +1,4 @@
-"""Values of one element that several packs give: which one holds is defined, and who loses it is told."""
+"""Values of one element that several packs give: the order that decides, and a report of each replaced value."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def given_values(composition: Composition) -> Iterator[Given]:
 
 
 def report_contested(composition: Composition, reporter: Reporter) -> None:
-    """Report values that another one takes the place of."""
+    """Report values that are replaced by others."""
     known: dict[tuple[str, str], Given] = {}
     for value in given_values(composition):
         pack, name, element, key, syntax = value
@@ -51,7 +51,7 @@ def report_replaced(
     composition: Composition,
     reporter: Reporter,
 ) -> None:
-    """Report what an element has twice, as a pack and a place: a note where a pack means to, a warning where none can."""
+    """Report that a pack replaces what another one gives an element: a note if it needs that pack, else a warning."""
     (before, old), (after, new) = lost, held
     if before in composition.names.needs[after]:
         reporter.report(

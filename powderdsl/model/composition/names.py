@@ -1,4 +1,4 @@
-"""Which definition a word means: one namespace over all packs, in which packs that do not know each other may clash."""
+"""Name resolution: one namespace over all packs, in which packs that do not know each other may clash."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def needs_of(packs: Sequence[PackDecl]) -> dict[str, frozenset[str]]:
 
 
 def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> tuple[list[str], list[str]]:
-    """Names, each after those that it has to follow, else as they are given; and those that wait for each other."""
+    """The names in a stable topological order, and the names of the first cycle that was met."""
     ordered: list[str] = []
     stuck: list[str] = []
     waiting = list(names)
@@ -82,7 +82,7 @@ def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> tupl
 
 
 def needed_first(packs: Sequence[PackDecl]) -> list[PackDecl]:
-    """The packs in load order, but each after those that it needs. Packs that need each other stay as they are."""
+    """The packs in load order, but each after the packs that it needs. Packs that need each other keep their order."""
     by_name = {pack.name.text: pack for pack in packs}
     ordered, _ = in_order(by_name, {name: needs - {name} for name, needs in needs_of(packs).items()})
     return [by_name[name] for name in ordered]
@@ -115,12 +115,12 @@ class Named(Generic[T]):
 
     @property
     def word(self) -> str:
-        """Its name in its own file, if that is another one."""
+        """Its name in its own file if that differs from `name`, else empty."""
         return self.decl.name.text if self.decl.name.text != self.name else ""
 
 
 class NameBook:
-    """Collects the definitions of packs, in load order, and reports those that clash.
+    """Collects the definitions of packs, in load order, and reports clashes.
 
     `rename` has other global names, by qualified name; `reserved` are words that name nothing.
     """
@@ -201,7 +201,7 @@ class NameBook:
         return known.name
 
     def finish(self) -> Names:
-        """What every word means in every pack."""
+        """The meaning of every word in every pack."""
         meanings: dict[tuple[str, str], str] = {}
         for word, written in self._words.items():
             for pack in self.packs if any(one.name != word for one in written) else ():

@@ -1,4 +1,4 @@
-"""Names with a `?` that nothing defines, but that look like a known name: what is misspelled there is lost in silence."""
+"""Undefined optional names (`name?`) that look like a misspelled known name: they would be ignored silently."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def report_misspelled(
 
 
 def defined_words(pack: PackDecl) -> Iterator[str]:
-    """The names that other packs may ask for, and those under `let` and `scratch`."""
+    """The names that other packs may use, and the names under `let` and `scratch`."""
     yield from (one.name.text for one in (*pack.definitions, *pack.params, *pack.passes))
     for one in pack.passes:
         yield from (item.name.text for item in one.scratch)
@@ -97,7 +97,7 @@ def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
 
 
 def _meant(word: str, known: Iterable[str]) -> str | None:
-    """The name that a word was probably meant for: the first of those that are the fewest slips away."""
+    """The name that a word was probably meant for: the first of the closest ones."""
     near = {name: slips for name in known if (slips := _slips(word, name)) is not None}
     return min(near, key=lambda name: near[name], default=None)
 

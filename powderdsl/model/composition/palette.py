@@ -1,4 +1,4 @@
-"""Which number each element has: assigned when packs are composed, or recorded in a palette.
+"""The ids of elements: assigned when packs are composed, or recorded in a palette.
 
 A palette has the qualified name of the element of each id, or None where an id is free. Worlds, datasets and
 checkpoints keep one, so that they mean the same elements whatever else is loaded later.
@@ -35,7 +35,7 @@ class Claim:
 
 
 def composed_ids(claims: Iterable[Claim]) -> dict[str, int]:
-    """Ids by global name. What comes first is decided first, so further packs change nothing.
+    """Ids by global name. Earlier claims are decided first, so further packs change nothing.
 
     An element has the id that its file gives, unless that is taken. All others have the lowest free id above those of
     the ruleset's packs, or, without a ruleset, above all ids so far.
@@ -87,7 +87,7 @@ def recorded_ids(claims: Iterable[Claim], palette: Palette) -> dict[str, int]:
 def report_ids(
     claims: Sequence[Claim], ids: Mapping[str, int], reporter: Reporter, *, recorded: bool
 ) -> None:
-    """Report elements without an id, two of one pack with the same one, and those that could not have theirs."""
+    """Report elements without an id, two elements of one pack with the same id, and ids that differ from the file."""
     loaded = [claim for claim in claims if claim.is_loaded]
     lacking = [claim for claim in loaded if claim.name not in ids]
     if lacking:

@@ -14,7 +14,7 @@ MAX_PASSES = 200
 def order_passes(
     passes: dict[str, Named[PassDecl]], names: Names, reporter: Reporter
 ) -> tuple[Named[PassDecl], ...]:
-    """Sort passes by `after` and `before`; what those leave open is decided by load order. `names` are those of passes."""
+    """Sort passes by `after` and `before`, then by load order. `names` resolves names of passes."""
     if len(passes) > MAX_PASSES:
         last = list(passes.values())[MAX_PASSES].decl.name.span
         reporter.error(

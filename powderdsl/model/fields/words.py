@@ -19,7 +19,7 @@ FORMS = {
     "real": ("a number", "a number such as `3` or `-0.25`"),
     "vec2": ("a vector", "rows and columns, such as `1.5,-2`"),
 }
-"""What a word of each kind is, and how it is written."""
+"""For each kind: a noun for its words, and how they are written."""
 
 _FLAGS = {"yes": 1, "true": 1, "no": 0, "false": 0}
 _WHOLE = re.compile(r"-?[0-9]{1,7}")
@@ -30,7 +30,7 @@ Bounds = tuple[float, float]
 
 
 class WordProblem(Exception):
-    """What is wrong with a word: a code, a message, a label, and maybe fixes."""
+    """A word is not a value of its kind. Has a code, a message, a label, and maybe fixes."""
 
     def __init__(self, code: str, message: str, label: str, *helps: str):
         super().__init__(message)
