@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -11,7 +11,7 @@ from functools import cached_property
 from math import lcm
 from typing import Any, TypeVar
 
-from powderdsl.diagnostics import Label, Reporter
+from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.composition.claim_scopes import ClaimScopes, title_of
 from powderdsl.model.composition.names import NameBook, Named, Names, needed_first, report_unknown
@@ -32,7 +32,6 @@ from powderdsl.model.declarations import (
 )
 from powderdsl.model.types import Element
 from powderdsl.syntax.parse import reserved_words
-from powderdsl.syntax.yaml_tree import Scalar
 
 T = TypeVar("T", bound=Definition)
 
@@ -216,44 +215,36 @@ def _check_renamed(ruleset: RulesetDecl | None, renamed: AbstractSet[str], repor
 
 
 def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
+    """Report packs that cannot be loaded together, and packs that are needed and not loaded."""
     loaded = {pack.name.text: pack for pack in packs}
-    missing: dict[str, list[Scalar]] = {}
-    needing: dict[str, list[str]] = {}
+    missing: dict[str, dict[str, Span]] = {}
     for pack in packs:
         for need in pack.needs:
             if need.text not in loaded:
-                missing.setdefault(need.text, []).append(need)
-                needing.setdefault(need.text, []).append(pack.name.text)
+                missing.setdefault(need.text, {})[pack.name.text] = need.span
         for other in pack.conflicts:
             if other.text in loaded:
+                message = f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together"
+                secondary = [Label(loaded[other.text].name.span, "loaded too")]
+                helps = ["leave one of them out"]
                 reporter.error(
-                    "PD306",
-                    f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together",
-                    other.span,
-                    "declared here",
-                    secondary=[Label(loaded[other.text].name.span, "loaded too")],
-                    helps=["leave one of them out"],
+                    "PD306", message, other.span, "declared here", secondary=secondary, helps=helps
                 )
-    for name, places in missing.items():
-        first, *others = needing[name]
+    for name, needing in missing.items():
+        first, *others = needing
         count = f" and {len(others)} others need" if others else " needs"
+        close = get_close_matches(name, sorted(loaded.keys() - needing.keys()), n=1, cutoff=0.75)
+        fix = f"load it too, as in `{name}+{first}`"
+        if close:
+            fix = f"did you mean `{close[0]}`?"
+        elif others:
+            fix = (
+                f"load `{name}` too, or leave out what needs it: {', '.join(f'`{pack}`' for pack in needing)}"
+            )
         reporter.error(
-            "PD305",
-            f"pack `{first}`{count} `{name}`, which is not loaded",
-            places[0].span,
-            "not loaded",
-            secondary=[Label(place.span, "needed here too") for place in places[1:4]],
-            helps=_need_helps(name, [first, *others], loaded),
-        )
-
-
-def _need_helps(need: str, needing: Sequence[str], loaded: Iterable[str]) -> list[str]:
-    close = get_close_matches(need, sorted(set(loaded) - set(needing)), n=1, cutoff=0.75)
-    if close:
-        return [f"did you mean `{close[0]}`?"]
-    if len(needing) == 1:
-        return [f"load it too, as in `{need}+{needing[0]}`"]
-    return [f"load `{need}` too, or leave out what needs it: {', '.join(f'`{name}`' for name in needing)}"]
+            "PD305", f"pack `{first}`{count} `{name}`, which is not loaded", needing[first], "not loaded",
+            secondary=[Label(needing[pack], "needed here too") for pack in others[:3]], helps=[fix],
+        )  # fmt: skip
 
 
 def _versions(

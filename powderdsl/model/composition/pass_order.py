@@ -45,15 +45,10 @@ def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], repor
         if step in path:
             cycle = [*path[path.index(step) :], step]
         path.append(step)
-    labels = [
-        Label(earlier[later][first], f"`{first}` before `{later}`")
-        for later, first in itertools.pairwise(cycle)
+    steps = [
+        (earlier[later][first], f"`{first}` before `{later}`") for later, first in itertools.pairwise(cycle)
     ]
-    reporter.error(
-        "PD307",
-        "passes wait for each other: " + " after ".join(f"`{name}`" for name in cycle),
-        labels[0].span,
-        labels[0].text,
-        secondary=labels[1:],
-        helps=["take one of these names out of its `after` or `before`"],
-    )
+    (place, label), *more = steps
+    message = "passes wait for each other: " + " after ".join(f"`{name}`" for name in cycle)
+    helps = ["take one of these names out of its `after` or `before`"]
+    reporter.error("PD307", message, place, label, secondary=[Label(*step) for step in more], helps=helps)

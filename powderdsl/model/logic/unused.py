@@ -60,10 +60,10 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     words = {names.of(pack.name.text, word) for pack in composition.packs for word in pack_words(pack)}
     for ruleset in composition.lineage:
         words |= {word for line in ruleset.invariants for word in words_of(line)}
-        words |= {scalar.text.removesuffix("?").partition(".")[0] for scalar in ruleset.matrix}
+        words |= {scalar.word.partition(".")[0] for scalar in ruleset.matrix}
     for name, field in composition.fields.items():
         if name not in words and field.decl.name.text not in words:
-            _unused("field", name, field.decl.name.span, reporter)
+            _unused("field", name, field.span, reporter)
     for block in (block for pack in composition.packs for one in pack.passes for block in one.block.walk()):
         later = {word for line in block.lines[len(block.lets) :] for word in words_of(line)}
         later |= {
@@ -81,9 +81,7 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
 
 def pack_words(pack: PackDecl) -> Iterator[str]:
     """Every name in a pack's rules, sets, invariants, tests and color ramps."""
-    for ramp in (*(one.ramp for one in pack.elements), *(one.ramp for one in pack.also)):
-        if ramp is not None:
-            yield ramp.field.text.removesuffix("?").rpartition(".")[2]
+    yield from (one.ramp.field.word.rpartition(".")[2] for one in pack.entries if one.ramp)
     for lines in (
         pack.lines,
         pack.invariants,

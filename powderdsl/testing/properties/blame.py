@@ -245,7 +245,7 @@ def _doings(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
             yield name, Cause(pack, element.name.span, f"replaces `{name}`")
     for prop in decl.properties:
         for key, _ in prop.values:
-            name = key.text.removesuffix("?")
+            name = key.word
             yield name, Cause(pack, key.span, f"gives `{name}` a value of `{prop.name.text}`")
     for pass_ in decl.passes:
         yield "", Cause(pack, pass_.name.span, f"has the pass `{pass_.name.text}`")
