@@ -116,7 +116,8 @@ def _with_conditions(statement: Compute, graph: Graph) -> Compute:
     done: dict[int, Node] = {}
     for node in sorted(nodes, key=lambda node: random[id(node)]):  # conditions contain no draws
         args = [done[id(arg)] for arg in node.args]
-        asked = [done[id(flag)] for flag in where.get(id(node), {}).values()]
+        flags = {} if id(node) in fixed else where.get(id(node), {})  # a variable's value is read everywhere
+        asked = [done[id(flag)] for flag in flags.values()]
         if node.op in DRAWS and takes_bits(node) and asked:
             args.append(combined("and", asked, graph))
         done[id(node)] = with_args(node, tuple(args), graph)
