@@ -139,7 +139,7 @@ class Elaborator:
         """Whether a local name is new; reports one that hides another."""
         hides = self.typer.hides(name.text, name.span, scope)
         if hides:
-            message, label = f"`{name.text}` already means something here", "hides the other meaning"
+            message, label = f"`{name.text}` is already defined here", "hides that definition"
             self.typer.reporter.error("PD308", message, name.span, label, helps=["choose another name"])
         return not hides
 
@@ -336,7 +336,7 @@ class Elaborator:
         if kind.name == "int" and (value.kind.lo < kind.lo or value.kind.hi > kind.hi):
             message = f"a value of {value.kind} goes into `{name}`, which holds {kind}"
             helps = [f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"]
-            self.typer.reporter.report("PD408", message, span, "it is cut off at the bounds", helps=helps)
+            self.typer.reporter.report("PD408", message, span, "it is clamped to the bounds", helps=helps)
 
     def _target(self, syntax: Syntax, scope: Scope) -> tuple[str, Kind, Offset]:
         """The field that is assigned, its kind, and where."""

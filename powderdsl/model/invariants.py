@@ -261,7 +261,7 @@ def _says_nothing(typer: Typer, span: Span, label: str, *, is_empty: bool = Fals
     """Report an invariant that no world can break. What is empty may need a pack that is not loaded: Unresolved."""
     if is_empty and typer.absent:
         raise Unresolved(", ".join(sorted(typer.absent)))
-    typer.reporter.report("PD510", "this invariant says nothing", span, label, helps=["remove it"])
+    typer.reporter.report("PD510", "this invariant is always true", span, label, helps=["remove it"])
 
 
 _CLAIMS: dict[str, Callable[[Typer, Syntax, Scope], Claim]] = {

@@ -339,7 +339,7 @@ class _PackReader(Reader):
             self.reporter.error(
                 "PD110", "`after` says how many steps", after.span, "not a number of steps", helps=helps
             )
-        field = "a mapping with an entry for each field", "write `FIELD: …`, each on a line of its own"
+        field = "a mapping with an entry for each field", "write `FIELD: …`, each on its own line"
         drawing = "a drawing of `{}`", "write a word a cell, a row a line, below `|`"
         return TestDecl(
             name,

@@ -311,7 +311,7 @@ class Reader:
             return False
         comment = comment_after(key)
         if row.required or row.shape in VALUES:
-            place, label, fix = key.span, "nothing stands after it", f"`{key.text}`: {row.about}"
+            place, label, fix = key.span, "it has no entries", f"`{key.text}`: {row.about}"
             if comment:
                 place, label = comment, "a comment, to YAML"
                 fix = f'put quotes around it: {key.text}: "{comment.text}"'
@@ -320,7 +320,7 @@ class Reader:
         if row.shape not in SECTIONS or (row.shape == "text" and comment):
             return False
         self.reporter.report(
-            "PD113", f"`{key.text}` is empty", key.span, "nothing stands after it",
+            "PD113", f"`{key.text}` is empty", key.span, "it has no entries",
             helps=[f"`{key.text}`: {row.about}", "remove it, or indent what belongs to it"],
         )  # fmt: skip
         return True
@@ -355,7 +355,7 @@ class Reader:
         if isinstance(node, Scalar) and node.text == "":
             return
         wanted = f"a mapping with an entry for each {what.split(' ', 1)[-1]}"
-        for key, value in self.pairs(node, wanted, "write `NAME: …`, each on a line of its own"):
+        for key, value in self.pairs(node, wanted, "write `NAME: …`, each on its own line"):
             if self.name(key, what):
                 yield key, value
 

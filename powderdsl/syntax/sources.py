@@ -48,7 +48,7 @@ def path_beside(name: str, span: Span, reporter: Reporter) -> Path | None:
     try:
         return inside(Path(span.source.name).parent, name)
     except ValueError as error:
-        helps = ["put the file beside this one, or below, and name it from here"]
+        helps = ["move the file into this folder or below it, and write its path from here"]
         reporter.error(
             "PD112", f"the path `{name}` leaves the folder of the file", span, str(error), helps=helps
         )

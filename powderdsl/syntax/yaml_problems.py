@@ -16,7 +16,7 @@ from powderdsl.diagnostics import Label, Reporter, Source, Span
 
 QUOTE = "put quotes around the whole value"
 _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
-COMMENT = "YAML takes a `#` after a space for a comment"
+COMMENT = "YAML reads a `#` after a space as a comment"
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ class _Builder:
             deep = f"document nested more than {MAX_DEPTH} deep"
             large = f"document of more than {MAX_NODES:,} values"
             place = Span(self.source, event.start_mark.index, event.start_mark.index + 1)
-            self.reporter.error("PD106", deep if depth > MAX_DEPTH else large, place, "here it is too much")
+            self.reporter.error("PD106", deep if depth > MAX_DEPTH else large, place, "the limit is exceeded here")
             raise _Abort
         if event.anchor:  # an alias has the name of its anchor
             what = "alias `*" if isinstance(event, yaml.AliasEvent) else "anchor `&"
@@ -189,8 +189,8 @@ class _Builder:
             elif plain_empty and self._in_braces(start):
                 self._no_value(key, first=not seen)
             elif key.text in seen:
-                message = f"key `{key.text}` stands twice in one mapping"
-                fix = "keep one of them, or join them"
+                message = f"key `{key.text}` occurs twice in one mapping"
+                fix = "remove one of them, or merge them"
                 other = Label(seen[key.text], "first time here")
                 self._fail("PD104", message, key.span, "second time here", fix, other)
             else:
@@ -202,7 +202,7 @@ class _Builder:
     def _no_value(self, key: Scalar, *, first: bool) -> None:
         """Nothing in `{…}` has a key without a value: most often a comma has cut a value in two."""
         if self.source.text[key.span.end :].lstrip().startswith(":"):
-            label = "nothing stands after its `:`"
+            label = "nothing follows its `:`"
             fix = 'write its value; one with `#` in it needs quotes: "#RRGGBB"'
         elif first:
             label, fix = "a key without a `:`", "`{…}` holds `key: value` pairs; rules stand outside braces"

@@ -196,7 +196,7 @@ class _TaskReader:
     def take(self, word: yaml_tree.Scalar | Word) -> None:
         """Report a new name that already means something, or that statements and expressions need."""
         if word.text in reserved_words() | rule_words() | {*ACTION_WORDS, *FUNCTIONS, *RULE_FUNCTIONS}:
-            self.reporter.error("PD311", f"`{word.text}` is a word of the language", word.span, "taken")
+            self.reporter.error("PD311", f"`{word.text}` is a reserved word", word.span, "taken")
         elif word.text in self.taken:
             message = f"`{word.text}` already means something"
             self.reporter.error("PD308", message, word.span, "second meaning")

@@ -67,7 +67,7 @@ class GoalChecker:
         """A reward, or None after reporting what is wrong with it."""
         found = self._checked(syntax)
         if found is not None and not any(one.op in ("measure", "action") for one in parts_of(found)):
-            label = "it says the same of every world"
+            label = "it has the same value in every world"
             self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
         return found
 

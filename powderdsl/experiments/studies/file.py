@@ -207,7 +207,7 @@ class _StudyReader:
     ) -> dict[str, dict[str, str]]:
         """What each value sets: the same names for all of them."""
         if not isinstance(node, yaml_tree.Mapping):
-            self.reader.shape(node, "a mapping", "write `VALUE: {NAME: VALUE, …}`, each on a line of its own")
+            self.reader.shape(node, "a mapping", "write `VALUE: {NAME: VALUE, …}`, each on its own line")
             return {}
         taken = (SEED, SIZE, *(axis.name for axis in self.axes), *self.set_names)
         found = {

@@ -55,12 +55,12 @@ def report_replaced(
     (before, old), (after, new) = lost, held
     if before in composition.names.needs[after]:
         reporter.report(
-            "PD317", f"`{after}` replaces the `{what}` of `{element}`", new, "this one holds",
+            "PD317", f"`{after}` replaces the `{what}` of `{element}`", new, "this value is used",
             secondary=[Label(old, f"the one that `{before}` gives")],
         )  # fmt: skip
         return
     reporter.report(
-        "PD316", f"packs `{before}` and `{after}` give `{element}` a different `{what}`", new, "this one holds",
+        "PD316", f"packs `{before}` and `{after}` give `{element}` a different `{what}`", new, "this value is used",
         secondary=[Label(old, "this one is lost")],
         helps=[f"say `needs: {before}` in `{after}` if it means to replace it", "or remove one of them"],
     )  # fmt: skip

@@ -150,7 +150,7 @@ class NameBook:
         """Whether a word may name something; reports one that belongs to the language."""
         if scalar.text in self.reserved:
             self.reporter.error(
-                "PD311", f"`{scalar.text}` is a word of the language", scalar.span, f"cannot name {a(kind)}",
+                "PD311", f"`{scalar.text}` is a reserved word", scalar.span, f"cannot name {a(kind)}",
                 helps=[f"write `{scalar.text}_`, or choose another name"],
             )  # fmt: skip
         return scalar.text not in self.reserved

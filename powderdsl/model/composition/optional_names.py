@@ -47,8 +47,8 @@ def report_misspelled(
         pack = others.get(meant) if meant not in known else None
         first, *more = places
         reporter.report(
-            "PD315", f"no pack that comes with powderdsl or is loaded defines `{word}`", first,
-            "with its `?`, this is never there",
+            "PD315", f"no loaded or shipped pack defines `{word}`", first,
+            "with the `?`, it is always absent",
             secondary=[Label(span, "and here") for span in more[:MAX_PLACES]],
             helps=[f"did you mean `{meant}?`" + (f", which `{pack}` defines" if pack else "")],
         )  # fmt: skip

@@ -49,6 +49,6 @@ def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], repor
         (earlier[later][first], f"`{first}` before `{later}`") for later, first in itertools.pairwise(cycle)
     ]
     (place, label), *more = steps
-    message = "passes wait for each other: " + " after ".join(f"`{name}`" for name in cycle)
+    message = "the order of passes is a cycle: " + " after ".join(f"`{name}`" for name in cycle)
     helps = ["take one of these names out of its `after` or `before`"]
     reporter.error("PD307", message, place, label, secondary=[Label(*step) for step in more], helps=helps)

@@ -241,7 +241,7 @@ class Coercer:
         """An offset that rules can reach."""
         if max(abs(offset[0]), abs(offset[1])) > MAX_OFFSET:
             label = f"rules reach {MAX_OFFSET} cells a step"
-            raise self.fail("PD409", "a neighbor too far away", span, label)
+            raise self.fail("PD409", "the neighbor is too far away", span, label)
         return offset
 
     def bounded(self, value: Expr, span: Span) -> Expr:

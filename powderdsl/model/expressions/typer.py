@@ -390,7 +390,7 @@ class Typer(Coercer):
         for binding in bindings:
             variable, domain = binding.children
             if self.hides(variable.text, variable.span, scope) or variable.text in domains:
-                message, label = f"`{variable.text}` already means something here", "hides the other meaning"
+                message, label = f"`{variable.text}` is already defined here", "hides that definition"
                 raise self.fail("PD308", message, variable.span, label, "choose another name")
             self.used.add(variable.text)
             # A variable is turned where it is used, and only there.

@@ -80,7 +80,7 @@ class Conflict:
             )
         one = self.first == self.second
         reporter.error(
-            self.code, self.message + where, claim(self.second), "two of these can meet" if one else "claims it too",
+            self.code, self.message + where, claim(self.second), "two of these can overlap" if one else "claims it too",
             secondary=[] if one else [Label(claim(self.first), "claims a cell")], notes=notes, helps=self.helps,
         )  # fmt: skip
 
@@ -176,7 +176,7 @@ def _report_fate(span: Span, fate: _Fate, relaxed: Facts, elaborated: Elaborated
     """Report a rule that never fires, and why, or that changes nothing."""
     if fate.fires:
         if not fate.useful:
-            label = "the cell already is what it becomes"
+            label = "the cell already holds that element"
             fix = "remove it, or name another element after `->`"
             reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
         return
@@ -187,8 +187,8 @@ def _report_fate(span: Span, fate: _Fate, relaxed: Facts, elaborated: Elaborated
     elif any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in fate.silent):
         reason = "no loaded element has the properties it asks for"
     else:
-        fix = "look for conditions that exclude each other, or that no element's properties meet"
-        label = "no cell can fulfill all of it"
+        fix = "look for conditions that exclude each other, or that the properties of no element meet"
+        label = "no cell can meet all of its conditions"
         reporter.report("PD503", "this rule can never fire", span, label, helps=[fix])
         return
     label = "cannot happen with these packs"
@@ -375,13 +375,13 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
         message = "a cell may be both mover and target"
         note = "the moves of one substep happen at once: no cell may take part in two of them"
         helps = (
-            "add a condition that a target cannot fulfill, such as a comparison of densities",
-            "or choose what happens then: `conflicts: drop_both`",
+            "add a condition that a target cannot meet, such as a comparison of densities",
+            "or choose a policy: `conflicts: drop_both`",
         )
         return Conflict("PD501", message, first.span, first.span, (note,), helps)
     code = "PD501" if isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move)) else "PD502"
-    message = "two rules may claim one cell in the same substep"
-    choice = "or choose what happens then: `conflicts: first_wins` or `conflicts: drop_both`"
+    message = "two rules may claim the same cell in one substep"
+    choice = "or choose a policy: `conflicts: first_wins` or `conflicts: drop_both`"
     return Conflict(code, message, first.span, second.span, (), (_EXCLUDE, choice))
 
 

@@ -87,7 +87,7 @@ def _report_decided(passes: tuple[Pass, ...], known: Sequence[Span], reporter: R
     for span, found in outcomes.items():
         if found in ({True}, {False}) and not _inside_any(span, known):
             reporter.report(
-                "PD513", "this comparison decides nothing", span, "it comes out the same in every world",
+                "PD513", "this comparison decides nothing", span, "its result is the same in every world",
                 helps=["look at the bounds of both sides", "remove it, if it is meant so"],
             )  # fmt: skip
 
@@ -161,7 +161,7 @@ def _report_overruled(
             continue
         words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
         reporter.report(
-            "PD514", "this rule is always overruled", span, "nothing comes of it",
+            "PD514", "this rule is always overruled", span, "it has no effect",
             secondary=[Label(winner.span, words)],
             helps=["make their conditions exclude each other", "or remove one of them"],
         )  # fmt: skip

@@ -66,7 +66,7 @@ def refuted(ruleset: Ruleset, ledger: Ledger) -> tuple[Diagnostic, ...]:
             "does not hold",
             secondary=[Label(span, "breaks it") for span in one.counterexample.culprits[:3]],
             notes=world,
-            helps=["fix the rule, or say less: `without SET` leaves worlds out"],
+            helps=["fix the rule, or weaken the invariant: `without SET` excludes worlds"],
         )
     return reporter.diagnostics
 
