@@ -134,7 +134,7 @@ class _Builder:
             deep = f"document nested more than {MAX_DEPTH} deep"
             large = f"document of more than {MAX_NODES:,} values"
             place = Span(self.source, event.start_mark.index, event.start_mark.index + 1)
-            self.reporter.error("PD106", deep if depth > MAX_DEPTH else large, place, "the limit is exceeded here")
+            self.reporter.error("PD106", deep if depth > MAX_DEPTH else large, place, "over the limit")
             raise _Abort
         if event.anchor:  # an alias has the name of its anchor
             what = "alias `*" if isinstance(event, yaml.AliasEvent) else "anchor `&"

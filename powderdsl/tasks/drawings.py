@@ -95,7 +95,7 @@ class Drawer:
                 found += [Group(self.count, number(1), 1, (), (drawing,))] if drawing else []
             if self.cells > MAX_DRAWINGS:
                 message = f"a world of more than {MAX_DRAWINGS:,} drawings"
-                self.reporter.error("PD508", message, item.span, "the limit is exceeded here", helps=["draw less"])
+                self.reporter.error("PD508", message, item.span, "over the limit", helps=["draw less"])
                 break
         return tuple(found)
 
