@@ -1,6 +1,6 @@
 """Boolean circuits on bit planes: gates that fold as they are built, adders, comparators, truth tables.
 
-An integer is a `Bits`: planes from the lowest bit, and whether the highest one is a sign (two's complement).
+An integer is a `Bits`: bit planes from the lowest, and whether the highest is a sign (two's complement).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from powderdsl.ir.ops import FLAG, Node, Offset
 
 @dataclass(frozen=True)
 class Bits:
-    """Planes of an integer, lowest first."""
+    """The bit planes of an integer, lowest first."""
 
     planes: tuple[Node, ...]
     signed: bool = False

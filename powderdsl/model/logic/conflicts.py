@@ -74,10 +74,8 @@ class Conflict:
         where = f" ({labels[0]})" if labels[0] else ""
         notes = [*filter(None, [example]), *self.notes]
         if len(labels) > 1:
-            more = "copy" if len(labels) == 2 else "copies"
-            notes.append(
-                f"the same in {len(labels) - 1} more {more} of the rule that its loop or symmetry makes"
-            )
+            more = "1 more copy" if len(labels) == 2 else f"{len(labels) - 1} more copies"
+            notes.append(f"the same in {more} of the rule that its loop or symmetry makes")
         one = self.first == self.second
         reporter.error(
             self.code, self.message + where, claim(self.second), "two of these can overlap" if one else "claims it too",

@@ -117,10 +117,7 @@ def decided(node: Expr) -> bool | None:
 
 
 def _inside_any(span: Span, others: Sequence[Span]) -> bool:
-    return any(
-        span.source == other.source and other.start <= span.start and span.end <= other.end
-        for other in others
-    )
+    return any(span.source == o.source and o.start <= span.start and span.end <= o.end for o in others)
 
 
 def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:

@@ -36,18 +36,13 @@ def report_unused(composition: Composition, typer: Typer, produced: frozenset[in
     _report_unwritten(composition, reporter)
     for element in composition.elements.values():
         if element.id not in produced:
-            reporter.report(
-                "PD504",
-                f"no rule produces `{element.name}`",
-                element.span,
-                "it only comes from the start world, or by painting",
-            )
+            label = "it only comes from the start world, or by painting"
+            reporter.report("PD504", f"no rule produces `{element.name}`", element.span, label)
 
 
 def _unused(what: str, name: str, span: Span, reporter: Reporter) -> None:
-    reporter.report(
-        "PD507", f"the {what} `{name}` is never used", span, "no rule reads it", helps=["remove it"]
-    )
+    message = f"the {what} `{name}` is never used"
+    reporter.report("PD507", message, span, "no rule reads it", helps=["remove it"])
 
 
 def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
@@ -65,14 +60,8 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
         if name not in words and field.decl.name.text not in words:
             _unused("field", name, field.span, reporter)
     for block in (block for pack in composition.packs for one in pack.passes for block in one.block.walk()):
-        later = {word for line in block.lines[len(block.lets) :] for word in words_of(line)}
-        later |= {
-            word
-            for inner in block.walk()
-            if inner is not block
-            for line in inner.lines
-            for word in words_of(line)
-        }
+        inner = [line for one in block.walk() if one is not block for line in one.lines]
+        later = {word for line in (*block.lines[len(block.lets) :], *inner) for word in words_of(line)}
         for scalar, value in reversed(block.lets):
             if scalar.text not in later:
                 _unused("value", scalar.text, scalar.span, reporter)
