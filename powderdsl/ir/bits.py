@@ -19,7 +19,6 @@ from powderdsl.ir.ops import (
     PassGraph,
     Program,
     SlotType,
-    SubstepGraph,
     Type,
     kernel_rows,
     nodes_of,
@@ -84,10 +83,10 @@ class _PassBits:
         for one in pass_.substeps:
             writes = tuple(w for name, node in one.writes for w in self._write(name, node))
             guards = tuple(self._flag(guard) for guard in one.guards)
-            substeps.append(SubstepGraph(one.label, one.place, writes, guards))
+            substeps.append(replace(one, writes=writes, guards=guards))
         outputs = tuple(w for name, node in pass_.outputs for w in self._write(name, node))
         kept = tuple((name, node) for name, node in outputs if not (node.op == "input" and node.attr == name))
-        return PassGraph(pass_.name, pass_.pack, tuple(substeps), kept)
+        return replace(pass_, substeps=tuple(substeps), outputs=kept)
 
     def _write(self, name: str, node: Node) -> list[tuple[str, Node]]:
         """The writes of bit planes that a write of a slot becomes. The range of a scratch slot is that of the node."""

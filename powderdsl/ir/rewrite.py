@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import Node, PassGraph, SubstepGraph, nodes_of
+from powderdsl.ir.ops import Node, PassGraph, nodes_of
 
 Rewrite = Callable[[Node, Builder], Node | None]
 """From a node to its replacement, or None for no change."""
@@ -82,13 +83,12 @@ def rewrite_pass(pass_: PassGraph, rules: Rules) -> PassGraph:
         build.place = node.places[0] if node.places else ""
         done[id(node)] = finish(build.rebuild(node, tuple(done[id(arg)] for arg in node.args)))
     substeps = tuple(
-        SubstepGraph(
-            one.label,
-            one.place,
-            tuple((slot, done[id(node)]) for slot, node in one.writes),
-            tuple(done[id(guard)] for guard in one.guards),
+        replace(
+            one,
+            writes=tuple((slot, done[id(node)]) for slot, node in one.writes),
+            guards=tuple(done[id(guard)] for guard in one.guards),
         )
         for one in pass_.substeps
     )
     outputs = tuple((slot, done[id(node)]) for slot, node in pass_.outputs)
-    return PassGraph(pass_.name, pass_.pack, substeps, outputs)
+    return replace(pass_, substeps=substeps, outputs=outputs)

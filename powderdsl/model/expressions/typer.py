@@ -88,13 +88,8 @@ class Typer(Coercer):
             self._rule_start = self._work  # once for a rule is enough
             what = "a rule that expands" if self._work <= MAX_WORK else "rules that expand"
             span, label = self._rule_span or syntax.span, "written out, it has thousands of parts"
-            raise self.fail(
-                "PD508",
-                f"{what} to too much",
-                span,
-                label,
-                "loop over fewer things, or name parts under `let:`",
-            )
+            fix = "loop over fewer things, or name parts under `let:`"
+            raise self.fail("PD508", f"{what} to too much", span, label, fix)
         return HANDLERS[syntax.kind](self, syntax, scope)
 
     def start_rule(self, span: Span) -> None:
