@@ -1,1 +1,1 @@
-"""What can be said of rules without running them."""
+"""Static analysis: facts about rules that need no run."""

@@ -24,7 +24,7 @@ Ids = frozenset[int]
 
 @dataclass(frozen=True)
 class Wants:
-    """What a line asks of a world. Of each of `needs` one element must exist, or the line cannot happen.
+    """The elements that a line depends on. Of each of `needs` one element must exist, or the line cannot happen.
 
     `copies`: ids that it only brings about where these already exist.
     """
@@ -34,7 +34,7 @@ class Wants:
 
 
 def find_wants(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Wants]:
-    """What each line that may happen asks for."""
+    """The needs of each line that may happen."""
     named = named_by_fields(ruleset)
     found: dict[RuleLine, Wants] = {}
     for pass_ in ruleset.passes:
@@ -51,7 +51,7 @@ def find_wants(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Wants]:
 
 
 def _wants(rule: Rule, asked: Asked, lets: list[Let], named: Ids) -> Wants:
-    """What one rule asks for. `lets` were fixed earlier in the pass."""
+    """The needs of one rule. `lets` were fixed earlier in the pass."""
     nodes = list(_nodes_of(rule, {**{let.name: let.value for let in lets}, **asked.lets}))
     reads_names = any(node.op in ("field", "let") and node.kind == ELEMENT for node in nodes)
     sets = [frozenset(node.value) for node in nodes if node.op == "member"]
@@ -71,7 +71,7 @@ def _wants(rule: Rule, asked: Asked, lets: list[Let], named: Ids) -> Wants:
 
 
 def _either(first: Wants, second: Wants) -> Wants:
-    """What both of two rules ask for: one of what the first needs, or of what the second needs, must exist."""
+    """The needs that two rules share: an element that the first or the second needs must exist."""
     joined = dict.fromkeys(a | b for a in first.needs for b in second.needs)
     least = [ids for ids in joined if not any(other < ids for other in joined)]
     return Wants(tuple(sorted(least, key=_by_size)[:MAX_NEEDS]), first.copies & second.copies)
@@ -110,7 +110,7 @@ def _nodes_of(rule: Rule, lets: dict[str, Expr]) -> Iterator[Expr]:
 class Lacking:
     """A substep in a world without some elements, which has had none of them since the step began.
 
-    Rival rules are left out of account: more is taken for possible.
+    Rival rules are ignored, so more is considered possible.
     """
 
     def __init__(self, asked: Asked, gone: Ids, earlier: list[Let]):

@@ -31,11 +31,7 @@ def _head(ledger: Ledger) -> Iterator[str]:
 
 def _sums(ledger: Ledger) -> Iterator[str]:
     yield "sums of cells"
-    for title, sums in (
-        ("constant", ledger.constant_sums),
-        ("never falls", ledger.rising_sums),
-        ("never rises", ledger.falling_sums),
-    ):
+    for title, sums in ledger.sums.items():
         for names in sums:
             yield f"  {title:<12} {_sum(names, ledger)}"
 
@@ -84,7 +80,7 @@ TRENDS = {
     "never rises": "never rises",
     "not decided": "may rise and fall",
 }
-"""What can be said of an element's number of cells, for JSON, and in words."""
+"""The trends of an element's number of cells, for JSON, and in words."""
 
 
 def trend(ledger: Ledger, name: str) -> str:

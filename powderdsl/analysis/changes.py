@@ -1,4 +1,4 @@
-"""What each line of rules may do: which elements become which, which are moved, which fields are written.
+"""Effects of each line of rules: which elements become which, which are moved, which fields are written.
 
 Everything found here is an upper bound. What a rule is not said to do, it cannot do, in no world: the search of
 `model.logic.satisfy` has excluded it. What it is said to do it may do, or the search could not exclude it.
@@ -46,7 +46,7 @@ class RuleLine:
 
 @dataclass
 class Found:
-    """What the rules of one line may do, by ids. `pairs` are (before, after), never of one element."""
+    """Effects of the rules of one line, by ids. `pairs` are (before, after), never of one element."""
 
     line: RuleLine
     fires: bool = False
@@ -77,7 +77,7 @@ class Asked:
         return not rivals or possible(self.facts, (*first, *rivals), self.lets)
 
     def rivals(self, rule: Rule) -> list[Condition]:
-        """What must not hold for the rule to happen, by the substep's conflict policy.
+        """The conditions that must not hold for the rule to happen, by the substep's conflict policy.
 
         Under ``drop_both`` no other rule may claim its cells; under ``first_wins`` no transform before it may. An
         earlier swap or move that is wanted may itself be dropped, so that says nothing.
@@ -124,12 +124,12 @@ def is_not(number: int, at: Offset = HERE) -> Condition:
 
 
 def ledger_facts(ruleset: Ruleset) -> Facts:
-    """What is known of cells, with work for all questions of one part of a ledger."""
+    """Facts about cells, with work for all questions of one part of a ledger."""
     return replace(facts_of(ruleset), budget=Budget(BUDGET))
 
 
 def find_changes(ruleset: Ruleset, facts: Facts) -> list[Found]:
-    """What each line may do, in the order in which the lines run first."""
+    """Effects of each line, in the order in which the lines first run."""
     found: dict[RuleLine, Found] = {}
     for pass_, moment in ruleset.substeps():
         asked = Asked.of(moment, facts)
@@ -186,7 +186,7 @@ def overwritten(rule: Move, asked: Asked) -> list[int]:
 
 
 def becomes(rule: Transform, asked: Asked, known: Pairs) -> Iterator[tuple[int, int]]:
-    """The pairs (before, after) of a transform, without those that are known already."""
+    """The pairs (before, after) of a transform that are not known yet."""
     ids = asked.facts.ids
     if rule.target.op == "const":
         after = int(rule.target.value)
@@ -206,7 +206,7 @@ def becomes(rule: Transform, asked: Asked, known: Pairs) -> Iterator[tuple[int, 
 
 
 def _chains(asked: Asked) -> Iterator[tuple[Move, Pairs]]:
-    """What moves of different kinds may do together, where one goes to the place that another leaves.
+    """Effects of moves of different kinds together, where one goes to the place that another leaves.
 
     Of such a row the first leaves its element behind and the last overwrites one: these need not be of one rule.
     """

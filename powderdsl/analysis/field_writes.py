@@ -1,4 +1,4 @@
-"""Which lines write which fields, and the bounds that values keep to."""
+"""The lines that write each field, and the bounds of its values."""
 
 from __future__ import annotations
 
@@ -43,20 +43,16 @@ def find_fields(ruleset: Ruleset, found: Iterable[Found]) -> tuple[FieldEntry, .
         default = show_value(ruleset, item.kind, item.default)
         for identity, value in item.own:
             default += f", {element_name(ruleset, identity)} as {show_value(ruleset, item.kind, value)}"
-        fresh = (min(item.defaults), max(item.defaults)) if item.kind.name == "int" else None
-        entries.append(
-            _entry(item.name, item.kind, default, item.at == "element", fresh, writes.get(item.name, []))
-        )
+        bounds = (min(item.defaults), max(item.defaults)) if item.kind.name == "int" else None
+        entries.append((item.name, item.kind, default, item.at == "element", bounds))
+    params = {param.name: param.kind for param in ruleset.params}
     for prop in ruleset.properties:
         if prop.stored:
-            params = {param.name: param.kind for param in ruleset.params}
             kinds = [params[v] if isinstance(v, str) else Kind("int", v, v) for v in prop.values]  # type: ignore[arg-type]
             hull = (min(kind.lo for kind in kinds), max(kind.hi for kind in kinds))
-            fresh = hull if prop.kind.name == "int" else None
-            entries.append(
-                _entry(prop.name, prop.kind, "its element has it", True, fresh, writes.get(prop.name, []))
-            )
-    return tuple(entries)
+            bounds = hull if prop.kind.name == "int" else None
+            entries.append((prop.name, prop.kind, "its element has it", True, bounds))
+    return tuple(_entry(*entry, writes.get(entry[0], [])) for entry in entries)
 
 
 def _entry(
@@ -69,9 +65,8 @@ def _entry(
 ) -> FieldEntry:
     declared = (kind.lo, kind.hi) if kind.name in ("int", "real", "vec2") else None
     reaches: dict[RuleLine, list[tuple[float | None, float | None]]] = {}
-    if kind.name == "int":
-        for line, assign in writes:
-            reaches.setdefault(line, []).append(reach(assign, (kind.lo, kind.hi)))
+    for line, assign in writes if kind.name == "int" else ():
+        reaches.setdefault(line, []).append(reach(assign, (kind.lo, kind.hi)))
     lines = tuple((line, *_hull(parts)) for line, parts in reaches.items())
     if fresh is not None:
         low, high = _hull([fresh, *(parts[1:] for parts in lines)])

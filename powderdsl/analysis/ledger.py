@@ -45,10 +45,10 @@ Verdict = Proven | NotProven
 
 @dataclass(frozen=True)
 class RuleEntry:
-    """What one line may do, at most.
+    """Upper bounds of what one line does.
 
     `changes` are pairs (before, after) of elements: in a cell where the first was, the second is. `moves` are the
-    elements that it carries away or pushes aside. `fires` is False if it is proven never to happen.
+    elements that it carries away or pushes aside. `fires` is False if it is proven that it never happens.
 
     Of each of `needs` one element must exist, or the line cannot happen. `copies` are elements that it makes only where
     they exist already. To exist is to be held by a cell, or named by a field, at the start of
@@ -65,7 +65,7 @@ class RuleEntry:
 
 @dataclass(frozen=True)
 class Ledger:
-    """What the rules of a ruleset do, line by line, and what can be concluded. Elements go by their names.
+    """The effects of a ruleset's rules, line by line, and conclusions from them. Elements are given by name.
 
     `complete` is False if the rules were too many to be asked about everything: then more is taken for possible.
     `named` are the elements that fields may name although no cell ever held them.
@@ -105,7 +105,7 @@ class Ledger:
 
     @cached_property
     def rising_sums(self) -> tuple[tuple[str, ...], ...]:
-        """For each element the smallest sum with it that never falls, without those that are constant.
+        """For each element the smallest sum with it that never falls, unless that sum is constant.
 
         It holds all that the element may become. Every other sum of different elements that cannot fall is joined of
         these and of constant ones.
@@ -116,6 +116,15 @@ class Ledger:
     def falling_sums(self) -> tuple[tuple[str, ...], ...]:
         """The same for sums that never rise: all that may become the element."""
         return self._closed_sums([(after, before) for before, after in self.changes])
+
+    @property
+    def sums(self) -> dict[str, tuple[tuple[str, ...], ...]]:
+        """All of these sums by what holds for them."""
+        return {
+            "constant": self.constant_sums,
+            "never falls": self.rising_sums,
+            "never rises": self.falling_sums,
+        }
 
     def _closed_sums(self, pairs: Iterable[tuple[str, str]]) -> tuple[tuple[str, ...], ...]:
         """Each element with everything that it reaches along some pairs, without the constant sums."""

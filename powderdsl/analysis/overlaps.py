@@ -19,7 +19,7 @@ OUTCOMES = {
     "cut off": "both change a number of a cell at once: at the bounds of its range the order matters",
     "first in turn": "both may want to turn a cell into something: the one that runs first does",
 }
-"""What becomes of two rules that meet, in words."""
+"""Outcomes for two rules that meet, in words."""
 
 MAX_LINES = 64
 """Lines that transform cells, up to which every two of different substeps are compared."""
@@ -58,7 +58,7 @@ def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[O
     """Rules of one substep that may claim one cell, where a policy decides."""
     if asked.moment.policy == "prove":
         return
-    # What is always dropped meets others too: here only the conditions count.
+    # Rules that are always dropped meet others too: only the conditions count here.
     movers = [rule for rule in asked.moment.rules if not isinstance(rule, Assign)]
     outcome = "first wins" if asked.moment.policy == "first_wins" else "both dropped"
     for i, second in enumerate(movers):
@@ -114,7 +114,7 @@ def _own_cells(rule: Rule, effect: Assign) -> bool:
 
 
 def order_matters(a: Assign, b: Assign) -> str:
-    """Which of OUTCOMES applies if these two write one cell, or nothing."""
+    """The key of OUTCOMES if these two write one cell, or an empty text."""
     if a.field != b.field or (a.op == b.op == ":=" and a.value == b.value):
         return ""
     if ":=" in (a.op, b.op):

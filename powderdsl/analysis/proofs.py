@@ -36,7 +36,7 @@ def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int
 
 
 def _conserved(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Verdict:
-    """What the ledger says of a count, where rules that need what is not there cannot happen."""
+    """The ledger's verdict on a count in worlds without some elements: rules that need these cannot happen."""
     cells = set(ledger.reach(name for name in ledger.elements if name not in without))
     known = cells | set(ledger.named)
     lines = []
@@ -93,7 +93,7 @@ def _bounded(claim: Bounded, ruleset: Ruleset, ledger: Ledger) -> Verdict:
 
 
 def horizon(ruleset: Ruleset) -> int:
-    """What a cell holds after a step depends on cells at most so many rows and columns away: an upper bound.
+    """How many rows and columns away a cell may affect another one within a step: an upper bound.
 
     Each substep sees what the substeps before it saw around each cell that it reads. `step` and `row` are not cells.
     """
@@ -112,7 +112,7 @@ def _moment(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
     masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules if rule.mask is not None}
     reaches = [_length(rule.offset) for rule in claims if not isinstance(rule, Transform)]
     if moment.policy != "prove" and claims:
-        # A rule must know where the others claim cells; those that come first decide one after the other.
+        # A rule must know where the others claim cells; earlier rules decide one after the other.
         rounds = len(claims) if moment.policy == "first_wins" and reaches else 1
         widest = max(masks[id(rule)] for rule in claims)
         wide = widest + 2 * max(reaches, default=0) * rounds

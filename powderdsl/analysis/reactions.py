@@ -1,4 +1,4 @@
-"""What rules do to elements: which may become which, which may be moved. Derived from the checked model."""
+"""Effects of rules on elements: which may become which, which may be moved. Derived from the checked model."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def reactions(ruleset: Ruleset) -> tuple[Reaction, ...]:
 
 
 def facts_of(ruleset: Ruleset) -> Facts:
-    """What is known of cells, for questions to `model.logic.satisfy`."""
+    """Facts about cells, for questions to `model.logic.satisfy`."""
     limited = {f.name: f for f in ruleset.fields if f.of is not None}
     return Facts(
         tuple(element.id for element in ruleset.elements),

@@ -1,9 +1,8 @@
 """Diagnostics: what is wrong, where, and what to write instead. Used by every stage; depends on nothing."""
 
 from powderdsl.diagnostics.codes import CODES, Code, Severity
-from powderdsl.diagnostics.diagnostic import Diagnostic, Label
+from powderdsl.diagnostics.diagnostic import Diagnostic, Label, Source, Span
 from powderdsl.diagnostics.report import CompileError, Reporter, suggest
-from powderdsl.diagnostics.span import Source, Span
 
 __all__ = [
     "CODES",

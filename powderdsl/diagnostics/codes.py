@@ -1,9 +1,14 @@
-"""The table of diagnostic codes. A code is permanent: never reused, its page stays when it is retired."""
+"""The table of diagnostic codes, and the page of each: its meaning, an example, the fix.
+
+A code is permanent: never reused, its page stays when it is retired.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from enum import Enum
+from pathlib import Path
 
 
 class Severity(Enum):
@@ -129,3 +134,31 @@ _ROWS = (
 )
 
 CODES: dict[str, Code] = {row[0]: Code(*row) for row in _ROWS}
+
+_PAGES = Path(__file__).resolve().parent / "pages"
+
+
+def find_code(word: str) -> Code | None:
+    """The row of a code (``PD301``, ``pd301``, ``301``) or of a slug (``unknown-name``)."""
+    text = word.strip().strip("[]`").lower().replace("_", "-").replace(" ", "-")
+    by_name = {row.code.lower(): row for row in CODES.values()} | {row.slug: row for row in CODES.values()}
+    return by_name.get(text) or by_name.get(f"pd{text}")
+
+
+def similar(word: str) -> tuple[str, ...]:
+    """Codes and slugs that look like an unknown one; all codes of its hundred if it looks like a code."""
+    text = word.strip().lower()
+    known = {name.lower(): name for row in CODES.values() for name in (row.code, row.slug)}
+    if text.startswith("pd") and len(text) >= 3:
+        hundred = tuple(code for code in CODES if code.lower().startswith(text[:3]))
+        if hundred:
+            return hundred
+    return tuple(known[name] for name in get_close_matches(text, known, n=3, cutoff=0.5))
+
+
+def page(row: Code) -> str:
+    """The Markdown page of a code. A code without a page still says what it is called."""
+    path = _PAGES / f"{row.code}.md"
+    if path.is_file():
+        return path.read_text(encoding="utf-8")
+    return f"# {row.code}: {row.slug.replace('-', ' ')}\n\nThis {row.severity.value} has no page yet.\n"

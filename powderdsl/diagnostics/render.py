@@ -8,9 +8,8 @@ from typing import Any
 from unicodedata import combining, east_asian_width
 
 from powderdsl.diagnostics.codes import Severity
-from powderdsl.diagnostics.diagnostic import Diagnostic, Label
+from powderdsl.diagnostics.diagnostic import Diagnostic, Label, Span
 from powderdsl.diagnostics.printable import printable
-from powderdsl.diagnostics.span import Span
 
 TAB_WIDTH = 4
 MAX_SHOWN = 160

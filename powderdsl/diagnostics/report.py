@@ -6,9 +6,8 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 from powderdsl.diagnostics.codes import Severity
-from powderdsl.diagnostics.diagnostic import Diagnostic, Label
+from powderdsl.diagnostics.diagnostic import Diagnostic, Label, Span
 from powderdsl.diagnostics.render import render_text
-from powderdsl.diagnostics.span import Span
 
 MAX_ERRORS = 200
 """A file with more mistakes than this is reported up to here: more would not be read."""

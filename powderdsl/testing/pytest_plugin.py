@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from powderdsl.model.types import Example, Invariant, Ruleset
     from powderdsl.testing.properties.search import InvariantSearch
 
-HEAD = re.compile(r"^pack:[ \t]*[A-Za-z_]\w*[ \t]*$|^ruleset:[ \t]*[A-Za-z_]\w*[ \t]*$", re.MULTILINE)
-LISTED = re.compile(r"^packs:[ \t]*\[?(.*)$", re.MULTILINE)
-NEEDED = re.compile(r"^needs:[ \t]*\[?([^\]\n]*)", re.MULTILINE)
+HEAD = re.compile(r"^(pack|ruleset):[ \t]*[A-Za-z_]\w*[ \t]*$", re.MULTILINE)
 
 WORLDS = 300
 """Random worlds that each invariant is tried on; `powderdsl test` tries more."""
@@ -66,18 +64,21 @@ def home_of(path: Path) -> str:
             head = _text(other)
         except (OSError, UnicodeDecodeError):
             continue
-        listed = LISTED.search(head) if re.search(r"^ruleset:", head, re.MULTILINE) else None
-        if listed and path.stem in re.findall(r"\w+", listed[1]):
+        if re.search(r"^ruleset:", head, re.MULTILINE) and path.stem in _listed("packs", head):
             return str(other)
-    needed = NEEDED.search(text)
-    names = re.findall(r"\w+", needed[1]) if needed else []
-    beside = {name: path.parent / f"{name}.yaml" for name in names}
+    beside = {name: path.parent / f"{name}.yaml" for name in _listed("needs", text)}
     found = [
-        str(beside[n]) if beside[n].is_file() else n
-        for n in names
-        if beside[n].is_file() or n in shipped_rules()
+        str(file) if file.is_file() else name
+        for name, file in beside.items()
+        if file.is_file() or name in shipped_rules()
     ]
     return "+".join([*found, str(path)])
+
+
+def _listed(key: str, text: str) -> list[str]:
+    """The names after a key that stand on its line."""
+    found = re.search(rf"^{key}:[ \t]*\[?([^\]\n]*)", text, re.MULTILINE)
+    return re.findall(r"\w+", found[1]) if found else []
 
 
 @cache
@@ -92,7 +93,7 @@ _SEARCHES: dict[int, tuple[Ruleset, InvariantSearch]] = {}
 
 
 def search_of(ruleset: Ruleset, worlds: int) -> InvariantSearch:
-    """What proves and tries a ruleset's invariants, made once: the ledger takes a second."""
+    """The search for a ruleset's invariants, made once: the ledger takes a second."""
     from powderdsl.testing.properties.running import Runner
     from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.diagnostics import CODES
-from powderdsl.diagnostics.explain import find_code, page, similar
+from powderdsl.diagnostics.codes import find_code, page, similar
 from tests.cli.commands import powderdsl
 
 

@@ -29,7 +29,7 @@ from powderdsl.analysis.ledger import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
-from powderdsl.diagnostics.explain import page
+from powderdsl.diagnostics.codes import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.experiments.runs import does_not_fit, find_run, open_run
 from powderdsl.experiments.studies.file import load_study

@@ -8,8 +8,7 @@ import click
 
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted
-from powderdsl.diagnostics.codes import CODES
-from powderdsl.diagnostics.explain import find_code, page, similar
+from powderdsl.diagnostics.codes import CODES, find_code, page, similar
 from powderdsl.diagnostics.printable import unguarded
 
 PAGE_WIDTH = 100

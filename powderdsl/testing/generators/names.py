@@ -1,4 +1,4 @@
-"""What a random expression may name: neighbors, elements, fields, parameters, kernels, what loops and `let` bind."""
+"""Names for random expressions: neighbors, elements, fields, parameters, kernels, and what loops and `let` bind."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Names:
         return f" in {name}" if name else "", kernels[name or "box"]
 
     def domain(self) -> tuple[Kind, str]:
-        """What a loop may run over: the kind of its variable, and the text."""
+        """A domain for a loop: the kind of its variable, and the text."""
         elements = self.words.elements
         groups = [*self.words.groups, f"({self.pick(*elements)}, {self.pick(*elements)})"]
         sides = self.pick("(left, right)", "sides", "diagonals", "(below, above.left)", "octants")

@@ -25,7 +25,7 @@ class Phrases(Names):
     """Makes expressions from words and local names. `depth` bounds their nesting."""
 
     def one_of(self, table: Table[T]) -> T:
-        """What one of the productions makes, by weight; those that make nothing are passed over."""
+        """The text of one of the productions, chosen by weight; productions that make nothing are skipped."""
         rows = list(table)
         while True:
             row = self.choices.weighted([(row[0], row) for row in rows])
@@ -61,7 +61,7 @@ class Phrases(Names):
     # Chances
 
     def chance(self, depth: int) -> str:
-        """What may stand after `with chance`."""
+        """An expression for `with chance`."""
         return self.one_of(
             [
                 (6, lambda: self.pick(*CHANCES)),
@@ -121,7 +121,7 @@ class Phrases(Names):
         return f"({self.place() if self.choices.maybe(70) else 'here'} {verb} {self.group()})"
 
     def _static(self) -> str:
-        """What is known when rules are unrolled."""
+        """A condition that is decided when rules are unrolled."""
         options = ["yes", "no", "2 < 3", *(f"{name} is {self.group()}" for name in self.local("one"))]
         options += [f"{name} == 1" for name in self.local("number")]
         options += [f"{name} is left" for name in self.sides()]

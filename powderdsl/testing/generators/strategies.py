@@ -49,7 +49,7 @@ def rulesets(manner: Manner | None = None) -> st.SearchStrategy[Ruleset]:
 
 
 def chosen(make: Callable[[Choices], T]) -> st.SearchStrategy[T]:
-    """What a function makes of choices that Hypothesis takes: plain options first, so that it shrinks to them."""
+    """Values that a function makes of Hypothesis' choices: plain options come first, so examples shrink to them."""
 
     @st.composite
     def strategy(draw: st.DrawFn) -> T:

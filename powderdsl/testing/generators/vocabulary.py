@@ -21,7 +21,7 @@ CHANCES = ("50%", "0%", "100%", "20%", "0.001%", "99.99%", "0.1", "33.3%", "0.00
 
 @dataclass
 class Words:
-    """What a random ruleset declares, by name; expressions and rules draw on it."""
+    """The names that a random ruleset declares; expressions and rules use them."""
 
     elements: list[str] = field(default_factory=list)
     ids: list[int] = field(default_factory=list)
@@ -43,7 +43,7 @@ class Words:
 
 @dataclass(frozen=True)
 class Manner:
-    """What a random ruleset may do. Tests of single properties leave out what would break the property."""
+    """Features of a random ruleset. Tests of single properties leave out what would break the property."""
 
     draws: bool = True
     """Streams of random numbers, and chances."""
@@ -65,7 +65,7 @@ def declare(choices: Choices, manner: Manner) -> tuple[Words, dict[str, Tree]]:
     words.ids = _ids(choices, count)
     tags = [f"t{i}" for i in range(choices.integer(0, 2))]
     sections["params"] = _params(choices, words, manner)
-    sections["properties"] = _properties(choices, words, manner)
+    sections["properties"] = _properties(choices, words)
     sections["fields"] = _fields(choices, words, manner)
     sections["streams"] = _streams(choices, words, manner)
     sections["kernels"] = _kernels(choices, words, manner)
@@ -110,7 +110,7 @@ def _params(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
     return section
 
 
-def _properties(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
+def _properties(choices: Choices, words: Words) -> dict[str, Tree]:
     section: dict[str, Tree] = {}
     for i in range(choices.weighted([(3, 2), (2, 1), (2, 3), (1, 0), (1, 5)])):
         name = f"p{i}"
@@ -155,7 +155,7 @@ def _fields(choices: Choices, words: Words, manner: Manner) -> dict[str, Tree]:
 
 
 def _default(choices: Choices, words: Words, kind: Kind) -> str:
-    """What a fresh cell may have of a field."""
+    """A field's value in fresh cells."""
     if kind == ELEMENT:
         return choices.pick(words.elements)
     if kind.name == "vec2":

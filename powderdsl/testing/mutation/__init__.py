@@ -1,1 +1,1 @@
-"""Mutation testing of packs: realistic mistakes, what notices them, and worlds that show those that nothing notices."""
+"""Mutation testing of packs: realistic mistakes, the checks that notice them, and worlds that show the survivors."""

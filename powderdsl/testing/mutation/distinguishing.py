@@ -87,7 +87,7 @@ def distinguish(
 
 
 def _shared(first: Simulator, second: Simulator) -> tuple[str, ...]:
-    """What both hold, elements first."""
+    """The slots that both have, elements first."""
     known = {slot.name for slot in second.slots}
     return tuple(slot.name for slot in first.slots if slot.name in known)
 
@@ -104,18 +104,13 @@ def _soonest(when: Array) -> tuple[int, int] | None:
 def _with_fields(
     first: Simulator, second: Simulator, names: tuple[str, ...], seed: int
 ) -> tuple[Start, int] | None:
-    """A world that differs, of those whose fields hold anything that they can."""
-    for sample, steps in _fielded_samples(first.ruleset, seed):
-        found = _soonest(differs_after(first, second, sample, steps, names))
+    """A world that differs, of those whose fields hold anything that they can, with the usual parameters."""
+    for drawn in random_samples(first.ruleset, seed, FIELDED):
+        sample = replace(drawn, params={}, step=np.zeros_like(drawn.step))
+        found = _soonest(differs_after(first, second, sample, 2, names))
         if found is not None:
             return sample.one(found[0]), found[1]
     return None
-
-
-def _fielded_samples(ruleset: Ruleset, seed: int) -> Iterator[tuple[Start, int]]:
-    """Worlds whose fields hold anything that they can, at the first step, with the usual parameters."""
-    for sample in random_samples(ruleset, seed, FIELDED):
-        yield replace(sample, params={}, step=np.zeros_like(sample.step)), 2
 
 
 def _small(

@@ -47,7 +47,7 @@ class Holders:
 
 @dataclass(frozen=True)
 class Cells:
-    """What is known of cells: values that an input can hold, and inputs that some elements alone are free to hold."""
+    """Facts about cells: values that an input can hold, and inputs that only some elements are free to hold."""
 
     domains: Mapping[str, tuple[int, ...]]
     holders: Mapping[str, Holders]
@@ -177,7 +177,7 @@ class _Cases:
         self.cells, self.work, self.counted = cells, work, counted
         self.inputs: dict[Variable, Node] = {}
         self.uses: dict[Variable, set[Hashable]] = {}
-        """What is asked of each input: its value, or only whether it is in a set."""
+        """The questions about each input: its value, or only whether it is in a set."""
         self.thresholds: dict[str, list[int]] = {}
         self.moduli: dict[str, int] = {}
         nodes = self._find_inputs(roots)
@@ -344,7 +344,7 @@ class _Cases:
 
 
 def _others(node: Node, at: Offset) -> Variable:
-    """What a count finds in other cells, as a variable: the same one where only the cell itself makes a difference."""
+    """A count's share from other cells, as a variable: the same one if only the cell itself makes a difference."""
     weights, wraps = node.attr
     return "counted", node.args[0].index, wraps, tuple(sorted(w for w in weights if w[:2] != (0, 0))), at
 
@@ -356,7 +356,7 @@ def _at(node: Node, at: Offset) -> Offset:
 
 
 def _answer(value: int, op: str, attr: Any) -> object:
-    """What `in_set` or `table` say of a value."""
+    """The answer of `in_set` or `table` for a value."""
     if op == "in_set":
         return value in attr
     return attr[value] if 0 <= value < len(attr) else None

@@ -80,7 +80,7 @@ def _same_substep(first: Ruleset, one: Pass, second: Ruleset, other: Pass, numbe
 
 
 def _same_writes(first: dict[str, Node], second: dict[str, Node], graph: Graph, cells: Cells) -> bool:
-    """Whether what is written is the same; what one does not write stays as it was."""
+    """Whether both write the same; a slot that one of them does not write keeps its value."""
     compare = Comparison(cells)
     for name in dict.fromkeys([*first, *second]):
         one, other = first.get(name), second.get(name)

@@ -1,4 +1,4 @@
-"""What the names of a composition are, and which other names a hurried author might write instead."""
+"""The names of a composition, and other names that a hurried author might write instead."""
 
 from __future__ import annotations
 

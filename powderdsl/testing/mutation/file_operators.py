@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass
 
@@ -56,12 +56,14 @@ class _FileChanges:
     names: Names
 
     def of(self, root: Mapping) -> Iterator[Change]:
-        parts = {
+        parts: dict[str, Callable[[str, Node, Path], Iterator[Change]]] = {
             "properties": self._property,
             "fields": self._field,
-            "params": self._param,
+            "params": lambda name, node, path: self._line(
+                node.get("default") if isinstance(node, Mapping) else node
+            ),
             "kernels": self._kernel,
-            "sets": self._set,
+            "sets": lambda name, node, path: self._line(node),
             "elements": self._element,
             "also": self._also,
             "passes": self._pass,
@@ -150,9 +152,6 @@ class _FileChanges:
                     yield from self._line(value)
                     yield from self._lost("field", entry)
 
-    def _param(self, name: str, node: Node, path: Path) -> Iterator[Change]:
-        yield from self._line(node.get("default") if isinstance(node, Mapping) else node)
-
     def _kernel(self, name: str, node: Node, path: Path) -> Iterator[Change]:
         if isinstance(node, Mapping):
             yield from self._line(node.get("shape"))
@@ -177,9 +176,6 @@ class _FileChanges:
         else:
             last = (*path, (node, len(node.entries) - 1))
             yield Change("kernel", (inserted(last, "edges: wrap"),))
-
-    def _set(self, name: str, node: Node, path: Path) -> Iterator[Change]:
-        yield from self._line(node)
 
     def _element(self, name: str, node: Node, path: Path) -> Iterator[Change]:
         if not isinstance(node, Mapping):

@@ -1,4 +1,4 @@
-"""What notices a mutant: the checker, an invariant that a world breaks, a test; or a proof that nothing can."""
+"""Judges a mutant: the checker, an invariant that a world breaks, or a test notices it, or a proof that nothing can."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from powderdsl.testing.properties.running import first_difference, run_sample
 from powderdsl.testing.properties.samples import State
 
 NOTICED = ("check", "invariant", "test", "generated")
-"""What may notice a mutant. `test` are those written by hand; the quick ones of them are asked before invariants."""
+"""The checks that may notice a mutant. `test`: tests written by hand; the quick ones run before invariants."""
 
 FEW_STEPS = 20
 """Tests of at most this many steps run before longer ones."""
@@ -35,7 +35,7 @@ PAIRED = 6
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a mutant.
+    """The verdict on a mutant.
 
     `status` is ``killed``, ``survived``, ``equivalent`` (proven) or ``invalid`` (not a rule file); `by` is one of NOTICED
     or how it was proven; `detail` is a code, an invariant's words or a test's name.
@@ -84,7 +84,7 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
 def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -> Example | None:
     """A test that the original passes and the mutant fails: one written by hand, if there is one.
 
-    `quick`: only those that cost less than invariants do; otherwise only the others.
+    `quick`: only tests that cost less than invariants; otherwise only the others.
     """
     for some in _portions(sim.ruleset, pack, quick):
         known = tuple(one for one in some if one.name not in original.failing)
@@ -155,7 +155,7 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
 
 
 def _declared(ruleset: Ruleset) -> tuple[object, ...]:
-    """What conditions read of elements and no world holds."""
+    """Properties and tags of elements: conditions read them, and no world holds them."""
     return (
         [(prop.name, prop.values) for prop in ruleset.properties],
         [(element.name, element.tags) for element in ruleset.elements],

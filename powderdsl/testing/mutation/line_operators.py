@@ -32,20 +32,31 @@ COMPARISONS = {
 
 UPDATES = {":=": ("+=", "-="), "+=": ("-=", ":="), "-=": ("+=", ":=")}
 
-SIGNS = {
-    "add": ("+", "-"),
-    "subtract": ("-", "+"),
-    "multiply": ("*", "/"),
-    "divide": ("/", "*"),
-    "quotient": ("div", "*"),
+BETWEEN = {
+    # kind of syntax: kind of mistake, the word between its two operands, and what stands for it by mistake
+    "is_": ("comparison", "is", "is not"),
+    "is_not": ("comparison", "is not", "is"),
+    "in_": ("comparison", "in", "not in"),
+    "not_in": ("comparison", "not in", "in"),
+    "and_": ("connective", "and", "or"),
+    "or_": ("connective", "or", "and"),
+    "add": ("arithmetic", "+", "-"),
+    "subtract": ("arithmetic", "-", "+"),
+    "multiply": ("arithmetic", "*", "/"),
+    "divide": ("arithmetic", "/", "*"),
+    "quotient": ("arithmetic", "div", "*"),
 }
 
-CALLS = {"min": "max", "max": "min", "count": "", "sum": ""}
+UNWRAPPED = {"not_": "negation", "negate": "constant", "any_but": "set"}
+"""Kinds of syntax that are replaced by their operand, and the kind of mistake."""
 
 
-def line_changes(tree: Syntax, names: Names) -> Iterator[Change]:
-    """All mistakes in a line, in the order in which it is read."""
-    yield from _visit(tree, None, names)
+def line_changes(node: Syntax, names: Names, parent: Syntax | None = None) -> Iterator[Change]:
+    """All mistakes in a line or a part of it, in the order in which it is read."""
+    yield from _own(node, parent, names)
+    for child in node.children:
+        if node.kind != "binding" or child is not node.children[0]:  # the variable's own name
+            yield from line_changes(child, names, node)
 
 
 def kind_changes(tree: Syntax) -> Iterator[Change]:
@@ -98,8 +109,9 @@ def _only(operator: str, parent: Syntax, child: Syntax) -> Change:
     return _change(operator, parent, parent.span.source.text[start:end])
 
 
-def _between(parent: Syntax, first: Syntax, second: Syntax, word: str, other: str, operator: str) -> Change:
-    """The word between two operands replaced."""
+def _between(operator: str, parent: Syntax, word: str, other: str, number: int = 0) -> Change:
+    """The word between an operand and the next one replaced."""
+    first, second = parent.children[number : number + 2]
     begin, end = extent(first, parent)[1], extent(second, parent)[0]
     text = parent.span.source.text[begin:end]
     found = re.search(re.escape(word).replace(r"\ ", r"\s+"), text)
@@ -107,17 +119,21 @@ def _between(parent: Syntax, first: Syntax, second: Syntax, word: str, other: st
     return Change(operator, (Edit(begin + found.start(), begin + found.end(), other),))
 
 
-def _visit(node: Syntax, parent: Syntax | None, names: Names) -> Iterator[Change]:
-    yield from _own(node, parent, names)
-    for child in node.children:
-        if node.kind == "binding" and child is node.children[0]:
-            continue  # the variable's own name
-        yield from _visit(child, node, names)
-
-
 def _own(node: Syntax, parent: Syntax | None, names: Names) -> Iterator[Change]:
     children = node.children
-    match node.kind:
+    kind = node.kind
+    if kind == "in_" and _names_kernel(node, parent, names):
+        yield _only("kernel", node, children[0])
+        return
+    if kind in ("and_", "or_"):
+        yield _only("connective", node, children[0])
+        if children[0].kind != kind:
+            yield _only("connective", node, children[1])
+    if kind in BETWEEN:
+        yield _between(BETWEEN[kind][0], node, *BETWEEN[kind][1:])
+    if kind in UNWRAPPED:
+        yield _only(UNWRAPPED[kind], node, children[0])
+    match kind:
         case "name" | "optional_name":
             yield from _name(node, names)
         case "attribute":
@@ -131,53 +147,27 @@ def _own(node: Syntax, parent: Syntax | None, names: Names) -> Iterator[Change]:
         case "percent":
             yield from chance_changes(node)
         case "yes" | "no":
-            yield _change("constant", node, "no" if node.kind == "yes" else "yes")
+            yield _change("constant", node, "no" if kind == "yes" else "yes")
         case "compare":
-            for number, sign in enumerate(node.text.split()):
+            for at, sign in enumerate(node.text.split()):
                 for other in COMPARISONS[sign]:
-                    yield _between(node, children[number], children[number + 1], sign, other, "comparison")
-        case "is_" | "is_not" | "in_" | "not_in" if not _names_kernel(node, parent, names):
-            word, other = {
-                "is_": ("is", "is not"),
-                "is_not": ("is not", "is"),
-                "in_": ("in", "not in"),
-                "not_in": ("not in", "in"),
-            }[node.kind]
-            yield _between(node, children[0], children[1], word, other, "comparison")
-        case "in_":
-            yield _only("kernel", node, children[0])
-        case "and_" | "or_":
-            word = node.kind.rstrip("_")
-            yield _only("connective", node, children[0])
-            if children[0].kind != node.kind:
-                yield _only("connective", node, children[1])
-            yield _between(
-                node, children[0], children[1], word, "or" if word == "and" else "and", "connective"
-            )
-        case "not_":
-            yield _only("negation", node, children[0])
-        case "add" | "subtract" | "multiply" | "divide" | "quotient":
-            yield _between(node, children[0], children[1], *SIGNS[node.kind], "arithmetic")
-        case "negate":
-            yield _only("constant", node, children[0])
+                    yield _between("comparison", node, sign, other, at)
         case "choose":
             yield _exchanged("arithmetic", node, children[0], children[2])
         case "call":
             yield from _call(node, names)
         case "any_of" | "all_of":
             start = node.span.start
-            yield Change("connective", (Edit(start, start + 3, "all" if node.kind == "any_of" else "any"),))
-        case "any_but":
-            yield _only("set", node, children[0])
+            yield Change("connective", (Edit(start, start + 3, "all" if kind == "any_of" else "any"),))
         case "tuple":
             yield from _tuple(node, parent)
         case "repeat":
             found = re.search(r"\d+", node.span.text)
             assert found is not None
-            for other_count in (int(found[0]) + 1, int(found[0]) - 1):
-                if other_count > 0:
-                    at = node.span.start + found.start()
-                    yield Change("constant", (Edit(at, at + len(found[0]), str(other_count)),))
+            at = node.span.start + found.start()
+            for count in (int(found[0]) + 1, int(found[0]) - 1):
+                if count > 0:
+                    yield Change("constant", (Edit(at, at + len(found[0]), str(count)),))
         case "for_" if len(children) > 1:
             yield _exchanged("order", node, children[0], children[1])
         case "transform" | "swap" | "move" | "assign":
@@ -185,8 +175,8 @@ def _own(node: Syntax, parent: Syntax | None, names: Names) -> Iterator[Change]:
         case "then":
             yield from _effects(node)
         case "update":
-            for other_sign in UPDATES[node.text]:
-                yield _between(node, children[0], children[1], node.text, other_sign, "write")
+            for other in UPDATES[node.text]:
+                yield _between("write", node, node.text, other)
 
 
 def _decimal(number: float) -> str:
@@ -196,9 +186,8 @@ def _decimal(number: float) -> str:
 
 def _integer(node: Syntax) -> Iterator[Change]:
     number = int(node.text)
-    for other in dict.fromkeys(
-        [number + 1, number - 1, *([number * 2, number // 2] if number >= 10 else [])]
-    ):
+    others = [number + 1, number - 1, *([number * 2, number // 2] if number >= 10 else [])]
+    for other in others:
         if other >= 0:
             yield _change("constant", node, str(other))
 
@@ -254,15 +243,13 @@ def _call(node: Syntax, names: Names) -> Iterator[Change]:
     if name in ("count", "sum") and not any(_names_kernel(part, node, names) for part in node.children):
         for kernel in ("ring", "cross"):
             yield Change("kernel", (Edit(node.span.end - 1, node.span.end - 1, f" in {kernel}"),))
-    if CALLS.get(name):
-        yield Change("arithmetic", (Edit(start, start + len(name), CALLS[name]),))
-    if name in ("abs", "clamp", "opposite"):
-        operator = "neighbor" if name == "opposite" else "arithmetic"
-        yield _change(
-            operator,
-            node,
-            f"({node.children[0].span.text})" if name != "opposite" else node.children[0].span.text,
-        )
+    if name in ("min", "max"):
+        yield Change("arithmetic", (Edit(start, start + 3, "max" if name == "min" else "min"),))
+    inner = node.children[0].span.text if node.children else ""
+    if name in ("abs", "clamp"):
+        yield _change("arithmetic", node, f"({inner})")
+    if name == "opposite":
+        yield _change("neighbor", node, inner)
     for shape in KERNEL_SHAPES if name in KERNEL_SHAPES else ():
         if shape != name:
             yield Change("kernel", (Edit(start, start + len(name), shape),))
@@ -334,9 +321,5 @@ def _effects(node: Syntax) -> Iterator[Change]:
     if len(updates) == 1:
         yield _change("effect", node, "")
         return
-    for number, update in enumerate(updates):
-        if number + 1 < len(updates):
-            edit = Edit(update.span.start, updates[number + 1].span.start, "")
-        else:
-            edit = Edit(updates[number - 1].span.end, update.span.end, "")
-        yield Change("effect", (edit,))
+    for number in range(len(updates)):
+        yield Change("effect", (_without(node, number),))

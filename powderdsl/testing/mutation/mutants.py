@@ -57,7 +57,7 @@ class Mutant:
 
     @property
     def key(self) -> str:
-        """What the mutant is known by from run to run: place, kind and the text that comes in."""
+        """Identifies the mutant from run to run: place, kind and the new text."""
         return f"{self.place} {self.operator} {self.diff}"
 
 

@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from powderdsl.compiler import lower, read, set_params
-from powderdsl.diagnostics import Diagnostic, Reporter, Severity
-from powderdsl.diagnostics.span import Source
+from powderdsl.diagnostics import Diagnostic, Reporter, Severity, Source
 from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
@@ -149,7 +148,7 @@ def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
 
 
 def meaning(ruleset: Ruleset) -> str:
-    """What two compositions have in common if no world can tell them apart by their model."""
+    """A fingerprint of the model: compositions with the same one turn every world into the same."""
     return fingerprint(replace(ruleset, tests=(), invariants=(), about=""))
 
 

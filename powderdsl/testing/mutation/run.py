@@ -37,7 +37,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a mutant. `size` is that of a world that shows a survivor: (rows, columns, steps)."""
+    """The verdict on a mutant. `size` is that of a world that shows a survivor: (rows, columns, steps)."""
 
     number: int
     verdict: Verdict
@@ -121,7 +121,7 @@ def work(task: Task, tell: Callable[[Any], None]) -> Outcome:
 
 
 def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
-    """Elements that a mutant is likely to be about: those that its lines name, by themselves, a tag or a set."""
+    """Elements that a mutant is likely to be about: its lines name them, one of their tags or a set."""
     words = set(re.findall(r"\w+", mutant.diff))
     tags = words & {tag.name.text for pack in original.packs for tag in pack.tags}
     own = {element.name for element in original.ruleset.elements if element.pack == mutant.pack}

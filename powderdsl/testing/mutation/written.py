@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from powderdsl.diagnostics import Reporter, Source
+from powderdsl.model.composition.names import needs_of
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.types import Element, Ruleset
 from powderdsl.simulation.draw import to_numpy
@@ -58,7 +59,7 @@ def written_test(
         items = ", ".join(f"{_quoted(glyph)}: {element}" for glyph, element in legend)
         lines.append(f"    legend: {{{items}}}")
     lines += ["    given: |", *_drawn(before, glyphs)]
-    needed = _closure(packs, mutant.pack)
+    needed = needs_of(packs)[mutant.pack]
     start = run_sample(sim, found.sample, 0)[1]
     usual = sim.world(found.sample.ids)
     for field in found.sample.fields:
@@ -132,7 +133,7 @@ def _legend(
     Characters that packs choose themselves are known wherever these are loaded; all others depend on what else is
     loaded. Elements of packs that this one does not need may be absent: the test then waits.
     """
-    needed = _closure(packs, pack)
+    needed = needs_of(packs)[pack]
     chosen = {f"{one.name.text}.{decl.name.text}": decl.glyph for one in packs for decl in one.elements}
     glyphs: dict[int, str] = {}
     legend = []
@@ -152,19 +153,6 @@ def _legend(
         glyphs[element.id] = glyph
         legend.append((glyph, element.name if element.pack in needed else f"{element.name}?"))
     return glyphs, legend
-
-
-def _closure(packs: Sequence[PackDecl], pack: str) -> frozenset[str]:
-    """A pack and all that it needs, directly or not."""
-    needs = {one.name.text: [need.text for need in one.needs] for one in packs}
-    found: set[str] = set()
-    waiting = [pack]
-    while waiting:
-        name = waiting.pop()
-        if name not in found:
-            found.add(name)
-            waiting.extend(needs.get(name, ()))
-    return frozenset(found)
 
 
 def with_tests(source: Source, tests: Sequence[GeneratedTest]) -> str:

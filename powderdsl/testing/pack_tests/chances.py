@@ -122,7 +122,7 @@ def _copies(start: World, first: int, count: int, seed: int) -> World:
 
 
 def world_context(world: World) -> reference.Context:
-    """What a condition reads of a world: its state as the oracle holds it, parameters, the clock."""
+    """The values that a condition reads: a world's state as the oracle holds it, parameters, the clock."""
     ruleset = world.sim.ruleset
     state = reference.widened(ruleset, {name: to_numpy(values) for name, values in world.state.items()})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))

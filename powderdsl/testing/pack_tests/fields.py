@@ -1,4 +1,4 @@
-"""Fields of pack tests: drawn ones in start worlds, and those that a last world must have."""
+"""Fields of pack tests: drawn in start worlds, and expected in last worlds."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _word(rules: Ruleset, kind: Kind, value: NDArray[Any]) -> str:
 
 
 def _wanted(rules: Ruleset, kind: Kind, cell: Cell, fresh: NDArray[Any]) -> str:
-    """What a cell should hold: a value, a range, or its default."""
+    """The value that a cell should hold, a range, or its default."""
     if not cell:
         return f"{_word(rules, kind, fresh)}, its default"
     if kind.name not in ("int", "real", "vec2"):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
 
 SEEDS = (0, 1, 2, 3, 4)
-"""What a test runs with if it names no seed: a rule that needs luck should not pass by luck."""
+"""Seeds of a test that names none: several, since a rule that depends on chance should not pass by luck."""
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them change what a test shows."""
@@ -35,7 +35,7 @@ ANYTHING = "?"
 
 @dataclass(frozen=True)
 class ExampleResult:
-    """What came of one test.
+    """The result of one test.
 
     `problem` is empty if it passed with every seed, otherwise a sentence about the first seed it failed with:
     `seed`, after how many steps, and the world then, in the test's characters. `field` is the field that is not as
@@ -98,7 +98,7 @@ def run_examples(
 
 
 def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> list[ExampleResult]:
-    """The results; those that are wrong only with packs that the tests do not speak of name these packs."""
+    """The results; a test that fails only with packs outside its scope names these packs."""
     scopes: dict[tuple[str, ...], list[ExampleResult]] = {}
     for result in results:
         scope = result.example.scope
@@ -117,7 +117,7 @@ def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> l
 
 
 def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: Simulator) -> tuple[Span, ...]:
-    """Which of some tests pass with other rules, by where they stand."""
+    """The places of the tests that pass with other rules."""
     tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
     if ruleset is None or not tests:
         return ()
@@ -151,7 +151,7 @@ class _Running:
         return set(range(1, steps + 1)) if self.example.always else {steps} if steps else set()
 
     def look(self, world: World, step: int) -> ExampleResult | None:
-        """What is wrong after a step; `world` holds this test's worlds alone."""
+        """The failure after a step, if any; `world` holds this test's worlds alone."""
         for index, problem, field in self._problems(world, step):
             after = _rows(to_numpy(world.ids)[index], self.ids, self.example)
             drawn = field_rows(field, world, index) if field else ()
@@ -226,7 +226,7 @@ def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | 
 
 
 def _rows(world: NDArray[np.uint8], ids: Mapping[str, int], example: Example) -> tuple[str, ...]:
-    """A world in characters, those that the test itself uses first: two may mean the same element."""
+    """A world in characters. Of two for the same element, the one that the test itself uses is taken."""
     used = "".join([*example.given, *(example.expect or ())])
     characters: dict[int, str] = {}
     for char in sorted(ids, key=lambda char: char not in used):

@@ -1,4 +1,4 @@
-"""Who broke a claim: the rules of the last step, and where packs were added that it does not speak of, those packs."""
+"""Finds what broke a claim: rules of the last step, and added packs outside the claim's scope."""
 
 from __future__ import annotations
 
@@ -103,24 +103,15 @@ def translated(sample: Start, ruleset: Ruleset, target: Ruleset) -> Start | None
     table = np.full(256, -1, np.int64)
     for element in ruleset.elements:
         table[element.id] = numbers.get(element.qualified, -1)
-
-    def renamed(values: Array) -> Array:
-        return np.asarray(table[values])
-
-    kinds = {slot.name: slot.kind for slot in slots(target)}
-    ids = renamed(sample.ids)
-    fields = {}
-    for name, values in sample.fields.items():
-        if name in kinds:
-            fields[name] = renamed(values) if kinds[name].name == "element" else values
-    named = [ids, *(values for name, values in fields.items() if kinds[name].name == "element")]
-    if any((values < 0).any() for values in named):
+    kinds = {slot.name: slot.kind.name for slot in slots(target)}
+    fields = {name: values for name, values in sample.fields.items() if name in kinds}
+    named = {name: values for name, values in fields.items() if kinds[name] == "element"}
+    if any((table[values] < 0).any() for values in (sample.ids, *named.values())):
         return None
+    fields |= {name: table[values].astype(values.dtype) for name, values in named.items()}
     there = {param.name for param in target.params}
     params = {name: values for name, values in sample.params.items() if name in there}
-    dtypes = {name: sample.fields[name].dtype for name in fields}
-    kept = {name: values.astype(dtypes[name]) for name, values in fields.items()}
-    return replace(sample, ids=ids.astype(np.uint8), fields=kept, params=params)
+    return replace(sample, ids=table[sample.ids].astype(np.uint8), fields=fields, params=params)
 
 
 def same_claim(prop: Property, ruleset: Ruleset) -> Property | None:
@@ -132,7 +123,7 @@ def same_claim(prop: Property, ruleset: Ruleset) -> Property | None:
 
 
 def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Difference:
-    """Which added packs break an invariant that holds in its scope, and by what."""
+    """The added packs that break an invariant which holds in its scope, and how they do it."""
     added = ruleset.added_to(prop.scope)
     owners = pack_of_line(ruleset)
     lines = [span for span in found.culprits if owners.get(span) in added]
@@ -152,7 +143,7 @@ def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Diffe
 
 
 def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | None:
-    """What the added packs that change a test do in it: their rules that happen, else what they do to other packs."""
+    """How added packs change a test: by their rules that happen, or else by what they change in other packs."""
     if not result.added:
         return None
     from powderdsl.testing.pack_tests.runner import (
@@ -221,7 +212,7 @@ def _still(prop: Property, ruleset: Ruleset, found: Counterexample, pack: str) -
 
 
 def doings(pack: str, ruleset: Ruleset, near: frozenset[str] = frozenset()) -> list[Cause]:
-    """What a pack does to others besides what its rules do: what concerns some elements, else everything."""
+    """Changes that a pack makes to others, besides its rules: to some elements, or else all of them."""
     found = list(_doings(pack, ruleset))
     close = [cause for name, cause in found if name in near]
     return close or [cause for name, cause in found if name] or [cause for _, cause in found]

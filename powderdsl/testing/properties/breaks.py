@@ -14,7 +14,7 @@ from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
 from powderdsl.testing.generators.cases import Array, Start, fresh, property_table
 from powderdsl.testing.properties.running import context, reference_states
-from powderdsl.testing.properties.samples import State, turned_cells, turned_sample, turned_state
+from powderdsl.testing.properties.samples import State, turned_back, turned_cells, turned_sample, turned_state
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ SIGMAS = 6.0
 
 
 class Runs(Protocol):
-    """What runs worlds: `running.Runner`, or the oracle alone."""
+    """Runs worlds: `running.Runner`, or the oracle alone."""
 
     @property
     def ruleset(self) -> Ruleset: ...
@@ -238,10 +238,7 @@ def _symmetric(claim: Symmetric, runs: Runs, sample: Start) -> Array:
     turned_draws = {name: turned_cells(values, claim.turn) for name, values in draws.items()}
     first = runs.states(sample, 1, draws)[-1]
     second = runs.states(turned_sample(runs.ruleset, sample, claim.turn), 1, turned_draws)[-1]
-    wrong = differences(turned_state(runs.ruleset, first, claim.turn), second)
-    for _ in range(1 if claim.turn == "mirrored" else 3):  # back to where the first worlds are
-        wrong = turned_cells(wrong, claim.turn)
-    return wrong
+    return turned_back(differences(turned_state(runs.ruleset, first, claim.turn), second), claim.turn)
 
 
 def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
@@ -258,9 +255,7 @@ def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
             b = (second == element.id).mean(0)
             mean = (a + b) / 2
             mask |= np.abs(a - b) > SIGMAS * np.sqrt(2 * mean * (1 - mean) / claim.copies) + 1e-9
-        for _ in range(1 if claim.turn == "mirrored" else 3):
-            mask = turned_cells(mask, claim.turn)
-        masks.append(mask)
+        masks.append(turned_back(mask, claim.turn))
     return np.stack(masks)
 
 

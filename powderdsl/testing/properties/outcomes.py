@@ -1,4 +1,4 @@
-"""What came of testing a property, as text for people and as plain data for JSON."""
+"""Results of testing properties, as text for people and as plain data for JSON."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def difference_words(found: Difference) -> str:
 
 
 def difference_lines(found: Difference) -> Iterator[str]:
-    """What in the added packs makes the difference."""
+    """The places in the added packs that make the difference."""
     for cause in found.causes:
         yield f"{place_of(cause.span)}: {cause.does}"
 

@@ -26,8 +26,7 @@ from powderdsl.testing.properties.search import (
     InvariantSearch,
     SearchPlan,
     counterexample,
-    sorted_out,
-    trials_alone,
+    told_apart,
 )
 from powderdsl.testing.properties.shrink import Work
 
@@ -98,7 +97,8 @@ def _report_difference(one: Result, found: Difference, world: Sequence[str], rep
 def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
     """The invariants that a few worlds break, each with a world that was made small."""
     oracle = Oracle(ruleset, ruleset.passes)
-    search = _tried(InvariantSearch.of(oracle, SearchPlan(), declared_only=True, ledger=ledger))
+    search = InvariantSearch.of(oracle, SearchPlan(), declared_only=True, ledger=ledger)
+    _try_worlds(search)
     broken = [trial for trial in search.trials if trial.sample is not None]
     found = []
     for trial in broken:
@@ -106,16 +106,11 @@ def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
         work, gone = Work(ruleset, WORK // len(broken)), trial.prop.without
         small = counterexample(trial.claim, oracle, trial.sample, trial.steps, work, gone)
         found.append(Result(trial.prop, "broken", trial.worlds, "", small))
-
-    def false_alone(alone: Ruleset, results: Sequence[Result]) -> set[str]:
-        search = _tried(trials_alone(alone, ruleset, results, SearchPlan(), oracle))
-        return {trial.prop.text for trial in search.trials if trial.sample is not None}
-
-    return sorted_out(found, ruleset, false_alone)
+    return told_apart(found, oracle, SearchPlan(), _try_worlds)
 
 
-def _tried(search: InvariantSearch) -> InvariantSearch:
-    """The search with what a few worlds broke."""
+def _try_worlds(search: InvariantSearch) -> None:
+    """Run a few worlds."""
     for number, sample in enumerate(random_samples(search.runner.ruleset, 0, WORLDS)):
         # Where mirrored numbers are used in another way only frequencies can tell: thousands of worlds.
         search.trials = [trial for trial in search.trials if not isinstance(trial.claim, Alike)]
@@ -124,7 +119,6 @@ def _tried(search: InvariantSearch) -> InvariantSearch:
         search.try_sample(sample, STEPS)
         if number < FOCUSED:
             _try_focused(search, sample)
-    return search
 
 
 def _try_focused(search: InvariantSearch, sample: Start) -> None:

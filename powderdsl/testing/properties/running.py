@@ -120,7 +120,7 @@ def _clock(sample: Start, step: int) -> reference.Clock:
 
 
 def context(ruleset: Ruleset, state: State, sample: Start, step: int) -> reference.Context:
-    """What a condition reads of worlds: their state, parameters, the clock."""
+    """The values that a condition reads: the state of worlds, parameters, the clock."""
     params = reference.parameters(ruleset, len(sample), sample.params)
     working = reference.widened(ruleset, {slot.name: state[slot.name] for slot in slots(ruleset)})
     return reference.Context(ruleset, working, params, {}, _clock(sample, step))

@@ -108,6 +108,11 @@ def turned_cells(values: Array, turn: str) -> Array:
     return np.rot90(values, -1, (-2, -1)).copy()
 
 
+def turned_back(values: Array, turn: str) -> Array:
+    """The inverse of `turned_cells`."""
+    return turned_cells(values, turn) if turn == "mirrored" else np.rot90(values, 1, (-2, -1)).copy()
+
+
 def turned_values(slot: Slot, values: Array, turn: str) -> Array:
     """A slot's array, turned."""
     cells = turned_cells(values, turn)

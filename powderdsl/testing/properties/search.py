@@ -190,14 +190,18 @@ class InvariantSearch:
         return sorted(self.results.values(), key=lambda result: order.index(result.prop.text))
 
 
-def sorted_out(
-    broken: Sequence[Result], ruleset: Ruleset, false_alone: Callable[[Ruleset, Sequence[Result]], set[str]]
+def told_apart(
+    broken: Sequence[Result],
+    runner: Runs,
+    plan: SearchPlan,
+    attempt: Callable[[InvariantSearch], object] = InvariantSearch.try_random,
 ) -> list[Result]:
-    """The same results; those that hold until packs are added say so.
+    """The same results; an invariant that holds in its scope, without added packs, is marked as different.
 
     Args:
-        false_alone: tries what is broken on the rules of its scope alone; the texts of what is broken there too.
+        attempt: runs worlds in a search on the rules of a scope.
     """
+    ruleset = runner.ruleset
     scopes: dict[tuple[str, ...], list[Result]] = {}
     for result in broken:
         if result.prop.scope and ruleset.added_to(result.prop.scope):
@@ -206,25 +210,17 @@ def sorted_out(
     for scope, results in scopes.items():
         alone = restricted(ruleset, scope)
         if alone is not None:
-            differ |= {one.prop.text for one in results} - false_alone(alone, results)
+            search = trials_alone(alone, ruleset, results, plan, runner)
+            if search.trials:
+                attempt(search)
+            false = {trial.prop.text for trial in search.trials if trial.sample is not None}
+            differ |= {one.prop.text for one in results} - false
     return [
         replace(one, status="differs", difference=difference(one.prop, ruleset, one.counterexample))
         if one.prop.text in differ and one.counterexample is not None
         else one
         for one in broken
     ]
-
-
-def told_apart(broken: Sequence[Result], runner: Runs, plan: SearchPlan) -> list[Result]:
-    """What is broken, and what only added packs break: their scopes are tried alone, on as many worlds."""
-
-    def false_alone(alone: Ruleset, results: Sequence[Result]) -> set[str]:
-        search = trials_alone(alone, runner.ruleset, results, plan, runner)
-        if search.trials:
-            search.try_random()
-        return {trial.prop.text for trial in search.trials if trial.sample is not None}
-
-    return sorted_out(broken, runner.ruleset, false_alone)
 
 
 def trials_alone(
@@ -299,12 +295,7 @@ def find_property(ruleset: Ruleset, text: str) -> Property | None:
 def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, str]]:
     """The sums that the ledger decides, as claims: a world that breaks one shows a bug in powderdsl."""
     ids = {element.name: element.id for element in ruleset.elements}
-    tables: tuple[tuple[str, Sequence[tuple[str, ...]]], ...] = (
-        ("constant", ledger.constant_sums),
-        ("never falls", ledger.rising_sums),
-        ("never rises", ledger.falling_sums),
-    )
-    for trend, sums in tables:
+    for trend, sums in ledger.sums.items():
         for names in sums:
             if len(names) == len(ledger.elements):
                 continue

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ WORK = 500_000_000
 """Work for one world, ten seconds or so: most need a hundredth of it."""
 
 RULE = 15_000
-"""What a rule costs in each step of a batch, in cells that it looks at."""
+"""The cost of a rule in each step of a batch, in cells."""
 
 
 @dataclass
@@ -39,6 +40,9 @@ class Work:
         rules = 1 + sum(len(moment.rules) for one in self.ruleset.passes for moment in one.moments)
         self.left -= rules * steps * (RULE + batch.ids.size)
 
+
+Group = Callable[[Start], list[Start]]
+"""Makes smaller worlds of one kind."""
 
 Judge = Callable[[Start, int], Array]
 """After which step each world of a sample, run for that number of steps, is accepted: int [B], 0 if it is not."""
@@ -95,7 +99,7 @@ def shrink_while(judge: Judge, sample: Start, steps: int, tries: int, work: Work
 
 
 def smallest(start: Start, find: Callable[[list[Start]], Start | None]) -> Start:
-    """What is left of start worlds when nothing more can go.
+    """The smallest start worlds that can be reached by removing one thing at a time.
 
     Args:
         find: one of some smaller starts that will do as well, or None.
@@ -160,23 +164,17 @@ def _single(sample: Start) -> list[Start]:
     return [sample.one(world) for world in range(len(sample))] if len(sample) > 1 else []
 
 
-def _plain(sample: Start) -> list[Start]:
-    """Without its fields and parameters, at the first step."""
-    if sample.fields or sample.params or sample.step.any():
-        return [replace(sample, fields={}, params={}, step=np.zeros_like(sample.step))]
-    return []
+def _usual(*parts: str) -> Group:
+    """With fields, parameters or the clock as in fresh worlds."""
 
+    def group(sample: Start) -> list[Start]:
+        usual: dict[str, Any] = {"fields": {}, "params": {}, "step": np.zeros_like(sample.step)}
+        given = {"fields": sample.fields, "params": sample.params, "step": sample.step.any()}
+        return (
+            [replace(sample, **{part: usual[part] for part in parts})] if any(given[p] for p in parts) else []
+        )
 
-def _fresh(sample: Start) -> list[Start]:
-    return [replace(sample, fields={})] if sample.fields else []
-
-
-def _usual(sample: Start) -> list[Start]:
-    return [replace(sample, params={})] if sample.params else []
-
-
-def _early(sample: Start) -> list[Start]:
-    return [replace(sample, step=np.zeros_like(sample.step))] if sample.step.any() else []
+    return group
 
 
 def _absent_fields(sample: Start) -> list[Start]:
@@ -214,7 +212,7 @@ def _plain_seed(sample: Start) -> list[Start]:
     return [replace(sample, seed=np.array([number])) for number in range(SEEDS)]
 
 
-def _parts(axis: int, halves: bool) -> Callable[[Start], list[Start]]:
+def _parts(axis: int, halves: bool) -> Group:
     """Worlds with half of the rows (axis 0) or columns (axis 1), or with one less."""
 
     def group(sample: Start) -> list[Start]:
@@ -262,16 +260,16 @@ def _fewer_cells(sample: Start) -> list[Start]:
     return found
 
 
-_GROUPS: tuple[Callable[[Start], list[Start]], ...] = (
+_GROUPS: tuple[Group, ...] = (
     _single,
-    _plain,
+    _usual("fields", "params", "step"),
     _parts(0, True),
     _parts(1, True),
     _parts(0, False),
     _parts(1, False),
-    _fresh,
-    _usual,
-    _early,
+    _usual("fields"),
+    _usual("params"),
+    _usual("step"),
     _fewer_fields,
     _fewer_kinds,
     _fewer_cells,
