@@ -16,7 +16,8 @@ def fingerprint(model: object) -> str:
     """64 hexadecimal digits for a value made of frozen dataclasses, tuples, frozen sets, numbers and text.
 
     Fields that take no part in comparisons, such as places in files, take none here, nor do those with `UNMEANING` as
-    metadata. A field at its default counts as absent, so that new fields change no fingerprint.
+    metadata. A field at its default counts as absent, so that new fields change no fingerprint. The names of classes and
+    fields are part of it: renaming one changes the fingerprints that users' files have recorded.
 
     Raises:
         TypeError: something else was found.
