@@ -212,7 +212,11 @@ class Cutter:
         inner, self.statements = self.statements, outer
         self.known, self.there = scope
         nothing = graph.node("const", FLAG, (), False)
-        kept = (*((out.var, nothing) for out in mine), *self.kept(guard))
+        masked = {
+            out.var.name for out in mine
+        }  # a mask may be what a slot held before: nothing, where masks are skipped
+        kept = tuple((var, nothing if value.attr in masked else value) for var, value in self.kept(guard))
+        kept = (*((out.var, nothing) for out in mine), *kept)
         question = self.answer(first)
         self.emit(Compute((question,), place, "words"))
         when = (load(graph, question.var),)
