@@ -39,3 +39,21 @@ def base_keys(seed: Tensor, index: Tensor) -> Tensor:
     for part in (seed & MASK, (seed >> 32) & MASK, index & MASK):
         keys = mix((keys + part) & MASK)
     return keys
+
+
+def uniforms(keys: Tensor, count: int) -> Tensor:
+    """Numbers in [0, 1) by key: float64 [B, count]."""
+    import torch
+
+    numbers = torch.arange(count, device=keys.device) * 0x9E3779B1 & MASK
+    low, high = mix(keys & MASK), (keys >> 32) & MASK
+    drawn = mix((mix(low ^ high)[:, None] + numbers) & MASK)
+    return drawn.double() / float(1 << 32)
+
+
+def action_keys(seed: int, episodes: Tensor, step: int | Tensor) -> Tensor:
+    """The keys of one action in each of some episodes, by their numbers: int64 [B]. `step` may be one for each."""
+    import torch
+
+    low = mix((mix(torch.full_like(episodes, seed) & MASK) + episodes) & MASK)
+    return mix((low + step) & MASK) << 31 | mix(low ^ mix(torch.zeros_like(low) + step)) >> 1

@@ -229,6 +229,11 @@ class TaskProgram:
         after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
         return after, reward.float(), success, over
 
+    @property
+    def block_edges(self) -> tuple[Tensor, Tensor]:
+        """The rows, then the columns, of the blocks that actions change: first and past the last, int64 [bins, 2]."""
+        return self._hands.edges
+
     def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
         """The current values of `measures`: float64 [B, n]."""
         return self._meter.take(episodes.world, episodes.regions, episodes.targets, params)

@@ -20,6 +20,7 @@ from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.parse import reserved_words as rule_words
 from powderdsl.tasks.agents import read_agent
 from powderdsl.tasks.drawings import Drawer, DrawingPlan, element_ids, report_unknown
+from powderdsl.tasks.experts import read_expert
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.keys import TASK_KEYS
 from powderdsl.tasks.stamps import read_stamp
@@ -158,14 +159,19 @@ class _TaskReader:
         )
         splits, used = self.splits(plan, size)
         agent = read_agent(self.reader, self.entries.get("agent"), self.ruleset, size)
-        goal = self.goal(plan)
+        checker = GoalChecker(self.typer, frozenset(plan.regions), frozenset(plan.targets), plan.knobs)
+        goal = self.goal(checker)
+        node = self.node("expert")
+        expert = (
+            read_expert(self.reader, node, agent, size, self.ruleset, checker) if node and agent else None
+        )
         self.unused(plan, used)
         self.typer.unknown.report()
         self.reporter.raise_if_errors()
         assert name is not None
         assert agent is not None
         about = self.reader.text(self.entries, "about")
-        return Task(name.text, about, self.ruleset, size, knobs, agent, goal, splits, self.rules)
+        return Task(name.text, about, self.ruleset, size, knobs, agent, goal, splits, expert, self.rules)
 
     def node(self, key: str) -> yaml_tree.Node | None:
         return self.entries[key][1] if key in self.entries else None
@@ -370,8 +376,7 @@ class _TaskReader:
 
     # What counts
 
-    def goal(self, plan: DrawingPlan) -> Goal:
-        checker = GoalChecker(self.typer, frozenset(plan.regions), frozenset(plan.targets), plan.knobs)
+    def goal(self, checker: GoalChecker) -> Goal:
         found: dict[str, Expr | None] = {}
         for section in ("reward", "end"):
             node = self.node(section)

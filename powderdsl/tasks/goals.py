@@ -79,10 +79,15 @@ class GoalChecker:
         self._not_a_condition(syntax)
         return None
 
-    def _checked(self, syntax: Syntax) -> Expr | None:
+    def measured(self, how: str, cells: Syntax) -> Measure | None:
+        """A measure of the cells of an expression, or None after a report."""
+        found = self._checked(cells, lambda: Expr("measure", REAL, value=self.measure(how, cells)))
+        return None if found is None else found.value
+
+    def _checked(self, syntax: Syntax, check: Callable[[], Expr] | None = None) -> Expr | None:
         self.typer.start_rule(syntax.span)
         try:
-            return self.scalar(syntax)
+            return self.scalar(syntax) if check is None else check()
         except Poisoned:
             return None
         except Unresolved as asleep:

@@ -31,6 +31,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
         "agent": Key("mapping", "what an agent may do, and for how long", True),
         "reward": Key("mapping", "what counts: `each`, `final`, or both"),
         "end": Key("mapping", "conditions that end an episode: `success`, `failure`"),
+        "expert": Key("any", "how a good player acts: a list of moves, or `search: N`"),
         "splits": Key("mapping", "other sets of worlds beside `train`"),
     },
     "knob": {
@@ -60,6 +61,19 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
     "end": {
         "success": Key("line", "the episode ends, and the task is done"),
         "failure": Key("line", "the episode ends, and the task is not done"),
+    },
+    "expert": {
+        "search": Key(
+            "number", "random plans that are simulated in each world; the best one is played", True
+        ),
+    },
+    "move": {
+        "choose": Key("word", "what it does: an element, `blow` or `nothing`", True),
+        "toward": Key("word", "where it blows: `left`, `right`, `above`, `below`, or both as `above.right`"),
+        "at": Key("any", "where: `[row, column]`, or `most(CELLS)`, the block with most of these cells"),
+        "within": Key("line", "a shape: only its cells count for `most`"),
+        "least": Key("number", "how many cells `most` must find for the move to apply; 1 by default"),
+        "if": Key("line", "when: a condition; the first move whose condition holds is played"),
     },
     "split": {
         "about": Key("text", "what it is for, in a sentence"),

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from powderdsl.diagnostics import Span
+from powderdsl.model.fingerprint import UNMEANING
 from powderdsl.model.types import Expr, Ruleset
-from powderdsl.worlds.raster import Size
+from powderdsl.worlds.raster import Shape, Size
 from powderdsl.worlds.scene.amounts import Amount
 
 BLOW = -1
@@ -179,6 +180,37 @@ class Goal:
 
 
 @dataclass(frozen=True)
+class ExpertMove:
+    """A move of a scripted player.
+
+    `choice` is an index into `Agent.choices`, `toward` the rows and columns (−1, 0 or 1) in which it blows. It acts on
+    the bin of `cell`, or on the bin whose block has most cells of the measure `most`. `condition` is a condition as in
+    `Goal`, of measures and ``action`` (``taken`` and ``left``); None holds always. `most` counts cells of the shape
+    `within` only, and needs `least` of them.
+    """
+
+    choice: int
+    toward: tuple[int, int]
+    cell: tuple[int, int] | None
+    most: Measure | None
+    condition: Expr | None
+    within: Shape | None = None
+    least: int = 1
+
+
+@dataclass(frozen=True)
+class Expert:
+    """How a good player acts. Before each action the first move that applies is played; a move applies if its condition
+    holds and enough cells of `most` exist. The last move always applies.
+
+    If `search` is not 0, there are no moves: so many random plans are simulated in each world, and the best is played.
+    """
+
+    moves: tuple[ExpertMove, ...]
+    search: int = 0
+
+
+@dataclass(frozen=True)
 class Task:
     """A checked task. `knobs` are filled in; `ruleset` has the task's parameters."""
 
@@ -190,6 +222,7 @@ class Task:
     agent: Agent
     goal: Goal
     splits: tuple[Split, ...]
+    expert: Expert | None = field(default=None, metadata=UNMEANING)
     rules: tuple[str, ...] = field(default=(), compare=False, repr=False)
     """The rules that were loaded, as `compiler.load` takes them."""
 

@@ -22,7 +22,9 @@ class Hands:
         """`counts`: whether the cells that actions change are counted."""
         self.agent, self.size, self.device, self.counts = agent, size, sim.device, counts
         self.choices = torch.tensor(agent.choices, device=self.device)
-        self._edges, self._lines = zip(*(self._brush(axis) for axis in (0, 1)), strict=True)
+        self.edges: tuple[Tensor, Tensor]
+        """Of rows, then of columns: the first line of each bin's block and the one after its last, int64 [bins, 2]."""
+        self.edges, self._lines = zip(*(self._brush(axis) for axis in (0, 1)), strict=True)
         self.places_elements = any(choice >= 0 for choice in agent.choices)
         known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=self.device)
         state = sim.world(known[None]).state
@@ -98,7 +100,7 @@ class Hands:
     ) -> Mapping[str, Tensor]:
         """A state of `world`'s with the block of each action filled: a value a world, [B] or [B, 2], in those of `where`."""
         if isinstance(state, PackedState):  # only the blocks are written, nothing is unpacked
-            boxes = torch.cat([edges[actions[:, 1 - axis]] for axis, edges in enumerate(self._edges)], 1)
+            boxes = torch.cat([edges[actions[:, 1 - axis]] for axis, edges in enumerate(self.edges)], 1)
             numbers = {name: one if one.is_floating_point() else one.long() for name, one in values.items()}
             return state.fill(
                 torch.where(where[:, None], boxes, 0), numbers, reuse=reuse or state is not world.state

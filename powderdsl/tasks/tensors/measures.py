@@ -76,11 +76,7 @@ class Meter:
     ) -> Tensor:
         """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own."""
         batch = len(world.step)
-        values = {one.name: (params or {}).get(one.name, float(one.default)) for one in self.ruleset.params}
-        every = {
-            name: torch.as_tensor(value, dtype=torch.float64, device=self.device).expand(batch)
-            for name, value in values.items()
-        }
+        every = self._params(params, batch)
         found: list[Tensor] = [torch.zeros(0)] * len(self.measures)
         for part in self._parts:
             for number, cells in part.cells(world, regions, every).items():
@@ -94,6 +90,21 @@ class Meter:
         if not found:
             return torch.zeros(batch, 0, dtype=torch.float64, device=self.device)
         return torch.stack([one.expand(batch) for one in found], 1)
+
+    def cells(self, number: int, world: World, regions: Mapping[str, Tensor]) -> Tensor:
+        """The cells that a measure counts, bool [B, H, W]. The meter must have no fixed regions, so that it sees all."""
+        region = self.measures[number].region
+        (part,) = (one for one in self._parts if number in one.numbers)
+        found = part.cells(world, regions, self._params(None, len(world.step)))[number]
+        found = found.expand(len(world.step), *self.size)
+        return found if region is None else found & regions[region]
+
+    def _params(self, params: Mapping[str, Any] | None, batch: int) -> dict[str, Tensor]:
+        values = {one.name: (params or {}).get(one.name, float(one.default)) for one in self.ruleset.params}
+        return {
+            name: torch.as_tensor(value, dtype=torch.float64, device=self.device).expand(batch)
+            for name, value in values.items()
+        }
 
     def _reduced(
         self, measure: Measure, cells: Tensor, window: Window, regions: Mapping[str, Tensor]

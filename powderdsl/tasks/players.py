@@ -1,0 +1,150 @@
+"""The expert of a task on tensors: scripted moves, or the best of many random plans, found by simulation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from powderdsl.system.random import action_keys, uniforms
+from powderdsl.tasks.episodes import Episodes, TaskProgram
+from powderdsl.tasks.goals import parts_of
+from powderdsl.tasks.task import Expert, ExpertMove, Measure
+from powderdsl.tasks.tensors.measures import Facts, Meter, scalar_value
+from powderdsl.worlds.raster import mask
+
+SIMULATED = 1024
+"""Episodes that a search simulates at once."""
+
+PLANS = 0x506C616E
+"""The seed of random plans."""
+
+
+class ExpertPlayer:
+    """Plays the expert of a program's task in a batch of episodes. A search keeps its plans: one player per batch.
+
+    Raises ValueError for a task without an expert.
+    """
+
+    def __init__(self, program: TaskProgram):
+        expert = program.task.expert
+        if expert is None:
+            raise ValueError(f"the task {program.task.name} has no expert")
+        self.program, self.expert = program, expert
+        self.measures = _measures_of(expert)
+        self._numbers = {measure: number for number, measure in enumerate(self.measures)}
+        self._meter = Meter(
+            program.simulator.ruleset, self.measures, program.task.size, {}, program.simulator.device
+        )
+        self._plans: Tensor | None = None
+
+    def __call__(self, episodes: Episodes) -> Tensor:
+        """The actions of some episodes, int64 [B, 5]."""
+        if self.expert.search:
+            if self._plans is None:
+                self._plans = best_plans(self.program, episodes.seed, self.expert.search)
+            step = episodes.acted.clamp(max=self._plans.shape[1] - 1)
+            return self._plans[torch.arange(len(step), device=step.device), step]
+        now = self._meter.take(episodes.world, episodes.regions, episodes.targets, None)
+        left = self.program.task.agent.actions - episodes.acted
+        facts = Facts(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
+        actions = torch.zeros(len(episodes), 5, dtype=torch.int64, device=now.device)
+        waiting = torch.ones(len(episodes), dtype=torch.bool, device=now.device)
+        for number, move in enumerate(self.expert.moves):
+            applies = waiting.clone()
+            if move.condition is not None:
+                applies &= scalar_value(move.condition, facts) != 0
+            if not bool(applies.any()):
+                continue
+            found, cells = self._action(move, episodes)
+            if number + 1 < len(self.expert.moves):
+                applies &= cells >= move.least
+            actions[applies] = found[applies]
+            waiting &= ~applies
+        return actions
+
+    def _action(self, move: ExpertMove, episodes: Episodes) -> tuple[Tensor, Tensor]:
+        """The action of a move in every episode, int64 [B, 5], and the number of cells that it counts, int64 [B]."""
+        task = self.program.task
+        count = torch.full_like(episodes.acted, task.size[0] * task.size[1])
+        if move.most is not None:
+            cells = self._meter.cells(self._numbers[move.most], episodes.world, episodes.regions)
+            if move.within is not None:
+                cells = cells & torch.from_numpy(mask(move.within, task.size)).to(cells.device)
+            count = cells.sum((1, 2))
+            row, column = self._fullest(cells)
+        else:
+            assert move.cell is not None
+            at = [
+                torch.full_like(episodes.acted, place * bins // side)
+                for place, bins, side in zip(move.cell, task.agent.bins, task.size, strict=True)
+            ]
+            row, column = at
+        rows, columns = move.toward
+        other = [torch.full_like(episodes.acted, value) for value in (move.choice, columns + 1, rows + 1)]
+        return torch.stack([column, row, *other], 1), count
+
+    def _fullest(self, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """The bin whose block has most of some cells, bool [B, H, W]; the first of several. int64 [B] each."""
+        sums = torch.nn.functional.pad(cells.long().cumsum(1).cumsum(2), (1, 0, 1, 0))
+        (top, bottom), (left, right) = (edges.T for edges in self.program.block_edges)
+        count = sums[:, bottom][:, :, right] - sums[:, top][:, :, right]
+        count += sums[:, top][:, :, left] - sums[:, bottom][:, :, left]
+        best = count.flatten(1).argmax(1)
+        columns = self.program.task.agent.bins[1]
+        return best // columns, best % columns
+
+
+def best_plans(program: TaskProgram, worlds: Tensor, count: int) -> Tensor:
+    """The best of `count` random plans in each of some worlds, int64 [n]: int64 [n, actions, 5].
+
+    Every plan is simulated from the world's start; its return decides, and the first of equal plans wins. Plans are
+    hashes of the world and the plan's number.
+    """
+    agent, device = program.task.agent, worlds.device
+    nvec = torch.tensor(program.action_nvec, device=device)
+    best = torch.zeros(len(worlds), agent.actions, 5, dtype=torch.int64, device=device)
+    returns = torch.full((len(worlds),), -torch.inf, dtype=torch.float64, device=device)
+    together = max(1, SIMULATED // max(1, len(worlds)))
+    for first in range(0, count, together):
+        numbers = torch.arange(first, min(first + together, count), device=device)
+        seeds = worlds.repeat(len(numbers))  # plan by plan
+        plan_numbers = numbers.repeat_interleave(len(worlds))
+        plans = torch.stack(
+            [
+                (uniforms(action_keys(PLANS, seeds, plan_numbers * agent.actions + step), 5) * nvec).long()
+                for step in range(agent.actions)
+            ],
+            1,
+        )
+        found = _returns(program, seeds, plans).view(len(numbers), len(worlds))
+        top = found.argmax(0)
+        better = found.gather(0, top[None])[0]
+        chosen = plans.view(len(numbers), len(worlds), agent.actions, 5)[
+            top, torch.arange(len(worlds), device=device)
+        ]
+        wins = better > returns
+        best[wins], returns[wins] = chosen[wins], better[wins]
+    return best
+
+
+def _returns(program: TaskProgram, seeds: Tensor, plans: Tensor) -> Tensor:
+    """The return of a plan in each of some worlds, float64 [n]."""
+    episodes = program.start(seeds)
+    total = torch.zeros(len(seeds), dtype=torch.float64, device=seeds.device)
+    going = torch.ones(len(seeds), dtype=torch.bool, device=seeds.device)
+    for step in range(plans.shape[1]):
+        episodes, reward, _, over = program.act(episodes, plans[:, step], reuse=True)
+        total += torch.where(going, reward.double(), 0.0)
+        going &= ~over
+    return total
+
+
+def _measures_of(expert: Expert) -> tuple[Measure, ...]:
+    """Every measure that an expert's moves read, once."""
+    found: dict[Measure, None] = {}
+    for move in expert.moves:
+        if move.most is not None:
+            found[move.most] = None
+        if move.condition is not None:
+            found |= {part.value: None for part in parts_of(move.condition) if part.op == "measure"}
+    return tuple(found)
