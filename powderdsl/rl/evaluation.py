@@ -18,11 +18,12 @@ from powderdsl.experiments.runs import RunFolder, find_run
 from powderdsl.rl.config import TrainConfig
 from powderdsl.rl.policies import config_of, load_policy, task_of
 from powderdsl.simulation.simulator import World
-from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
+from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import check_split
 from powderdsl.tasks.task import Task
 
-POLICIES = ("trained", "random", "nothing")
+POLICIES = ("trained", "expert", "random", "nothing")
 BASELINES = ("random", "nothing")
 EVALUATION = "evaluation.json"
 BATCH = 256
@@ -42,7 +43,9 @@ class Score:
     """A policy on a split. `interval` is half of the 95 % interval of `mean`: 1.96 standard errors; None of one episode.
 
     `above` has the mean difference to each of BASELINES in the same worlds, with its own interval, as far as they were
-    played and are others. `success` is None for tasks that do not say what success is.
+    played and are others. `success` is None for tasks that do not say what success is. `normalized` is the mean on a
+    scale where doing nothing is 0 and the task's expert 1, with its interval, paired by world (delta method); None unless
+    both were played and the expert is better.
     """
 
     split: str
@@ -53,17 +56,22 @@ class Score:
     success: float | None
     length: float
     above: Mapping[str, tuple[float, float | None]]
+    normalized: tuple[float, float | None] | None = None
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of policies on splits. `step`: the interactions that the trained one had learned from."""
+    """Scores of policies on splits. `step`: the interactions that the trained one had learned from.
+
+    `unchanged`: in how many worlds of each split all policies that were played got the same return, if several were.
+    """
 
     task: str
     step: int | None
     deterministic: bool
     seed: int
     scores: tuple[Score, ...]
+    unchanged: Mapping[str, int]
 
     def as_json(self) -> dict[str, Any]:
         """For JSON: scores by split and policy."""
@@ -74,9 +82,15 @@ class Evaluation:
             numbers["above"] = {
                 other: {"mean": mean, "interval": half} for other, (mean, half) in score.above.items()
             }
+            if score.normalized is not None:
+                numbers["normalized"] = dict(zip(("mean", "interval"), score.normalized, strict=True))
             splits.setdefault(score.split, {})[score.policy] = numbers
         about = {name: value for name, value in asdict(self).items() if name != "scores"}
         return {**about, "splits": splits}
+
+
+Player = Callable[[Episodes], Tensor]
+"""From episodes as they are, which it may look into, to actions int64 [B, 5]."""
 
 
 def play(
@@ -87,6 +101,7 @@ def play(
     observation: str = "ids",
     numbers: Tensor | None = None,
     seed: int = 0,
+    player: Player | None = None,
     begun: Callable[[Any], None] | None = None,
     seen: Callable[[World], None] | None = None,
     acted: Callable[[Tensor | None, Tensor, Tensor], None] | None = None,
@@ -97,6 +112,7 @@ def play(
         policy: None does nothing at all: the worlds run by themselves.
         worlds: which, int64 [n]. numbers: of the episodes, int64 [n], which a policy's random numbers depend on together
             with `seed`; 0, 1, … otherwise.
+        player: acts instead of a policy.
         begun: called with the episodes at their start. seen: with the worlds after each action and step, see
             `TaskProgram.act`. acted: after each action, with the actions, the returns so far and which episodes are over.
     """
@@ -112,7 +128,11 @@ def play(
         begun(episodes)
     for step in range(program.task.agent.actions):
         keys = action_keys(seed, numbers, step)
-        actions = None if policy is None else policy(sight.of(episodes.world), keys)
+        actions = None
+        if player is not None:
+            actions = player(episodes)
+        elif policy is not None:
+            actions = policy(sight.of(episodes.world), keys)
         # Episodes that are over run on, and no longer count.
         episodes, reward, success, over = program.act(episodes, actions, reuse=seen is None, seen=seen)
         returns += torch.where(going, reward.double(), 0.0)
@@ -146,7 +166,9 @@ def evaluate(
 
     Args:
         run_or_task: a run, or the path or name of one, or a task as `Task`, which has no trained policy.
-        splits: all of the task's unless given. policies: some of POLICIES; all of them unless given.
+        splits: all of the task's unless given.
+        policies: some of POLICIES. Unless given, all that the task and the run have, but not an expert that searches,
+            which takes as long as its many plans.
         deterministic: the trained policy takes the likeliest action, instead of drawing one.
         backend, device: those of the run unless given. said: called with each score as it is known.
         packs: names or files of packs that are added to the rules of a run's task.
@@ -163,7 +185,7 @@ def evaluate(
     names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
     for name in names:
         check_split(task, name)
-    chosen = _chosen(policies, POLICIES if run is not None else BASELINES)
+    chosen = _chosen(policies, task, trained=run is not None)
     if episodes < 1 or not names:
         raise ValueError(
             f"episodes is {episodes}: it takes an integer from 1" if names else "splits are empty"
@@ -177,24 +199,31 @@ def evaluate(
         trained = load_policy(run, env, deterministic=deterministic)
         acts["trained"], step = trained, trained.step
     scores: list[Score] = []
+    unchanged: dict[str, int] = {}
     for name in names:
         program = first if name == first.split else TaskProgram(task, name, first.simulator)
         count = config.worlds if run is not None and name == config.split else episodes
         worlds = torch.arange(episodes) % count
-        played = {one: _play_all(program, acts[one], worlds, config.observation, seed) for one in chosen}
+        played = {one: _play_all(program, one, acts, worlds, config.observation, seed) for one in chosen}
+        if len(chosen) > 1:
+            returns = torch.stack([one.returns for one in played.values()])
+            unchanged[name] = int((returns == returns[0]).all(0).sum())
         for policy in chosen:
             scores.append(_score(name, policy, played, task))
             if said is not None:
                 said(scores[-1])
-    found = Evaluation(task.name, step, deterministic, seed, tuple(scores))
+    found = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged)
     if run is not None:
         run.write_json(EVALUATION, found.as_json())
     return found
 
 
-def _chosen(policies: Sequence[str] | None, known: Sequence[str]) -> list[str]:
-    """The policies to play, in the order of those that are known. Raises ValueError."""
-    chosen = [one for one in known if policies is None or one in policies]
+def _chosen(policies: Sequence[str] | None, task: Task, *, trained: bool) -> list[str]:
+    """The policies to play, in the order of POLICIES. Raises ValueError."""
+    there = {"trained": trained, "expert": task.expert is not None}
+    known = [one for one in POLICIES if there.get(one, True)]
+    slow = {"expert"} if task.expert is not None and task.expert.search else set()
+    chosen = [one for one in known if (one not in slow if policies is None else one in policies)]
     unknown = [one for one in policies or () if one not in known]
     if unknown or not chosen:
         raise ValueError(f"policies are {', '.join(known)}; found {unknown[0] if unknown else 'none'}")
@@ -202,13 +231,23 @@ def _chosen(policies: Sequence[str] | None, known: Sequence[str]) -> list[str]:
 
 
 def _play_all(
-    program: TaskProgram, policy: Policy | None, worlds: Tensor, observation: str, seed: int
+    program: TaskProgram,
+    name: str,
+    acts: Mapping[str, Policy | None],
+    worlds: Tensor,
+    observation: str,
+    seed: int,
 ) -> Played:
+    policy = acts.get(name)
     kind = observation if policy is not None else "ids"
-    parts = [
-        play(program, policy, worlds[numbers], observation=kind, numbers=numbers, seed=seed)
-        for numbers in torch.arange(len(worlds)).split(BATCH)
-    ]
+    parts = []
+    for numbers in torch.arange(len(worlds)).split(BATCH):
+        player = ExpertPlayer(program) if name == "expert" else None
+        parts.append(
+            play(
+                program, policy, worlds[numbers], observation=kind, numbers=numbers, seed=seed, player=player
+            )
+        )
     return Played(*map(torch.cat, zip(*parts, strict=True)))
 
 
@@ -219,9 +258,25 @@ def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task
         for other in BASELINES
         if other != policy and other in all_played
     }
+    normalized = None
+    if {"expert", "nothing"} <= all_played.keys():
+        nothing = all_played["nothing"].returns
+        normalized = _ratio(played.returns - nothing, all_played["expert"].returns - nothing)
     success = float(played.success.double().mean()) if task.goal.success is not None else None
     length = float(played.lengths.double().mean())
-    return Score(split, policy, len(played.returns), *_mean(played.returns), success, length, above)
+    return Score(
+        split, policy, len(played.returns), *_mean(played.returns), success, length, above, normalized
+    )
+
+
+def _ratio(values: Tensor, scale: Tensor) -> tuple[float, float | None] | None:
+    """The ratio of two means of the same worlds, and half of its 95 % interval; None unless the second is positive."""
+    whole = float(scale.mean())
+    if whole <= 0:
+        return None
+    ratio = float(values.mean()) / whole
+    _, half = _mean(values - ratio * scale)
+    return ratio, None if half is None else half / whole
 
 
 def _mean(values: Tensor) -> tuple[float, float | None]:

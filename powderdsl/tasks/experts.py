@@ -119,7 +119,7 @@ class _Move:
                 self.reader.reporter.error("PD804", message, word.span, "not a direction", helps=helps)
                 return None
         rows, columns = (sum(SIDES[part][axis] for part in parts) for axis in (0, 1))
-        if len(parts) > 2 or abs(rows) + abs(columns) != len(parts):
+        if max(abs(rows), abs(columns)) > 1 or abs(rows) + abs(columns) != len(parts):
             message, helps = f"`{word.text}` is not one direction", ["write one of them, or `above.right`"]
             self.reader.reporter.error("PD804", message, word.span, "contradicts itself", helps=helps)
             return None

@@ -36,7 +36,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
     "--policies",
     callback=_names,
     metavar="A,B",
-    help="Policies among trained, random, nothing.  [default: all]",
+    help="Policies among trained, expert, random, nothing.  [default: all; an expert that searches only if named]",
 )
 @opt.integer("--episodes", 1, 10**6, "Episodes per split and policy.", 256)
 @click.option(
@@ -82,9 +82,15 @@ def command(
 
 def _text(found: Evaluation) -> list[str]:
     after = "" if found.step is None else f", after {found.step:,} interactions"
-    rows = [["split", "policy", "return", "above random", "above nothing", "success", "actions"]]
+    rows = [["split", "policy", "return", "above random", "above nothing", "of expert", "success", "actions"]]
     rows += [_row(score) for score in found.scores]
-    return [f"{found.task}{after}", *table(rows)]
+    worlds = {score.split: score.episodes for score in found.scores}
+    same = [
+        f"{name}: all policies got the same return in {count} of {worlds[name]} worlds"
+        for name, count in found.unchanged.items()
+        if count
+    ]
+    return [f"{found.task}{after}", *table(rows), *same]
 
 
 def _row(score: Score) -> list[str]:
@@ -96,6 +102,7 @@ def _row(score: Score) -> list[str]:
         score.policy,
         _number(score.mean, score.interval),
         *(_number(*score.above[other]) if other in score.above else "" for other in BASELINES),
+        "" if score.normalized is None else _number(*score.normalized),
         success,
         f"{score.length:.1f}",
     ]
