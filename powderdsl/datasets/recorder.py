@@ -36,6 +36,7 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs.folder import held
 from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram
+from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
 
 Array = NDArray[Any]
@@ -67,7 +68,8 @@ def still_action(task: Task) -> tuple[int, int, int, int, int]:
     return 0, 0, choices.index(choice), 1, 1
 
 
-SCRIPTED: dict[str, Callable[[TaskProgram], Policy]] = {
+SCRIPTED: dict[str, Callable[[TaskProgram], Policy | ExpertPlayer]] = {
+    "expert": ExpertPlayer,
     "random": lambda program: random_policy(program.action_nvec),
     "nothing": nothing_policy,
 }
@@ -180,7 +182,14 @@ class _Recording:
     `env` has a number of slots. A slot whose episode is over takes the next one, so that all are busy until the end.
     """
 
-    def __init__(self, one: TensorEnv, policy: Policy, sight: Observation, folder: Path, manifest: Manifest):
+    def __init__(
+        self,
+        one: TensorEnv,
+        policy: Policy | ExpertPlayer,
+        sight: Observation,
+        folder: Path,
+        manifest: Manifest,
+    ):
         self.recipe, self.manifest, self.folder = manifest.recipe, manifest, folder
         self.one, self.policy, self.sight = one, policy, sight
         recorded = {row.number for row in manifest.shards}
@@ -229,9 +238,13 @@ class _Recording:
         env, tape, every = self.env, self.tape, np.arange(len(self.taken))
         episode, taken = (torch.from_numpy(one.copy()).to(env.device) for one in (self.episode, self.taken))
         assert env.episodes is not None
-        shown = observed if self.sight.kind == self.recipe.observation else self.sight.of(env.episodes.world)
-        with torch.no_grad():
-            actions = torch.as_tensor(self.policy(shown, action_keys(self.recipe.seed, episode, taken)))
+        if isinstance(self.policy, ExpertPlayer):
+            actions = self.policy(env.episodes)
+        else:
+            own = self.sight.kind == self.recipe.observation
+            shown = observed if own else self.sight.of(env.episodes.world)
+            with torch.no_grad():
+                actions = torch.as_tensor(self.policy(shown, action_keys(self.recipe.seed, episode, taken)))
         observed, reward, terminated, truncated, info = env.step(actions)
         given = {"action": actions, "reward": reward, "terminated": terminated, "truncated": truncated}
         for name, value in {**given, "success": info["success"]}.items():

@@ -18,7 +18,7 @@ from powderdsl.experiments.runs import RunFolder, find_run
 from powderdsl.rl.config import TrainConfig
 from powderdsl.rl.policies import config_of, load_policy, task_of
 from powderdsl.simulation.simulator import World
-from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
+from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import check_split
 from powderdsl.tasks.task import Task
@@ -89,19 +89,14 @@ class Evaluation:
         return {**about, "splits": splits}
 
 
-Player = Callable[[Episodes], Tensor]
-"""From episodes as they are, which it may look into, to actions int64 [B, 5]."""
-
-
 def play(
     program: TaskProgram,
-    policy: Policy | None,
+    policy: Policy | ExpertPlayer | None,
     worlds: Tensor,
     *,
     observation: str = "ids",
     numbers: Tensor | None = None,
     seed: int = 0,
-    player: Player | None = None,
     begun: Callable[[Any], None] | None = None,
     seen: Callable[[World], None] | None = None,
     acted: Callable[[Tensor | None, Tensor, Tensor], None] | None = None,
@@ -109,10 +104,9 @@ def play(
     """One episode in each of some worlds.
 
     Args:
-        policy: None does nothing at all: the worlds run by themselves.
+        policy: an expert sees the episodes themselves. None does nothing at all: the worlds run by themselves.
         worlds: which, int64 [n]. numbers: of the episodes, int64 [n], which a policy's random numbers depend on together
             with `seed`; 0, 1, … otherwise.
-        player: acts instead of a policy.
         begun: called with the episodes at their start. seen: with the worlds after each action and step, see
             `TaskProgram.act`. acted: after each action, with the actions, the returns so far and which episodes are over.
     """
@@ -129,8 +123,8 @@ def play(
     for step in range(program.task.agent.actions):
         keys = action_keys(seed, numbers, step)
         actions = None
-        if player is not None:
-            actions = player(episodes)
+        if isinstance(policy, ExpertPlayer):
+            actions = policy(episodes)
         elif policy is not None:
             actions = policy(sight.of(episodes.world), keys)
         # Episodes that are over run on, and no longer count.
@@ -192,7 +186,10 @@ def evaluate(
         )
     backend, device = backend or config.backend, device or config.device
     first = compile_task(task, split=names[0], backend=backend, device=device, threads=config.threads)
-    acts: dict[str, Policy | None] = {"random": random_policy(first.action_nvec), "nothing": None}
+    acts: dict[str, Policy | ExpertPlayer | None] = {
+        "random": random_policy(first.action_nvec),
+        "nothing": None,
+    }
     step = None
     if run is not None and "trained" in chosen:
         env = TensorEnv(first, 1, observation=config.observation)
@@ -204,7 +201,9 @@ def evaluate(
         program = first if name == first.split else TaskProgram(task, name, first.simulator)
         count = config.worlds if run is not None and name == config.split else episodes
         worlds = torch.arange(episodes) % count
-        played = {one: _play_all(program, one, acts, worlds, config.observation, seed) for one in chosen}
+        if "expert" in chosen:
+            acts["expert"] = ExpertPlayer(program)
+        played = {one: _play_all(program, acts[one], worlds, config.observation, seed) for one in chosen}
         if len(chosen) > 1:
             returns = torch.stack([one.returns for one in played.values()])
             unchanged[name] = int((returns == returns[0]).all(0).sum())
@@ -231,23 +230,13 @@ def _chosen(policies: Sequence[str] | None, task: Task, *, trained: bool) -> lis
 
 
 def _play_all(
-    program: TaskProgram,
-    name: str,
-    acts: Mapping[str, Policy | None],
-    worlds: Tensor,
-    observation: str,
-    seed: int,
+    program: TaskProgram, policy: Policy | ExpertPlayer | None, worlds: Tensor, observation: str, seed: int
 ) -> Played:
-    policy = acts.get(name)
     kind = observation if policy is not None else "ids"
-    parts = []
-    for numbers in torch.arange(len(worlds)).split(BATCH):
-        player = ExpertPlayer(program) if name == "expert" else None
-        parts.append(
-            play(
-                program, policy, worlds[numbers], observation=kind, numbers=numbers, seed=seed, player=player
-            )
-        )
+    parts = [
+        play(program, policy, worlds[numbers], observation=kind, numbers=numbers, seed=seed)
+        for numbers in torch.arange(len(worlds)).split(BATCH)
+    ]
     return Played(*map(torch.cat, zip(*parts, strict=True)))
 
 

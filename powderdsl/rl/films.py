@@ -17,6 +17,7 @@ from powderdsl.rl.evaluation import Played, play
 from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import Episodes, TaskProgram
+from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.task import BLOW, Task
 
 LINE = 14
@@ -77,7 +78,7 @@ class FilmRecorder:
 
 def film(
     program: TaskProgram,
-    policy: Policy | None,
+    policy: Policy | ExpertPlayer | None,
     worlds: Tensor,
     *,
     observation: str = "ids",

@@ -20,7 +20,7 @@ PLANS = 0x506C616E
 
 
 class ExpertPlayer:
-    """Plays the expert of a program's task in a batch of episodes. A search keeps its plans: one player per batch.
+    """Plays the expert of a program's task. A search is made when a world is first seen, and its plan kept.
 
     Raises ValueError for a task without an expert.
     """
@@ -35,15 +35,13 @@ class ExpertPlayer:
         self._meter = Meter(
             program.simulator.ruleset, self.measures, program.task.size, {}, program.simulator.device
         )
-        self._plans: Tensor | None = None
+        self._plans: dict[int, Tensor] = {}
+        """Of a search: int64 [actions, 5] by world."""
 
     def __call__(self, episodes: Episodes) -> Tensor:
         """The actions of some episodes, int64 [B, 5]."""
         if self.expert.search:
-            if self._plans is None:
-                self._plans = best_plans(self.program, episodes.seed, self.expert.search)
-            step = episodes.acted.clamp(max=self._plans.shape[1] - 1)
-            return self._plans[torch.arange(len(step), device=step.device), step]
+            return self._planned(episodes)
         now = self._meter.take(episodes.world, episodes.regions, episodes.targets, None)
         left = self.program.task.agent.actions - episodes.acted
         facts = Facts(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
@@ -61,6 +59,16 @@ class ExpertPlayer:
             actions[applies] = found[applies]
             waiting &= ~applies
         return actions
+
+    def _planned(self, episodes: Episodes) -> Tensor:
+        """The actions of the plans for some episodes, int64 [B, 5]."""
+        seeds, last = episodes.seed.tolist(), self.program.task.agent.actions - 1
+        new = [seed for seed in dict.fromkeys(seeds) if seed not in self._plans]
+        if new:
+            worlds = torch.tensor(new, device=episodes.seed.device)
+            self._plans |= zip(new, best_plans(self.program, worlds, self.expert.search), strict=True)
+        steps = zip(seeds, episodes.acted.tolist(), strict=True)
+        return torch.stack([self._plans[seed][min(step, last)] for seed, step in steps])
 
     def _action(self, move: ExpertMove, episodes: Episodes) -> tuple[Tensor, Tensor]:
         """The action of a move in every episode, int64 [B, 5], and the number of cells that it counts, int64 [B]."""

@@ -20,7 +20,7 @@ from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 
-SCRIPTED = ("random", "nothing")
+SCRIPTED = ("expert", "random", "nothing")
 
 
 @click.command("record", cls=opt.ManyWords)
@@ -30,8 +30,8 @@ SCRIPTED = ("random", "nothing")
 @opt.text("--split", "SPLIT", "The set of worlds.", "train")
 @opt.text(
     "--policy",
-    "random|nothing|RUN",
-    "Policy: every action equally likely, no action, or a trained agent.",
+    "expert|random|nothing|RUN",
+    "Policy: the task's expert, every action equally likely, no action, or a trained agent.",
     "random",
 )
 @opt.choice("--observation", ("ids", "compact"), "Record elements only, or the whole state.", "ids")
@@ -158,6 +158,8 @@ def _checked(
             from powderdsl.datasets.recorder import still_action
 
             still_action(found)
+    if found is not None and policy == "expert" and found.expert is None:
+        mistakes.lines.append(f"the task {found.name} has no `expert:`")
     return None if mistakes.report() else found
 
 

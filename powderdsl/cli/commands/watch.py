@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from powderdsl.envs.acting import Policy
     from powderdsl.experiments.runs import RunFolder
     from powderdsl.tasks.episodes import TaskProgram
+    from powderdsl.tasks.players import ExpertPlayer
 
 SUFFIXES = (".gif", ".mp4")
 
@@ -29,7 +30,9 @@ SUFFIXES = (".gif", ".mp4")
 @opt.integer("--worlds", 1, 64, "Number of worlds, side by side.", 4)
 @opt.integer("--first", 0, 2**62, "Number of the first world.", 0)
 @opt.choice(
-    "--policy", ("trained", "random", "nothing"), "Policy that acts.  [default: trained; for a TASK: random]"
+    "--policy",
+    ("trained", "expert", "random", "nothing"),
+    "Policy that acts.  [default: trained; for a TASK: random]",
 )
 @click.option("--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one.")
 @opt.integer("--seed", 0, 2**32 - 1, "Seed of what the policy draws.", 0)
@@ -99,14 +102,17 @@ def command(
 
 def _acting(
     name: str, played: Task | RunFolder, program: TaskProgram, config: TrainConfig, deterministic: bool
-) -> tuple[Policy | None, str]:
+) -> tuple[Policy | ExpertPlayer | None, str]:
     """A policy, None if nobody acts, and the kind of observation that it is given."""
     from powderdsl.envs.acting import random_policy
     from powderdsl.envs.tensor_env import TensorEnv
     from powderdsl.rl.policies import load_policy
+    from powderdsl.tasks.players import ExpertPlayer
 
     with user_values():
         if name == "trained" and not isinstance(played, Task):
             env = TensorEnv(program, 1, observation=config.observation)
             return load_policy(played, env, deterministic=deterministic), config.observation
+        if name == "expert":
+            return ExpertPlayer(program), "ids"
         return (random_policy(program.action_nvec) if name == "random" else None), "ids"
