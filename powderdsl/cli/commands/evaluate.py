@@ -90,7 +90,7 @@ def _text(found: Evaluation) -> list[str]:
         for name, count in found.unchanged.items()
         if count
     ]
-    return [f"{found.task}{after}", *table(rows), *same]
+    return [f"{found.task}{after}", *same, *table(rows)]
 
 
 def _row(score: Score) -> list[str]:
