@@ -106,8 +106,8 @@ class Places:
             return
         self.wrong.add(where.step)
         span = self.place("word", where.step, where.option, str(where.number))
-        names = names_in([where.text])
-        written = self._written(names.pop(), where) if len(names) == 1 else None
+        names = sorted(names_in([where.text]))
+        written = self._written(names[0], where) if len(names) == 1 else None
         if written is not None:
             more["secondary"] = (Label(span, f"as `{where.written}`"),)
         self.reporter.error(code, message, written or span, label, **more)

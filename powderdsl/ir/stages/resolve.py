@@ -125,8 +125,8 @@ def _substitute(
 ) -> Node:
     """The condition with tables of known elements replaced."""
     if node.op == "table" and node.args[0] in known:
-        values = {node.attr[i] for i in known[node.args[0]] if i < len(node.attr)}
-        return build.integer(values.pop()) if len(values) == 1 else node
+        values = sorted({node.attr[i] for i in known[node.args[0]] if i < len(node.attr)})
+        return build.integer(values[0]) if len(values) == 1 else node
     if node.op not in _LOGIC or _tables(node, tables).isdisjoint(known):
         return node
     if node not in done:
