@@ -224,7 +224,7 @@ def test_folders_of_others_are_left_alone(small: TaskProgram, tmp_path: Path) ->
         ({"shard": 0}, "shard must be"),
         ({"shard": 1 << 30}, "a shard of 1073741824 episodes may take"),
         ({"observation": "matrix"}, "observation is one of ids, compact"),
-        ({"policy": "clever"}, "one of random, nothing"),
+        ({"policy": "clever"}, "one of expert, random, nothing"),
         ({"policy": lambda observed, keys: None}, "needs a policy_name"),
         (
             {"policy": lambda observed, keys: [[9] * 5] * 2, "policy_name": "bad"},

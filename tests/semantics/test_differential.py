@@ -222,7 +222,7 @@ def test_a_difference_is_found_and_located() -> None:
         "pack: p\nfields: {f: {type: 0..9, at: place}}\nelements: {a: {id: 0, color: '#000000'}}\n"
         "passes:\n  first: {do: f += 1}\n  second: {do: f += step mod 2}\n"
     )
-    start = Start(np.zeros((2, 3, 4), np.uint8))
+    start = Start.fresh(np.zeros((2, 3, 4), np.uint8))
     right, wrong = compile_ruleset(ruleset, backend="reference"), compile_ruleset(ruleset, backend="torch")
     assert_same(ruleset, start, simulators=[right, wrong], steps=3)
     step = wrong.step

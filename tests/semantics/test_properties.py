@@ -76,12 +76,7 @@ def test_a_world_is_the_same_alone_and_in_a_batch(backend: str, seeds: range) ->
         after = simulator.step(together, 3)
         for i in range(3):
             assert_equal(simulator.step(together.select([i]), 3), after.select(i))
-            one = replace(
-                start,
-                ids=start.ids[i : i + 1],
-                fields={name: values[i : i + 1] for name, values in start.fields.items()},
-            )
-            alone = replace(one.world(simulator), index=together.index[i : i + 1])
+            alone = replace(start.one(i).world(simulator), index=together.index[i : i + 1])
             assert_equal(simulator.step(alone, 3), after.select(i))
         assert_equal(simulator.step(together.select([2, 0]), 3), after.select([2, 0]))
 
@@ -415,7 +410,7 @@ def test_the_empty_world_of_an_empty_pack_stays() -> None:
     head = "pack: p\nelements:\n  a: {id: 0, color: '#000000'}\n  b: {id: 1, color: '#000001'}\n"
     never = "passes: {one: {do: 'a -> b, with chance 0%'}}\n"
     always = "passes: {one: {do: 'a -> b, with chance 100%'}}\n"
-    start = Start(np.arange(12).reshape(1, 3, 4) % 2)
+    start = Start.fresh(np.arange(12).reshape(1, 3, 4) % 2)
     for text, changes in ((head, False), (head + never, False), (head + always, True)):
         for backend in ("reference", "torch", "arrays"):
             simulator = compile_ruleset(load_text(text), backend=backend)

@@ -251,7 +251,7 @@ def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: p
     found = json.loads(Path("agent/evaluation.json").read_text())
     splits = list(found["splits"])
     real = set(numbers(found))
-    known = set(numbers(values_of_agent(splits, ("trained", "random", "nothing"))))
+    known = set(numbers(values_of_agent(splits, ("trained", "expert", "random", "nothing"))))
     assert {keys for keys in known if keys[-1] != "success"} <= real <= known
 
     quick = ("--width", 4, "--batch", 4, "--buffer", 8, "--refresh", 2, "--states", 8, "--iterations", 1)

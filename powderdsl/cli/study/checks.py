@@ -289,7 +289,8 @@ class _StudyCheck:
             for split in word.filled.split(","):
                 with self.told(word):
                     check_split(task, split.strip())
-        known = POLICIES if call.step.on_step else POLICIES[1:]
+        there = {"trained": bool(call.step.on_step), "expert": task.expert is not None}
+        known = [one for one in POLICIES if there.get(one, True)]
         for word in call.all("policies"):
             for policy in map(str.strip, word.filled.split(",")):
                 if policy not in known:

@@ -19,7 +19,7 @@ EVALUATES: dict[tuple[str, ...], tuple[tuple[str, ...], ...]] = {
     ("wm", "eval"): (("wm", "train"), ("wm", "finetune")),
 }
 """Commands that write an evaluation.json, and whose runs they write it to."""
-POLICIES = ("trained", "random", "nothing")
+POLICIES = ("trained", "expert", "random", "nothing")
 BASELINES = ("random", "nothing")
 PREDICTORS = ("model", "nothing changes", "most frequent outcome")
 
@@ -77,10 +77,15 @@ def _evaluation(
     )
     return values_of_agent(
         splits or [one.name for one in task.splits],
-        policies or POLICIES,
+        policies or [one for one in POLICIES if one != "expert" or _has_script(task)],
         success=task.goal.success is not None,
         interval=all(word.filled != "1" for word in words.get("episodes", ())),
     )
+
+
+def _has_script(task: Task) -> bool:
+    """Whether `evaluate` plays the task's expert without being asked to."""
+    return task.expert is not None and not task.expert.search
 
 
 def _follow(places: Places, measure: Measure, tree: Mapping[str, Any], keys: Sequence[str]) -> None:
@@ -122,11 +127,13 @@ def values_of_agent(
             "above": {
                 other: {"mean": 0, **half} for other in BASELINES if other != policy and other in policies
             },
+            **({"normalized": {"mean": 0, **half}} if {"expert", "nothing"} <= {*policies} else {}),
         }
         for policy in policies
     }
     step = {"step": 0} if "trained" in policies else {}
-    return {**step, "seed": 0, "splits": dict.fromkeys(splits, scores)}
+    unchanged = {"unchanged": dict.fromkeys(splits, 0)} if len(policies) > 1 else {}
+    return {**step, "seed": 0, "splits": dict.fromkeys(splits, scores), **unchanged}
 
 
 def values_of_world_model() -> Mapping[str, Any]:
