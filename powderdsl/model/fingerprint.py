@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import MISSING, Field, fields, is_dataclass
 from fractions import Fraction
 from types import MappingProxyType
@@ -19,20 +20,23 @@ def fingerprint(model: object) -> str:
     metadata. A field at its default counts as absent, so that new fields change no fingerprint. The names of classes and
     fields are part of it: renaming one changes the fingerprints that users' files have recorded.
 
+    A function as the metadata ``fingerprint`` of a field gives what stands for its value.
+
     Raises:
         TypeError: something else was found.
     """
-    known: dict[int, str] = {}  # shared parts are many: once each
+    known: dict[int, tuple[object, str]] = {}  # shared parts are many: once each
     return _digest(model, known)
 
 
-def _digest(value: object, known: dict[int, str]) -> str:
+def _digest(value: object, known: dict[int, tuple[object, str]]) -> str:
     if is_dataclass(value):
         if id(value) not in known:
             parts = [f"{field.name}={_digest(part, known)}" for field, part in _meaning(value)]
             text = f"{type(value).__name__}({','.join(parts)})"
-            known[id(value)] = hashlib.sha256(text.encode()).hexdigest()
-        return known[id(value)]
+            # The value is kept: another object could get its id.
+            known[id(value)] = value, hashlib.sha256(text.encode()).hexdigest()
+        return known[id(value)][1]
     if isinstance(value, tuple):
         return f"[{','.join(_digest(part, known) for part in value)}]"
     if isinstance(value, frozenset):
@@ -48,5 +52,6 @@ def _meaning(value: Any) -> list[tuple[Field[Any], Any]]:
         part = getattr(value, field.name)
         default = field.default_factory() if field.default_factory is not MISSING else field.default
         if field.compare and field.metadata.get("meaning", True) and (default is MISSING or part != default):
-            found.append((field, part))
+            written: Callable[[Any], Any] = field.metadata.get("fingerprint", lambda part: part)
+            found.append((field, written(part)))
     return found
