@@ -224,7 +224,7 @@ class Expert:
     """How a good player acts. Before each action the first move that applies is played; a move applies if its condition
     holds and enough cells of `most` exist. The last move always applies.
 
-    If `search` is not 0, there are no moves: so many random plans are simulated in each world, and the best is played.
+    If `search` is not 0, there are no moves: that number of random plans is simulated in each world, and the best is played.
     """
 
     moves: tuple[ExpertMove, ...]

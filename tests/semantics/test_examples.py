@@ -45,7 +45,7 @@ def test_all_of_them_load_together() -> None:
 
 
 def failures(rules: Ruleset, pack: str, backend: str) -> list[str]:
-    """The tests of one pack that fail with all of these rules; what packs beside it change is no failure."""
+    """The tests of one pack that fail with all of these rules; changes by packs beside it are not failures."""
     own = tuple(example for example in rules.tests if example.pack == pack)
     assert own, f"{pack} has no tests"
     results = run_examples(replace(rules, tests=own), backend=backend)
