@@ -221,7 +221,7 @@ def _chosen(policies: Sequence[str] | None, task: Task, *, trained: bool) -> lis
     """The policies to play, in the order of POLICIES. Raises ValueError."""
     there = {"trained": trained, "expert": task.expert is not None}
     known = [one for one in POLICIES if there.get(one, True)]
-    slow = {"expert"} if task.expert is not None and task.expert.search else set()
+    slow = {"expert"} if task.expert is not None and not task.expert.scripted else set()
     chosen = [one for one in known if (one not in slow if policies is None else one in policies)]
     unknown = [one for one in policies or () if one not in known]
     if unknown or not chosen:

@@ -77,15 +77,10 @@ def _evaluation(
     )
     return values_of_agent(
         splits or [one.name for one in task.splits],
-        policies or [one for one in POLICIES if one != "expert" or _has_script(task)],
+        policies or [one for one in POLICIES if one != "expert" or (task.expert and task.expert.scripted)],
         success=task.goal.success is not None,
         interval=all(word.filled != "1" for word in words.get("episodes", ())),
     )
-
-
-def _has_script(task: Task) -> bool:
-    """Whether `evaluate` plays the task's expert without being asked to."""
-    return task.expert is not None and not task.expert.search
 
 
 def _follow(places: Places, measure: Measure, tree: Mapping[str, Any], keys: Sequence[str]) -> None:
