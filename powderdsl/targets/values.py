@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from powderdsl.ir.ops import Node
+from powderdsl.schedule.types import ordered
 
 
 class Values:
@@ -64,12 +65,19 @@ class CellValues(Values):
         return chain
 
     def alike(self, node: Node) -> list[list[Node]]:
-        """The chain of a choice, and others on the same masks: the components of a vector share their tests."""
-        chain = self.chain(node)
-        masks = [choice.args[0] for choice in chain]
-        others = [
-            self.chain(other) for other in self.choices if other is not node and id(other) not in self.known
-        ]
-        return [
-            chain, *(one for one in others if len(one) > 1 and [choice.args[0] for choice in one] == masks)
-        ]  # fmt: skip
+        """The chain of a choice, and others on the same masks: the components of a vector share their tests.
+
+        None of them depends on another.
+        """
+        chains = [self.chain(node)]
+        masks = [choice.args[0] for choice in chains[0]]
+        for other in self.choices:
+            chain = [] if other is node or id(other) in self.known else self.chain(other)
+            if len(chain) > 1 and [choice.args[0] for choice in chain] == masks:
+                if not any(_depends(other, one[0]) or _depends(one[0], other) for one in chains):
+                    chains.append(chain)
+        return chains
+
+
+def _depends(value: Node, on: Node) -> bool:
+    return any(node is on for node in ordered([value]))
