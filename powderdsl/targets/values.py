@@ -73,9 +73,9 @@ class CellValues(Values):
         masks = [choice.args[0] for choice in chains[0]]
         for other in self.choices:
             chain = [] if other is node or id(other) in self.known else self.chain(other)
-            if len(chain) > 1 and [choice.args[0] for choice in chain] == masks:
-                if not any(_depends(other, one[0]) or _depends(one[0], other) for one in chains):
-                    chains.append(chain)
+            same = len(chain) > 1 and [choice.args[0] for choice in chain] == masks
+            if same and not any(_depends(other, one[0]) or _depends(one[0], other) for one in chains):
+                chains.append(chain)
         return chains
 
 

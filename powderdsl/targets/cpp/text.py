@@ -123,7 +123,8 @@ class _Printer:
         self.layout.around = max(self.layout.around, abs(dy))
         movers = str(move.movers.attr)
         names = {plane.new.name: "" if plane.new.name in declared else "Plane* " for plane in move.planes}
-        if any(_leaves(plane.old, plane.leaves, movers) is None for plane in move.planes):
+        far = move.op == "arrive" and abs(dy) > 1  # `arrive_planes` moves by one row
+        if far or any(_leaves(plane.old, plane.leaves, movers) is None for plane in move.planes):
             (plane,) = move.planes
             old, rest = plane.old.attr, _held(plane.leaves)
             target = f"shifted(c, {movers}, {-dy}, {-dx})"
