@@ -228,6 +228,9 @@ def runnable(page: Path) -> bool:
     return any(block.language in RUNNABLE for block in blocks_of(read(page)))
 
 
+# Of workers of a DataLoader: torch warns on one core, Python from 3.12 on of a fork beside other threads.
+@pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("page", [page for page in PAGES if runnable(page)], ids=page_name)
 def test_blocks_run(page: Path, folder: Path) -> None:
     namespace: dict[str, Any] = {"__name__": "documentation"}

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from powderdsl.datasets.dataset import Dataset
     from powderdsl.datasets.recorder import record
+    from powderdsl.datasets.transitions import Transitions, split
 
-__all__ = ["Dataset", "record"]
+__all__ = ["Dataset", "Transitions", "record", "split"]
 
-_HOMES = {"Dataset": "dataset", "record": "recorder"}
+_HOMES = {"Dataset": "dataset", "Transitions": "transitions", "record": "recorder", "split": "transitions"}
 
 
 def __getattr__(name: str) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data import IterableDataset, get_worker_info
 
 from powderdsl.datasets.manifest import (
     Manifest,
@@ -23,7 +23,7 @@ from powderdsl.datasets.manifest import (
     read_manifest,
     recipe_of,
 )
-from powderdsl.datasets.shards import DTYPES, Shard, open_shard, row_shape
+from powderdsl.datasets.shards import DTYPES, Shard, open_shard, read_episodes, row_shape
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.system.random import MASK, base_keys, mix
@@ -130,12 +130,14 @@ class Dataset:
         Raises:
             CompileError: PD631, naming each difference.
         """
-        other = recipe_of(env)
         names = (*MEANING, "params", "ruleset_fingerprint", "task_fingerprint") if same_rules else MEANING
+        self.require_equal(recipe_of(env), names, env.task.name)
+
+    def require_equal(self, other: Recipe, names: tuple[str, ...], whose: object) -> None:
+        """Raise CompileError (PD631) where some values of the recipe differ from those of another."""
         found = [one for one in differences(self.recipe, other) if one.split(":")[0].split(".")[0] in names]
         if found:
-            message = f"{self.folder} does not fit {env.task.name}"
-            raise failure("PD631", message, notes=tuple(found[:20]))
+            raise failure("PD631", f"{self.folder} does not fit {whose}", notes=tuple(found[:20]))
 
     def check(self) -> None:
         """Read every byte of every shard.
@@ -180,18 +182,17 @@ class Dataset:
 
     def transitions(
         self, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
-    ) -> Iterator[Batch]:
+    ) -> Batches:
         """Endless minibatches of `batch` transitions, all equally likely, drawn with replacement.
 
         Minibatch n depends on `seed` and n alone. `start` is the first one's number, to continue where one stopped.
         """
         _check_draw(batch, seed, start)
-        found = self._batches(1, self._ends, batch, seed, device, start)
-        return (Batch(*(value[:, 0] for value in one)) for one in found)
+        return Batches(self, None, self._ends, batch, seed, device, start)
 
     def sequences(
         self, length: int, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
-    ) -> Iterator[Batch]:
+    ) -> Batches:
         """Endless minibatches [B, L, …] of `length` transitions in a row of one episode, all equally likely.
 
         Raises:
@@ -204,40 +205,46 @@ class Dataset:
         if not ends[-1]:
             longest = max(int(one.max()) for one in self._lengths)
             raise ValueError(f"no episode has {length} actions; the longest has {longest}")
-        return self._batches(length, ends, batch, seed, device, start)
+        return Batches(self, length, ends, batch, seed, device, start)
 
     # Drawing
 
-    def _batches(
-        self, length: int, ends: Array, batch: int, seed: int, device: str | torch.device, start: int
-    ) -> Iterator[Batch]:
-        """Minibatches of windows of `length` transitions; `ends` are the numbers of windows up to each shard."""
-        while True:
-            found = self._gather(drawn(seed, start, batch, int(ends[-1])), ends, length)
-            yield Batch(*(torch.from_numpy(value).to(device) for value in found))
-            start += 1
-
-    def _gather(self, windows: Array, ends: Array, length: int) -> list[Array]:
-        """The arrays of `Batch` of windows, [B, length, …]."""
-        stored = {name: name.removeprefix("next_") for name in Batch._fields}
-        out = {
-            name: np.empty((len(windows), length, *row_shape(self.recipe, of)), DTYPES[of])
-            for name, of in stored.items()
-        }
+    def located(self, windows: Array, ends: Array, length: int) -> tuple[Array, Array]:
+        """The episode and the first action of windows of `length` transitions; `ends` count them up to each shard."""
+        episode, within = np.empty_like(windows), np.empty_like(windows)
         number = np.searchsorted(ends, windows, side="right")
         for one in np.unique(number).tolist():
             rows = np.flatnonzero(number == one)
-            shard = self._shard(one)
             window = windows[rows] - (ends[one - 1] if one else 0)
-            count = np.maximum(0, shard.arrays["length"].astype(np.int64) - length + 1)
+            count = np.maximum(0, self._shard(one).arrays["length"].astype(np.int64) - length + 1)
             place = np.searchsorted(np.cumsum(count), window, side="right")
-            within = window - (np.cumsum(count) - count)[place]
-            at = (shard.starts[place] + within)[:, None] + np.arange(length)
-            first = at + place[:, None]  # each episode before has one observation more than actions
+            episode[rows] = one * self.recipe.shard + place
+            within[rows] = window - (np.cumsum(count) - count)[place]
+        return episode, within
+
+    def gather(self, episode: Array, first: Array, length: int) -> list[Array]:
+        """The arrays of `Batch`, [n, length, …], of `length` transitions from action `first` of each episode, int64 [n]."""
+        stored = {name: name.removeprefix("next_") for name in Batch._fields}
+        out = {
+            name: np.empty((len(episode), length, *row_shape(self.recipe, of)), DTYPES[of])
+            for name, of in stored.items()
+        }
+        number, place = episode // self.recipe.shard, episode % self.recipe.shard
+        for one in np.unique(number).tolist():
+            rows = np.flatnonzero(number == one)
+            shard = self._shard(one)
+            at = (shard.starts[place[rows]] + first[rows])[:, None] + np.arange(length)
+            shown = at + place[rows][:, None]  # each episode before has one observation more than actions
             for name, of in stored.items():
-                taken = first + (name != of) if of == "observation" else at
+                taken = shown + (name != of) if of == "observation" else at
                 out[name][rows] = shard.arrays[of][taken]
         return list(out.values())
+
+    def lengths_and_worlds(self) -> tuple[Array, Array]:
+        """The number of actions and the world of every episode: int64 [episodes] each. Reads little of each shard."""
+        parts = [read_episodes(self.folder, self.recipe, row) for row in self.manifest.shards]
+        length, world = (np.concatenate(one).astype(np.int64) for one in zip(*parts, strict=True))
+        return length, world
 
     @cached_property
     def _lengths(self) -> list[Array]:
@@ -257,6 +264,42 @@ class Dataset:
                 self._shards.popitem(last=False)
         self._shards.move_to_end(number)
         return self._shards[number]
+
+
+class Batches(IterableDataset[Batch]):
+    """An endless iterator over minibatches: see `Dataset.transitions` and `Dataset.sequences`.
+
+    It is also a dataset for `torch.utils.data.DataLoader` with ``batch_size=None``. Worker w of W reads every W-th
+    minibatch from the w-th, so the loader yields the same minibatches in the same order with any number of workers.
+    """
+
+    def __init__(
+        self,
+        data: Dataset,
+        length: int | None,
+        ends: Array,
+        batch: int,
+        seed: int,
+        device: str | torch.device,
+        number: int,
+    ):
+        self.data, self.length, self.batch, self.seed, self.device = data, length, batch, seed, device
+        self.number = number
+        """Of the next minibatch; in a worker, of the first one that its workers read next."""
+        self._ends = ends
+
+    def __iter__(self) -> Batches:
+        return self
+
+    def __next__(self) -> Batch:
+        worker = get_worker_info()
+        number = self.number + (worker.id if worker else 0)
+        self.number += worker.num_workers if worker else 1
+        windows = drawn(self.seed, number, self.batch, int(self._ends[-1]))
+        length = self.length or 1
+        found = self.data.gather(*self.data.located(windows, self._ends, length), length)
+        tensors = (torch.from_numpy(value if self.length else value[:, 0]) for value in found)
+        return Batch(*(tensor.to(self.device) for tensor in tensors))
 
 
 def drawn(seed: int, number: int, count: int, below: int) -> Array:

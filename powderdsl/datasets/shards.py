@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import os
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -118,15 +119,41 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
         CompileError: PD630, naming the shard and what is wrong with it.
     """
     path = folder / row.file
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-        if size != row.bytes:
-            raise _Wrong(f"{size:,} bytes instead of {row.bytes:,}")
+    with _defects(path):
+        _check_size(path, row)
         if not is_whole(folder, row):
             raise _Wrong("its SHA-256 is another than the manifest's")
         shard = _read(path, shapes(recipe, row.number, row.transitions))
         _check_episodes(shard.arrays, recipe)
+    return shard
+
+
+def read_episodes(folder: Path, recipe: Recipe, row: ShardRow) -> tuple[Array, Array]:
+    """The arrays `length` and `world` of a shard, whose other bytes are neither read nor checked.
+
+    Raises:
+        CompileError: PD630, as `open_shard`.
+    """
+    path = folder / row.file
+    with _defects(path):
+        _check_size(path, row)
+        found = _read(path, shapes(recipe, row.number, row.transitions), only=("length", "world")).arrays
+        _check_lengths(found["length"].astype(np.int64), recipe, row.transitions)
+    return found["length"], found["world"]
+
+
+def _check_size(path: Path, row: ShardRow) -> None:
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+    if size != row.bytes:
+        raise _Wrong(f"{size:,} bytes instead of {row.bytes:,}")
+
+
+@contextmanager
+def _defects(path: Path) -> Iterator[None]:
+    """Turns whatever reading a damaged shard raises into CompileError (PD630)."""
+    try:
+        yield
     except _Wrong as error:
         reason = str(error)
     except OSError as error:
@@ -134,7 +161,7 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
     except Exception as error:  # a damaged archive raises whatever its codec likes
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
     else:
-        return shard
+        return
     raise damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it again")
 
 
@@ -142,15 +169,16 @@ class _Wrong(Exception):
     """A defect of a shard."""
 
 
-def _read(path: Path, expected: dict[str, tuple[int, ...]]) -> Shard:
-    """The arrays of an archive. Raises if it does not have exactly the expected ones."""
+def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...] = tuple(DTYPES)) -> Shard:
+    """Some arrays of an archive. Raises if it does not have exactly the expected ones."""
     arrays: dict[str, Array] = {}
     loaded = 0
     whole = np.memmap(path, np.uint8, "r")
     with zipfile.ZipFile(path) as archive:
         if sorted(archive.namelist()) != sorted(f"{name}.npy" for name in expected):
             raise _Wrong(f"it must hold {', '.join(expected)}, and nothing else")
-        for name, shape in expected.items():
+        for name in only:
+            shape = expected[name]
             entry = archive.getinfo(f"{name}.npy")
             dtype = np.dtype(DTYPES[name])
             size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
@@ -180,11 +208,15 @@ def _data_offset(whole: Array, entry: zipfile.ZipInfo) -> int:
     return int(at + 30 + name + extra)
 
 
+def _check_lengths(length: Array, recipe: Recipe, transitions: int) -> None:
+    if length.min() < 1 or length.max() > recipe.actions or length.sum() != transitions:
+        raise _Wrong("the lengths of its episodes do not fit")
+
+
 def _check_episodes(arrays: dict[str, Array], recipe: Recipe) -> None:
     """Check that episodes end where their lengths say, and that actions are in range."""
     length, action = arrays["length"].astype(np.int64), arrays["action"]
-    if length.min() < 1 or length.max() > recipe.actions or length.sum() != len(action):
-        raise _Wrong("the lengths of its episodes do not fit")
+    _check_lengths(length, recipe, len(action))
     ended = arrays["terminated"].astype(np.int64) + arrays["truncated"]
     last = np.zeros_like(ended)
     last[np.cumsum(length) - 1] = 1
