@@ -1,12 +1,13 @@
 """World models: networks that learn to predict a world some steps on (Frans & Isola 2023, section 4).
 
-`pairs` makes the data, `replay` keeps it, `unet` is the paper's network, `training` and `scores` take that one or any
+`pairs` makes the data, `replay` keeps it, `unet` is the paper's network, `training`, `evaluation` and `scores` take that one or any
 other: a callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
 """
 
+from powderdsl.worldmodel.evaluation import Tested, evaluate
 from powderdsl.worldmodel.pairs import DataConfig, TaskWorlds, Worlds, pairs_of, task_worlds, unseen_seeds
 from powderdsl.worldmodel.replay import Replay
-from powderdsl.worldmodel.scores import Score, Tested, evaluate, frequent, outcomes, score, still
+from powderdsl.worldmodel.scores import Score, frequent, outcomes, score, still
 from powderdsl.worldmodel.training import (
     PRESETS,
     Machine,

@@ -1,38 +1,57 @@
-"""Scores of predictions: networks and baselines by the same measure."""
+"""Scores of predictions: networks and baselines by the same measure.
+
+All but the loss follow from counts of cells, so they are the same whatever the order and the batches of the pairs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import reduce
-from operator import add
-from typing import Any, TypedDict, Unpack
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from powderdsl.worldmodel.pairs import DataConfig, Pairs, TaskWorlds, pairs_of, task_worlds, unseen_seeds
-from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, VariedWorlds
-from powderdsl.worldmodel.training import HERE, Machine, Network, Trained, check_palette, load_rules_of
+from powderdsl.worldmodel.pairs import Pairs
+
+Network = Callable[[Tensor], Tensor]
+"""Ids uint8 [B, H, W] -> logits [B, slots, H, W]."""
 
 TOGETHER = 1 << 17
 """The most cells that a network is given at once."""
 
-FIT_WORLDS = 64
-"""The most training worlds that baselines are fitted on."""
+BINS = 15
+"""Bins of equal width of probabilities, as in Guo et al. (2017)."""
 
-MODEL, STILL, FREQUENT = "model", "nothing changes", "most frequent outcome"
+UNITS = 1 << 24
+"""A probability is counted as an integer number of this share, so that sums do not depend on their order."""
+
+KINDS = ("all", "changed", "change")
+"""Calibration tables: the predicted element, of all cells and of those that change; and whether a cell changes."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """Sums over cells. `confusion`, int64 [slots, slots], counts cells by what they became and what was predicted."""
+    """Counts of cells, and the sum of their losses.
+
+    `confusion`, int64 [slots, slots], counts cells by what they became and what was predicted. A cell is *changed* if it
+    holds another element at the end than at the start, and *predicted to change* if the most likely element is another
+    than at the start. `bins`, int64 [3, BINS, 3], has a table for each of `KINDS`: for each bin of probabilities the
+    number of cells, how many of them the prediction was right about, and the sum of their probabilities in `UNITS`.
+    """
 
     loss_sum: float
     confusion: Tensor
     changed: int
     changed_right: int
+    predicted_changed: int
+    bins: Tensor
+
+    @staticmethod
+    def none(slots: int) -> Score:
+        """The score of no cells."""
+        confusion = torch.zeros(slots, slots, dtype=torch.int64)
+        return Score(0.0, confusion, 0, 0, 0, torch.zeros(len(KINDS), BINS, 3, dtype=torch.int64))
 
     @property
     def cells(self) -> int:
@@ -40,8 +59,7 @@ class Score:
 
     def plain(self) -> dict[str, float | int | None]:
         """For JSON."""
-        names = ("loss", "accuracy", "changed_accuracy", "cells", "changed")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in MEASURES}
 
     @property
     def loss(self) -> float:
@@ -54,8 +72,57 @@ class Score:
 
     @property
     def changed_accuracy(self) -> float | None:
-        """Of cells that hold another element at the end than at the start; None if there are none."""
+        """Of the changed cells, the share whose new element is predicted: the recall of changes. None without any."""
         return self.changed_right / self.changed if self.changed else None
+
+    @property
+    def change_precision(self) -> float | None:
+        """Of the cells predicted to change, the share whose new element is predicted. None without any."""
+        return self.changed_right / self.predicted_changed if self.predicted_changed else None
+
+    @property
+    def change_f1(self) -> float | None:
+        """The harmonic mean of precision and recall of changes. None if nothing changes nor is predicted to."""
+        both = self.changed + self.predicted_changed
+        return 2 * self.changed_right / both if both else None
+
+    @property
+    def ece(self) -> float | None:
+        """Expected calibration error of the most likely element: probability against accuracy, over all cells."""
+        return self._calibration_error("all")
+
+    @property
+    def changed_ece(self) -> float | None:
+        """The same over the changed cells alone."""
+        return self._calibration_error("changed")
+
+    @property
+    def change_ece(self) -> float | None:
+        """Expected calibration error of the probability that a cell changes, over all cells."""
+        return self._calibration_error("change")
+
+    def _calibration_error(self, kind: str) -> float | None:
+        table = self.bins[KINDS.index(kind)]
+        cells = int(table[:, 0].sum())
+        gaps = (table[:, 1] * UNITS - table[:, 2]).abs().sum()
+        return int(gaps) / (UNITS * cells) if cells else None
+
+    def reliability(self) -> dict[str, list[dict[str, float | int]]]:
+        """For each of `KINDS` the bins that have cells: their bounds, cells, mean probability, and share that was right."""
+        found: dict[str, list[dict[str, float | int]]] = {}
+        for kind, table in zip(KINDS, self.bins.tolist(), strict=True):
+            found[kind] = [
+                {
+                    "low": number / BINS,
+                    "high": (number + 1) / BINS,
+                    "cells": cells,
+                    "probability": units / (UNITS * cells),
+                    "observed": right / cells,
+                }
+                for number, (cells, right, units) in enumerate(table)
+                if cells
+            ]
+        return found
 
     def __add__(self, other: Score) -> Score:
         return Score(
@@ -63,14 +130,32 @@ class Score:
             self.confusion + other.confusion,
             self.changed + other.changed,
             self.changed_right + other.changed_right,
+            self.predicted_changed + other.predicted_changed,
+            self.bins + other.bins,
         )
+
+
+MEASURES = (
+    "loss",
+    "accuracy",
+    "changed_accuracy",
+    "change_precision",
+    "change_f1",
+    "ece",
+    "changed_ece",
+    "change_ece",
+    "cells",
+    "changed",
+    "predicted_changed",
+)
+"""The numbers of a `Score` by name."""
 
 
 def score(predict: Network, pairs: Iterable[Pairs], slots: int) -> Score:
     """The score of a network, or of any callable from ids to logits [B, slots, H, W], on some pairs."""
-    total = Score(0.0, torch.zeros(slots, slots, dtype=torch.int64), 0, 0)
+    total = Score.none(slots)
     for starts, ends in pairs:
-        few = max(1, TOGETHER // (starts.shape[1] * starts.shape[2]))
+        few = max(1, TOGETHER // (starts.shape[-2] * starts.shape[-1]))
         for begin in range(0, len(starts), few):
             total = total + _score(predict, starts[begin : begin + few], ends[begin : begin + few], slots)
     return total
@@ -81,10 +166,32 @@ def _score(predict: Network, starts: Tensor, ends: Tensor, slots: int) -> Score:
     logits = predict(starts).float()
     truth = ends.long()
     loss = F.cross_entropy(logits, truth, reduction="none").double().sum()
-    predicted = logits.argmax(1)
-    changed = starts != ends
-    right = (predicted == truth) & changed
-    return Score(float(loss), _counts(truth, predicted, slots), int(changed.sum()), int(right.sum()))
+    chances, predicted = logits.softmax(1), logits.argmax(1)
+    most = chances.gather(1, predicted[:, None])[:, 0]
+    stays = chances.gather(1, starts.long()[:, None])[:, 0]
+    changed, right = starts != ends, predicted == truth
+    tables = (
+        _binned(most, right),
+        _binned(most[changed], right[changed]),
+        _binned(1 - stays, changed),
+    )
+    return Score(
+        float(loss),
+        _counts(truth, predicted, slots),
+        int(changed.sum()),
+        int((right & changed).sum()),
+        int((predicted != starts).sum()),
+        torch.stack(tables),
+    )
+
+
+def _binned(chances: Tensor, right: Tensor) -> Tensor:
+    """A table of `Score.bins`: int64 [BINS, 3]."""
+    units = (chances.flatten().double() * UNITS).round().long().clamp(0, UNITS)
+    number = (units * BINS // UNITS).clamp(max=BINS - 1)
+    columns = torch.stack([torch.ones_like(units), right.flatten().long(), units], 1)
+    table = torch.zeros(BINS, 3, dtype=torch.int64, device=units.device)
+    return table.index_add_(0, number, columns).cpu()
 
 
 class Table:
@@ -134,143 +241,6 @@ def frequent(counts: Tensor, ids: Sequence[int]) -> Table:
     seen = counts.double()
     seen[:, list(ids)] += 1
     return Table(seen / seen.sum(1, keepdim=True))
-
-
-@dataclass(frozen=True)
-class Tested:
-    """The results of a test: by world, the score of each predictor; `missing` has the worlds that could not be tested."""
-
-    rules: str
-    task: str
-    split: str
-    only: tuple[str, ...]
-    worlds: int
-    scores: Mapping[str, Mapping[str, Score]]
-    missing: Mapping[str, tuple[str, ...]]
-    palette: tuple[str | None, ...]
-    step: int
-
-    def mean(self, predictor: str) -> float:
-        """The mean of the worlds' losses, each counted once."""
-        return sum(one[predictor].loss for one in self.scores.values()) / len(self.scores)
-
-    def plain(self) -> dict[str, Any]:
-        """For JSON."""
-        names = [MODEL, STILL, FREQUENT]
-        whole = {name: reduce(add, [one[name] for one in self.scores.values()]) for name in names}
-        return {
-            "rules": self.rules,
-            "task": self.task,
-            "split": self.split,
-            "only": list(self.only),
-            "worlds_each": self.worlds,
-            "iterations": self.step,
-            "mean": {name: {**whole[name].plain(), "loss": self.mean(name)} for name in names},
-            "tests": {test: {name: one[name].plain() for name in names} for test, one in self.scores.items()},
-            "elements": elements_of(whole[MODEL], self.palette),
-            "left_out": {name: list(lacking) for name, lacking in self.missing.items()},
-        }
-
-
-class TestedOn(TypedDict, total=False):
-    """What a network is tested on: see `evaluate`."""
-
-    task: str | None
-    split: str
-    rules: str | None
-    only: tuple[str, ...] | None
-    knobs: Mapping[str, int] | None
-    rulesets: int
-
-
-def evaluate(
-    trained: Trained, *, worlds: int | None = None, machine: Machine = HERE, **tested_on: Unpack[TestedOn]
-) -> Tested:
-    """Test a network and both baselines on worlds that training never uses.
-
-    Args:
-        worlds: worlds of a split, or random futures of each of its stands; by default 32 and 4.
-        split: ``designed`` unless another is given.
-        task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
-        rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
-            which training takes. 0: the rules as they are.
-
-    Raises:
-        CompileError: as `task_worlds`; PD623 if the rules have elements that the network has no slots for.
-    """
-    fit = _counted(trained, machine)
-    data = _data_of(trained, **tested_on)
-    found = _worlds_of(trained, data, machine)
-    slots, names = len(trained.palette), found.names
-    ids = [element.id for element in found.rules.elements]
-    predictors: dict[str, Network] = {
-        MODEL: trained.network,
-        STILL: still(fit, ids),
-        FREQUENT: frequent(fit, ids),
-    }
-    many = worlds or (4 if len(names) > 1 else 32)
-    scores = {}
-    for name, seeds in zip(names, unseen_seeds(many, len(names)).view(len(names), many), strict=True):
-        pairs = list(pairs_of(found, seeds.to(machine.device), data.steps, data.pairs))
-        scores[name] = {who: score(predict, pairs, slots) for who, predict in predictors.items()}
-    return Tested(
-        rules=found.rules.name,
-        task=data.task,
-        split=data.split,
-        only=data.only,
-        worlds=many,
-        scores=scores,
-        missing={name: lacking for name, lacking, _ in found.found.missing},
-        palette=trained.palette,
-        step=trained.checkpoint.step,
-    )
-
-
-def unseen_worlds(
-    trained: Trained, *, machine: Machine = HERE, **tested_on: Unpack[TestedOn]
-) -> TaskWorlds | VariedWorlds:
-    """The worlds that `evaluate` tests on, which has the same arguments and errors.
-
-    Worlds that the rules cannot have are left out, as long as others remain.
-    """
-    return _worlds_of(trained, _data_of(trained, **tested_on), machine)
-
-
-def _data_of(
-    trained: Trained,
-    task: str | None = None,
-    split: str = "designed",
-    rules: str | None = None,
-    only: tuple[str, ...] | None = None,
-    knobs: Mapping[str, int] | None = None,
-    rulesets: int = 0,
-) -> DataConfig:
-    """The training data's configuration with the given changes."""
-    data = trained.config.data
-    return replace(
-        data,
-        task=task or data.task,
-        split=split,
-        rules=data.rules if rules is None else rules,
-        params=data.params if rules is None else {},
-        only=data.only if only is None else only,
-        knobs=(data.knobs if task is None else {}) if knobs is None else knobs,
-        rulesets=rulesets,
-        first_ruleset=UNSEEN_RULESETS,
-    )
-
-
-def _worlds_of(trained: Trained, data: DataConfig, machine: Machine) -> TaskWorlds | VariedWorlds:
-    check_palette(trained.run.path, trained.palette, load_rules_of(data, trained.palette))
-    return task_worlds(data, **machine.simulation, partly=True, palette=trained.palette)
-
-
-def _counted(trained: Trained, machine: Machine) -> Tensor:
-    """Outcomes of some of the run's training worlds."""
-    data = trained.config.data
-    found = task_worlds(data, **machine.simulation, palette=trained.palette)
-    seeds = torch.arange(min(FIT_WORLDS, data.states), device=machine.device)
-    return outcomes(pairs_of(found, seeds, data.steps, data.pairs), len(trained.palette))
 
 
 def elements_of(found: Score, palette: tuple[str | None, ...]) -> dict[str, dict[str, float | int | None]]:

@@ -13,7 +13,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
 from powderdsl.worldmodel.pairs import TaskWorlds, unseen_seeds
 from powderdsl.worldmodel.rulesets import VariedWorlds
-from powderdsl.worldmodel.training import Network
+from powderdsl.worldmodel.scores import Network
 
 RIGHT, WRONG = (235, 235, 235), (200, 30, 30)
 """Colors of cells that were predicted correctly, and of others."""

@@ -33,6 +33,7 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.rule_words import add, pack_names
+from powderdsl.worldmodel.scores import Network
 from powderdsl.worldmodel.unet import UNet, fresh_unet
 
 KIND = "worldmodel"
@@ -42,9 +43,6 @@ LOG_EVERY = 10
 
 MAX_WIDTH = 1024
 """Features of the first block."""
-
-Network = Callable[[Tensor], Tensor]
-"""Ids uint8 [B, H, W] -> logits [B, slots, H, W]."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ MODULES = (
     "powderdsl.rl.evaluation",
     "powderdsl.experiments.studies.run",
     "powderdsl.tasks.shipped",
-    "powderdsl.worldmodel.scores",
+    "powderdsl.worldmodel.evaluation",
     "powderdsl.worlds.image",
     "powderdsl.worlds.scene",
     "powderdsl.worlds.store",

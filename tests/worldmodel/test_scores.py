@@ -115,3 +115,77 @@ def test_weights_hang_on_the_seed_alone() -> None:
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert not torch.equal(one["head.weight"], fresh_unet(4, 2, 8).state_dict()["head.weight"])
     assert before.shape == torch.random.get_rng_state().shape
+
+
+def spread(chances: Tensor) -> Tensor:
+    """A predictor that gives every cell the same probabilities, [H, W, slots] of a single world."""
+    return chances.double().clamp(min=1e-12).log().permute(2, 0, 1)[None]
+
+
+def test_changes_have_recall_precision_and_f1() -> None:
+    # Two cells change, 0 to 1 and 2 to 0. The first is predicted, the second predicted to become 1; one more is predicted
+    # to change and does not.
+    predicted = torch.tensor([[[0, 1, 0, 1], [2, 1, 2, 0]]])
+    found = score(lambda ids: F.one_hot(predicted, 3).permute(0, 3, 1, 2).float(), PAIRS, 3)
+    assert (found.changed, found.predicted_changed, found.changed_right) == (2, 3, 1)
+    assert (found.changed_accuracy, found.change_precision) == (1 / 2, 1 / 3)
+    assert found.change_f1 == pytest.approx(2 / (2 / 1 + 3 / 1))
+    nothing = score(lambda ids: F.one_hot(ids.long(), 3).permute(0, 3, 1, 2).float(), [(START, START)], 3)
+    assert (nothing.changed_accuracy, nothing.change_precision, nothing.change_f1) == (None, None, None)
+    assert (nothing.changed_ece, nothing.change_ece) == (None, pytest.approx(1 - math.e / (math.e + 2)))
+
+
+def test_calibration_is_what_a_hand_computes() -> None:
+    # Every cell most likely stays: the upper row with probability 0.9, the lower one with 0.75. Bins of a fifteenth: the
+    # 13th has the upper row, three of four right; the 11th the lower one, three of four right.
+    chances = torch.full((2, 4, 3), 0.05)
+    chances[1] = 0.125
+    stay = torch.tensor([0.9, 0.75])[:, None].expand(2, 4)
+    chances.scatter_(2, START[0].long()[..., None], stay[..., None])
+    found = score(lambda ids: spread(chances), PAIRS, 3)
+    assert found.ece == pytest.approx((abs(0.9 - 3 / 4) * 4 + abs(0.75 - 3 / 4) * 4) / 8, abs=1e-6)
+    # Of the two that change none is right, and the probability of a change is one minus that to stay.
+    assert found.changed_ece == pytest.approx((0.9 + 0.75) / 2, abs=1e-6)
+    assert found.change_ece == pytest.approx((abs(0.1 - 1 / 4) * 4 + abs(0.25 - 1 / 4) * 4) / 8, abs=1e-6)
+    table = found.reliability()
+    assert [(round(one["low"] * 15), one["cells"], one["observed"]) for one in table["all"]] == [
+        (11, 4, 0.75),
+        (13, 4, 0.75),
+    ]
+    assert [round(one["probability"], 5) for one in table["change"]] == [0.1, 0.25]
+    assert [one["cells"] for one in table["changed"]] == [1, 1]
+
+
+def test_a_predictor_that_knows_the_probabilities_is_calibrated() -> None:
+    source = torch.Generator().manual_seed(3)
+    chances = torch.rand(1, 4, 64, 64, generator=source).softmax(1) ** 2
+    chances = (chances / chances.sum(1, keepdim=True)).expand(64, -1, -1, -1)
+    flat = chances.permute(0, 2, 3, 1).reshape(-1, 4)
+    ends = torch.multinomial(flat, 1, generator=source).view(64, 64, 64).to(torch.uint8)
+    starts = torch.randint(0, 4, (64, 64, 64), dtype=torch.uint8, generator=source)
+    found = score(lambda ids: chances[: len(ids)].log(), [(starts, ends)], 4)
+    assert found.ece is not None
+    assert found.change_ece is not None
+    assert max(found.ece, found.change_ece) < 0.005
+    sharper = score(lambda ids: 3 * chances[: len(ids)].log(), [(starts, ends)], 4)
+    assert sharper.ece is not None
+    assert sharper.ece > 0.05
+
+
+def test_counts_do_not_depend_on_batches() -> None:
+    torch.manual_seed(1)
+    logits = 4 * torch.randn(40, 5, 9, 7)
+    starts, ends = (torch.randint(0, 5, (40, 9, 7), dtype=torch.uint8) for _ in range(2))
+    at = {tuple(one.flatten().tolist()): number for number, one in enumerate(starts)}
+
+    def network(ids: Tensor) -> Tensor:
+        return logits[[at[tuple(one.flatten().tolist())] for one in ids]]
+
+    whole = score(network, [(starts, ends)], 5)
+    order = torch.randperm(40)
+    parts = score(network, [(starts[one], ends[one]) for one in order.split(7)], 5)
+    assert torch.equal(whole.bins, parts.bins)
+    assert torch.equal(whole.confusion, parts.confusion)
+    one, other = whole.plain(), parts.plain()
+    assert one.pop("loss") == pytest.approx(other.pop("loss"))
+    assert one == other

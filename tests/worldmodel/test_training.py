@@ -17,7 +17,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.experiments.runs.metrics import read_metrics
 from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, finetuned, load_trained, train
-from powderdsl.worldmodel.scores import unseen_worlds
+from powderdsl.worldmodel.evaluation import unseen_worlds
 from powderdsl.worldmodel.training import TrainingProgress
 from tests.processes import started, waited
 

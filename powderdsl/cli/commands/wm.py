@@ -16,7 +16,7 @@ from powderdsl.cli.options import check_writable
 from powderdsl.cli.output import print_json, progress, table
 
 if TYPE_CHECKING:
-    from powderdsl.worldmodel.scores import Tested
+    from powderdsl.worldmodel.evaluation import Tested
     from powderdsl.worldmodel.training import Machine, TrainConfig, TrainingProgress
 
 
@@ -186,7 +186,7 @@ def eval_command(
     """
     from powderdsl.cli.task_sheets import knob_values
     from powderdsl.experiments.runs.folder import write_json
-    from powderdsl.worldmodel.scores import evaluate
+    from powderdsl.worldmodel.evaluation import evaluate
     from powderdsl.worldmodel.training import load_trained
 
     machine = _machine(values)
@@ -223,7 +223,7 @@ def show_command(run: str, out: Path, steps: int | None, after: int, scale: int,
         raise BadInput(f"`{out}`: strips are a .png file")
     check_writable(out)
     from powderdsl.simulation.media import write_png
-    from powderdsl.worldmodel.scores import unseen_worlds
+    from powderdsl.worldmodel.evaluation import unseen_worlds
     from powderdsl.worldmodel.strips import sheet, strips
     from powderdsl.worldmodel.training import load_trained
 
@@ -304,12 +304,38 @@ def _text(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
     for name, one in plain["elements"].items():
         rows.append([name, f"{one['cells']:,}", _share(one["recall"]), _share(one["precision"])])
     yield from table(rows)
+    yield ""
+    rows = [["changes, calibration", "recall", "precision", "F1", "ECE", "ECE, changed", "ECE, of change"]]
+    for who, one in plain["mean"].items():
+        shares = (_share(one[name]) for name in ("changed_accuracy", "change_precision", "change_f1"))
+        errors = (_number(one[name]) for name in ("ece", "changed_ece", "change_ece"))
+        rows.append([who, *shares, *errors])
+    yield from table(rows)
+    yield ""
+    yield from table(_reliability(plain["reliability"]))
     for name, lacking in plain["left_out"].items():
         yield f"left out: {name}, which needs {', '.join(lacking)}"
 
 
 def _figures(one: Mapping[str, Any]) -> str:
     return f"{one['loss']:.4f} ({_share(one['accuracy'])}; {_share(one['changed_accuracy'])})"
+
+
+def _reliability(tables: Mapping[str, Any]) -> list[list[str]]:
+    """Rows by probability: what was predicted of all and of changed cells, and how likely a change was."""
+    rows = [["probability", "cells", "right", "changed", "right", "of change", "changed"]]
+    by_low = {name: {one["low"]: one for one in table} for name, table in tables.items()}
+    for low, high in sorted({(one["low"], one["high"]) for table in tables.values() for one in table}):
+        cells = []
+        for name in ("all", "changed", "change"):
+            one = by_low[name].get(low)
+            cells += ["", ""] if one is None else [f"{one['cells']:,}", _share(one["observed"])]
+        rows.append([f"{low:.2f} to {high:.2f}", *cells])
+    return rows
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
 
 
 def _share(value: float | None) -> str:
