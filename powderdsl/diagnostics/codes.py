@@ -117,6 +117,7 @@ _ROWS = (
     ("PD622", "run-in-use", _ERROR),
     ("PD623", "run-does-not-fit", _ERROR),
     ("PD624", "training-diverged", _ERROR),
+    ("PD625", "invalid-network", _ERROR),
     ("PD630", "invalid-dataset", _ERROR),
     ("PD631", "dataset-mismatch", _ERROR),
     ("PD640", "invalid-setting", _ERROR),

@@ -14,7 +14,8 @@ from torch import Tensor
 from powderdsl.worldmodel.pairs import DataConfig, TaskWorlds, pairs_of, task_worlds, unseen_seeds
 from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, VariedWorlds
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
-from powderdsl.worldmodel.training import HERE, Machine, Trained, check_palette, load_rules_of
+from powderdsl.worldmodel.trained import Trained
+from powderdsl.worldmodel.training import HERE, Machine, check_palette, load_rules_of
 
 FIT_WORLDS = 64
 """The most training worlds that baselines are fitted on."""

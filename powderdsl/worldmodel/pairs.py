@@ -24,6 +24,12 @@ from powderdsl.worldmodel.watched import SplitWorlds, Watched, watched
 TEST_SEEDS = 1 << 32
 """The first seed of worlds that models are tested on. Training takes seeds below it."""
 
+VALIDATION_SEEDS = 1 << 33
+"""The first seed of worlds that models are validated on during training: far beyond those of tests."""
+
+VALIDATION_WORLDS = 64
+"""The worlds that models are validated on, each at one time."""
+
 Pairs = tuple[Tensor, Tensor]
 """Start and end, element ids uint8 [B, H, W] each."""
 
@@ -151,6 +157,14 @@ def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[
         start = world.ids
         world = worlds.later(world, steps)
         yield start, world.ids
+
+
+def validation_pairs(worlds: Worlds, config: DataConfig, device: str | torch.device = "cpu") -> list[Pairs]:
+    """Pairs of worlds that neither training nor tests use: one of each world, at times that take turns."""
+    number = torch.arange(VALIDATION_WORLDS, device=device)
+    found = pairs_of(worlds, VALIDATION_SEEDS + number, config.steps, config.pairs)
+    kept = [(number % config.pairs == moment, pair) for moment, pair in enumerate(found)]
+    return [tuple(ids[mask.to(ids.device)] for ids in pair) for mask, pair in kept if mask.any()]  # type: ignore[misc]
 
 
 def unseen_seeds(count: int, variants: int = 1) -> Tensor:

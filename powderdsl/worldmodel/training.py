@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,6 @@ from powderdsl.experiments.runs import (
     Checkpoint,
     RunFolder,
     does_not_fit,
-    find_run,
-    no_run,
     open_run,
     read_run,
 )
@@ -27,19 +26,24 @@ from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.system.interrupts import held_back
+from powderdsl.system.random import base_keys, mix
 from powderdsl.system.settings import check_bounds, setting
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
-from powderdsl.worldmodel.pairs import DataConfig, Worlds, task_worlds
+from powderdsl.worldmodel.networks import CustomNetwork, OneHot, is_network_name
+from powderdsl.worldmodel.pairs import DataConfig, Pairs, Worlds, task_worlds, validation_pairs
 from powderdsl.worldmodel.replay import Replay
-from powderdsl.worldmodel.rule_words import add, pack_names
-from powderdsl.worldmodel.scores import Network
-from powderdsl.worldmodel.unet import UNet, fresh_unet
+from powderdsl.worldmodel.scores import Network, score
+from powderdsl.worldmodel.unet import fresh_unet
+from powderdsl.worldmodel.weights import fit_weights
 
 KIND = "worldmodel"
 
 LOG_EVERY = 10
 """Iterations whose mean loss makes a line of the metrics."""
+
+LATER = ("network",)
+"""Settings that the first runs do not have, with the default None."""
 
 MAX_WIDTH = 1024
 """Features of the first block."""
@@ -52,6 +56,7 @@ class TrainConfig:
     `parent` is the name of the checkpoint that a fine-tuned network starts from; without it weights are random.
     `palette` has the qualified name of the element of each of the network's slots, or None; empty: those of the task's
     and the data's rules. `slots` is how many there are at least: free ones are room for packs that come later.
+    `network` is the name of a `CustomNetwork`, as text: what it names is imported only if the user gives it again.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -63,6 +68,7 @@ class TrainConfig:
     parent: str | None = None
     slots: int = setting(0, low=0, high=MAX_ELEMENTS)
     palette: tuple[str | None, ...] = ()
+    network: str | None = None
 
     def __post_init__(self) -> None:
         """Raises ValueError for values out of range."""
@@ -71,6 +77,14 @@ class TrainConfig:
             raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
         if len(self.palette) > MAX_ELEMENTS:
             raise ValueError(f"palette has more than {MAX_ELEMENTS} slots")
+        if self.network is not None and not is_network_name(self.network):
+            raise ValueError("network must have the form module:Class")
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """For ``run.json``. Settings that came later are left out unless they are used: older runs lack them."""
+        found = asdict(self)
+        return {name: value for name, value in found.items() if name not in LATER or value is not None}
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
@@ -109,6 +123,11 @@ class Machine:
         return {"device": self.device, "threads": self.threads, "backend": self.backend}
 
 
+VALIDATED = ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece")
+"""Measures of a validation besides the loss."""
+
+Tell = Callable[["TrainingProgress"], None]
+
 HERE = Machine()
 """One thread of this CPU."""
 
@@ -122,6 +141,8 @@ class TrainingProgress:
     loss: float | None
     simulated: float = 0.0
     """The share of time that making worlds takes, since the last line of metrics."""
+    validation: float | None = None
+    """The last loss on held-out worlds."""
 
 
 def train(
@@ -131,11 +152,12 @@ def train(
     machine: Machine = HERE,
     worlds: Worlds | None = None,
     identity: Mapping[str, Any] | None = None,
-    network: nn.Module | None = None,
+    network: nn.Module | CustomNetwork | None = None,
     parent: Checkpoint | None = None,
     note: Mapping[str, Any] | None = None,
     tell: Callable[[TrainingProgress], None] | None = None,
     save_seconds: float = 60,
+    validate_every: int = 0,
 ) -> RunFolder:
     """Train a network until `config.iterations`, or continue with the run that is in the folder.
 
@@ -145,31 +167,74 @@ def train(
         worlds: your own, instead of those of the task that `config.data` names, whose rules and split then say nothing.
         identity: what else decides which weights come out, such as what your own worlds depend on: kept in ``run.json``,
             and compared when a run continues.
-        network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W]; the paper's U-net otherwise.
+        network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W], or a `CustomNetwork`, whose name the run
+            records; the paper's U-net otherwise.
         parent: weights to start from, of the run that `finetuned` was given.
         note: more for ``run.json``, such as where the parent lies.
         save_seconds: how often a checkpoint is written, besides the last one.
+        validate_every: after how many iterations, and at the end, to score the network on held-out worlds
+            (`validation_pairs`); 0: never. It decides nothing about the weights, so it may change when a run continues.
 
     Raises:
         CompileError: from `task_worlds` and `open_run`; PD622 if another process trains there; PD623 if weights do not
-            fit the network; PD624 if the loss is no longer finite.
+            fit the network, or the network that the run was begun with is not given; PD624 if the loss is no longer
+            finite; PD625 for a `CustomNetwork` that cannot be trained.
         ValueError: your own network gives logits of another shape.
         KeyboardInterrupt: Ctrl-C, after a last checkpoint.
     """
+    if isinstance(network, CustomNetwork):
+        config = replace(config, network=network.name)
+    elif network is None and config.network is not None:
+        raise network_missing(Path(folder), config.network)
     palette = _palette_for(config, Path(folder), worlds)
     if worlds is None:
         found = task_worlds(config.data, **machine.simulation, palette=palette)
         worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
     check_palette(Path(folder), palette, worlds.rules)
     own = {"palette": palette, "rules_fingerprint": fingerprint(worlds.rules), **(identity or {})}
-    run = open_run(folder, KIND, {**asdict(config), **own}, note={"machine": asdict(machine), **(note or {})})
+    slots, encoder = len(palette), OneHot(len(palette))
+    if isinstance(network, CustomNetwork):
+        network.check(encoder, encoder.channels, slots, encoder.example(2, worlds.size), config.seed)
+    run = open_run(folder, KIND, {**config.plain, **own}, note={"machine": asdict(machine), **(note or {})})
     with run.locked():
-        model = network or fresh_unet(len(palette), config.width, config.seed)
-        trainer = _Trainer(config, machine, run, model.to(machine.device), len(palette))
+        if isinstance(network, CustomNetwork):
+            network = network.build(encoder, encoder.channels, slots, config.seed)
+        model = network or fresh_unet(slots, config.width, config.seed)
+        trainer = _Trainer(config, machine, run, model.to(machine.device), slots)
         trainer.restore(parent)
         if trainer.done < config.iterations:
-            trainer.train(worlds, tell or (lambda progress: None), save_seconds)
+            pairs = validation_pairs(worlds, config.data, machine.device) if validate_every else []
+            validation = Validation(validate_every, pairs)
+            trainer.train(worlds, validation, tell or (lambda progress: None), save_seconds)
     return run
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Held-out pairs, and after how many iterations a network is scored on them; 0: never."""
+
+    every: int
+    pairs: Sequence[Pairs]
+
+    def due(self, done: int, of: int) -> bool:
+        """Whether to score a network after `done` of `of` iterations."""
+        return bool(self.every) and (done % self.every == 0 or done == of)
+
+    def values(self, model: nn.Module, slots: int) -> dict[str, float]:
+        """Metrics of a network, which stays as it is."""
+        training = model.training
+        with _random_numbers_kept(next(model.parameters()).device):
+            found = score(model.eval(), self.pairs, slots).plain()
+        model.train(training)
+        named = {"loss/validation": found["loss"]}
+        named |= {f"validation/{name}": found[name] for name in VALIDATED}
+        return {name: value for name, value in named.items() if value is not None}
+
+
+def _random_numbers_kept(device: torch.device) -> AbstractContextManager[None]:
+    """Gives torch's global generators back as they were."""
+    kept: AbstractContextManager[None] = torch.random.fork_rng([device] if device.type == "cuda" else [])
+    return kept
 
 
 class _Trainer:
@@ -197,7 +262,7 @@ class _Trainer:
             why = " ".join(str(error).split())[:300]
             raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
 
-    def train(self, worlds: Worlds, tell: Callable[[TrainingProgress], None], save_seconds: float) -> None:
+    def train(self, worlds: Worlds, validation: Validation, tell: Tell, save_seconds: float) -> None:
         """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""
         device, store = self.machine.device, self.machine.store
         replay = Replay(
@@ -205,13 +270,14 @@ class _Trainer:
         )
         try:
             replay.go_to(self.done)
-            self._iterate(replay, tell, save_seconds)
+            with _random_numbers_kept(torch.device(device)):
+                self._iterate(replay, validation, tell, save_seconds)
         finally:
             replay.close()
 
-    def _iterate(self, replay: Replay, tell: Callable[[TrainingProgress], None], save_seconds: float) -> None:
+    def _iterate(self, replay: Replay, validation: Validation, tell: Tell, save_seconds: float) -> None:
         config, total = self.config, self.config.iterations
-        loss, simulated, making = None, 0.0, 0.0
+        loss, held_out, simulated, making = None, None, 0.0, 0.0
         saved = since = time.monotonic()
         self.model.train()
         # An iteration is never left half done.
@@ -222,6 +288,7 @@ class _Trainer:
                 replay.advance()
                 making += time.monotonic() - began
                 self.done += 1
+                values: dict[str, float] = {}
                 if self.done % LOG_EVERY == 0 or self.done == total:
                     loss = sum(self.recent) / len(self.recent)
                     self.recent = []
@@ -230,16 +297,27 @@ class _Trainer:
                     took = time.monotonic() - since
                     simulated = making / took
                     speed = {"time/pairs_a_second": LOG_EVERY * config.batch / took}
-                    metrics.write(self.done, {"loss/train": loss, **speed, "time/simulation": simulated})
+                    values = {"loss/train": loss, **speed, "time/simulation": simulated}
                     since, making = time.monotonic(), 0.0
-                tell(TrainingProgress(self.done, total, loss, simulated))
+                if validation.due(self.done, total):
+                    began = time.monotonic()
+                    values |= validation.values(self.model, self.slots)
+                    held_out = values["loss/validation"]
+                    since += time.monotonic() - began
+                if values:
+                    metrics.write(self.done, values)
+                tell(TrainingProgress(self.done, total, loss, simulated, held_out))
                 if time.monotonic() - saved > save_seconds:
                     self.save()
                     saved = time.monotonic()
             self.save()
 
     def step(self, starts: Tensor, ends: Tensor) -> float:
-        """One step of Adam; the loss before it: cross-entropy a cell, in nats."""
+        """One step of Adam; the loss before it: cross-entropy a cell, in nats.
+
+        Networks that draw random numbers, as for dropout, draw the same ones after any interruption.
+        """
+        torch.manual_seed(int(mix(base_keys(torch.tensor([self.config.seed]), torch.tensor([self.done]))[0])))
         cuda = torch.device(self.machine.device).type == "cuda"
         with torch.autocast("cuda", torch.bfloat16, enabled=cuda):
             logits = self.forward(starts)
@@ -257,6 +335,13 @@ class _Trainer:
         self.run.save_checkpoint(
             self.done, {"model": model, "optimizer": optimizer, "recent": [*self.recent]}
         )
+
+
+def network_missing(folder: Path, name: str) -> CompileError:
+    """The error for a run whose network has to be given, for the run's files must not decide what is executed (PD623)."""
+    why = f"it was trained with a network of its own, which it calls `{name}`"
+    helps = ("if you trust that code, give `--network` as in training; it is not imported otherwise",)
+    return does_not_fit(folder, why, helps=helps)
 
 
 def load_rules_of(config: DataConfig, palette: Palette) -> Ruleset:
@@ -277,15 +362,6 @@ def palette_of(config: DataConfig, slots: int = 0) -> tuple[str | None, ...]:
     return (*found, *[None] * (slots - len(found)))
 
 
-def extended_palette(palette: Palette, rules: Ruleset) -> tuple[str | None, ...]:
-    """A palette with the elements of rules that were loaded with it: in its free slots, then behind its end."""
-    ids = [element.id for element in rules.elements]
-    found = [*palette, *[None] * (max(ids) + 1 - len(palette))]
-    for element in rules.elements:
-        found[element.id] = element.qualified
-    return tuple(found)
-
-
 def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tuple[str | None, ...]:
     """The slots of a run: as asked for, as recorded in its folder, or those that its rules need."""
     if config.palette:
@@ -295,14 +371,14 @@ def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tu
         return (*found, *[None] * (config.slots - len(found)))
     palette = palette_of(config.data, config.slots)
     try:
-        recorded = _recorded_palette(read_run(folder, KIND))
+        recorded = recorded_palette(read_run(folder, KIND))
     except (CompileError, KeyError, TypeError):
         return palette  # a new run; or another one, which `open_run` refuses
     fits = len(recorded) >= config.slots and {*palette} <= {*recorded, None}
     return recorded if fits else palette
 
 
-def _recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
+def recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
     """Raises KeyError, TypeError."""
     return tuple(None if one is None else str(one) for one in run.config["palette"])
 
@@ -328,89 +404,6 @@ def check_palette(folder: Path, palette: Palette, rules: Ruleset) -> None:
         raise does_not_fit(folder, *why, helps=helps if lacking else ())
 
 
-def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False) -> None:
-    """Give a network the weights of a checkpoint.
-
-    Args:
-        grow: the network may be larger: what the checkpoint lacks keeps the weights that it has.
-
-    Raises:
-        CompileError: PD623 if they are those of another network.
-    """
-    found = _weights(checkpoint)
-    try:
-        model.load_state_dict(_grown(found, model) if grow else found)
-    except (RuntimeError, TypeError, AttributeError) as error:
-        words = [line.strip()[:200] for line in str(error).splitlines()[:4]]
-        raise does_not_fit(checkpoint.path, "its weights are those of another network", *words) from None
-
-
-def _weights(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The weights in a checkpoint, which may hold anything; none if it has no weights."""
-    state = checkpoint.state.get("model") if isinstance(checkpoint.state, dict) else None
-    return dict(state) if isinstance(state, dict) else {}
-
-
-def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:
-    """Weights in the shapes of a network that has more slots, first in each dimension."""
-    for name, fresh in model.state_dict().items():
-        old = state.get(name)
-        if (
-            isinstance(old, Tensor)
-            and old.ndim == fresh.ndim
-            and old.shape != fresh.shape
-            and all(a <= b for a, b in zip(old.shape, fresh.shape, strict=True))
-        ):
-            state[name] = fresh.clone()
-            state[name][tuple(slice(size) for size in old.shape)] = old
-    return state
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A network from a run, with its configuration and its slots."""
-
-    run: RunFolder
-    config: TrainConfig
-    palette: tuple[str | None, ...]
-    network: nn.Module
-    checkpoint: Checkpoint
-
-
-def load_trained(
-    path: str | Path | RunFolder, *, device: str = "cpu", network: nn.Module | None = None
-) -> Trained:
-    """The network of a run, with its newest weights, ready to predict.
-
-    Raises:
-        CompileError: PD620 if there is no run, or no checkpoint that can be read; PD623 if the weights do not fit.
-    """
-    run = path if isinstance(path, RunFolder) else find_run(path, KIND)
-    try:
-        config, palette = TrainConfig.of(run.config), _recorded_palette(run)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise no_run(run.path, str(error)) from None
-    checkpoint = run.checkpoint(device)
-    if network is None:
-        _check_size(run, config, palette, checkpoint)
-    model = network or UNet(len(palette), config.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    fit_weights(model, checkpoint)
-    return Trained(run, config, palette, model.to(device).eval(), checkpoint)
-
-
-def _check_size(
-    run: RunFolder, config: TrainConfig, palette: tuple[str | None, ...], checkpoint: Checkpoint
-) -> None:
-    """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError."""
-    if type(config.width) is not int or not 1 <= config.width <= MAX_WIDTH or not 1 <= len(palette) <= 256:
-        raise no_run(run.path, "its network has sizes that no training gives")
-    with torch.device("meta"):
-        wanted = {name: one.shape for name, one in UNet(len(palette), config.width).state_dict().items()}
-    found = {name: getattr(one, "shape", None) for name, one in _weights(checkpoint).items()}
-    if wanted != found:
-        raise does_not_fit(checkpoint.path, "its weights are those of another network")
-
-
 def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:
     """The error for a loss that is no longer finite (PD624)."""
     return failure(
@@ -419,36 +412,3 @@ def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:
         notes=(f"in {folder}",),
         helps=(f"choose a smaller learning rate than {learning_rate:g}",),
     )
-
-
-# Transfer: packs that a network has not seen are added to its rules, and it continues from its weights
-
-SIMPLER = "kinds"
-"""The knob that says how many elements are drawn: other packs' elements come after all of these."""
-
-
-def finetuned(
-    trained: Trained, packs: Sequence[str], *, iterations: int = 100, **changes: Any
-) -> TrainConfig:
-    """The configuration that continues from a network, on worlds in which elements of `packs` alone are drawn.
-
-    The rules are those of the run with the packs added. Elements that the network knows keep their slots; others get
-    its free slots, and where none are left the network grows. A knob for the number of elements is left at its default,
-    for its list may end before the packs' elements. Rulesets are not varied.
-
-    Args:
-        packs: names of shipped packs or of packs that the run left out, or files.
-        changes: other fields of `TrainConfig`.
-
-    Raises:
-        CompileError: what `load` raises.
-    """
-    config = trained.config
-    data = config.data
-    own = data.rules or "+".join(load_task(data.task).rules)
-    rules, names = add(own, packs), pack_names(own, packs)
-    knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
-    data = replace(data, rules=rules, only=names, knobs=knobs, rulesets=0)
-    palette = extended_palette(trained.palette, load_rules_of(data, trained.palette))
-    values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
-    return replace(config, data=data, palette=palette, **values)

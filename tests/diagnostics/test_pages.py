@@ -38,6 +38,7 @@ from powderdsl.rl import preset
 from powderdsl.system.writing import replacing
 from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics
 from powderdsl.testing.properties.refute import refuted
+from powderdsl.worldmodel.networks import custom_network
 from powderdsl.worldmodel.training import diverged
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.image import read_image
@@ -289,6 +290,7 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD622": train_in_one_folder_twice,
     "PD623": use_a_run_that_does_not_fit,
     "PD624": learn_too_fast,
+    "PD625": lambda: custom_network("nets:Deep"),
     "PD630": lambda: read_manifest(Path("recorded")),
     "PD631": record_with_another_seed,
     "PD640": lambda: preset("paper", "sand-pushing", batch=1),

@@ -18,7 +18,7 @@ from powderdsl.rl import train as train_agent
 from powderdsl.rl.policies import config_of, load_policy, recorded_palette, task_of
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import Machine, TrainConfig, load_trained, train
-from powderdsl.worldmodel.training import finetuned
+from powderdsl.worldmodel.trained import finetuned
 from powderdsl.worlds.store import load_world
 
 SAVED = Path(__file__).parent.parent / "data" / "first_format"

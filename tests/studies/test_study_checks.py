@@ -261,7 +261,9 @@ def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: p
     assert tested.exit_code == 0, tested.output
     real = {any_name(keys) for keys in numbers(json.loads(Path("model/evaluation.json").read_text()))}
     known = set(numbers(values_of_world_model()))
-    never = {keys for keys in known if keys[-2:] == ("nothing changes", "change_precision")}  # it predicts none
+    never = {
+        keys for keys in known if keys[-2:] == ("nothing changes", "change_precision")
+    }  # it predicts none
     assert known - never <= real <= known
 
 

@@ -11,8 +11,8 @@ import powderdsl
 from powderdsl.diagnostics import CompileError
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, load_trained, task_worlds, train
-from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, RulesetSource, VariedWorlds, Variety
 from powderdsl.worldmodel.evaluation import unseen_worlds
+from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, RulesetSource, VariedWorlds, Variety
 
 TASK = """
 task: mixed

@@ -16,8 +16,19 @@ from torch import Tensor, nn
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.experiments.runs.metrics import read_metrics
-from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, finetuned, load_trained, train
+from powderdsl.worldmodel import (
+    DataConfig,
+    Machine,
+    TrainConfig,
+    evaluate,
+    finetuned,
+    load_trained,
+    pairs_of,
+    task_worlds,
+    train,
+)
 from powderdsl.worldmodel.evaluation import unseen_worlds
+from powderdsl.worldmodel.pairs import TEST_SEEDS, VALIDATION_SEEDS, VALIDATION_WORLDS, validation_pairs
 from powderdsl.worldmodel.training import TrainingProgress
 from tests.processes import started, waited
 
@@ -86,6 +97,54 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(dunes: str, tmp_path:
     assert same(weights(train(config, tmp_path / "parts", machine=HERE)), weights(whole))  # it is done
 
 
+def test_validation_changes_no_weight(dunes: str, tmp_path: Path) -> None:
+    config = tiny(dunes)
+    whole = train(config, tmp_path / "whole", machine=HERE)
+    watched = train(config, tmp_path / "watched", machine=HERE, validate_every=8)
+    assert same(weights(watched), weights(whole))
+    found = {line["step"]: line for line in read_metrics(watched.path)}
+    assert [step for step, line in found.items() if "loss/validation" in line] == [8, 16, 24, 30]
+    assert [step for step, line in found.items() if "loss/train" in line] == [10, 20, 30]
+    assert found[30]["loss/validation"] < found[8]["loss/validation"]
+    for name in ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece"):
+        assert 0 <= found[30][f"validation/{name}"] <= 1
+
+    def interrupt(now: TrainingProgress) -> None:
+        if now.done == 19:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path / "parts", machine=HERE, validate_every=8, tell=interrupt)
+    parts = train(config, tmp_path / "parts", machine=HERE, validate_every=8)
+    assert same(weights(parts), weights(whole))
+    timeless = [
+        [{name: one for name, one in line.items() if "time/" not in name} for line in read_metrics(run.path)]
+        for run in (parts, watched)
+    ]
+    assert timeless[0] == timeless[1]
+
+
+def test_validation_worlds_are_held_out(dunes: str) -> None:
+    data = tiny(dunes).data
+    worlds = task_worlds(data, backend="torch")
+    seeds: list[int] = []
+    start = worlds.start
+
+    def noted(asked: Tensor) -> object:
+        seeds.extend(asked.tolist())
+        return start(asked)
+
+    worlds.start = noted  # type: ignore[method-assign, assignment]
+    pairs = validation_pairs(worlds, data)
+    assert len(set(seeds)) == VALIDATION_WORLDS == sum(len(starts) for starts, _ in pairs)
+    assert min(seeds) > TEST_SEEDS + (1 << 20)  # tests have at most that many worlds
+    # World n gives pair n mod 4 of its future.
+    whole = list(pairs_of(worlds, VALIDATION_SEEDS + torch.arange(VALIDATION_WORLDS), data.steps, data.pairs))
+    for moment, (starts, ends) in enumerate(pairs):
+        assert torch.equal(starts, whole[moment][0][moment::4])
+        assert torch.equal(ends, whole[moment][1][moment::4])
+
+
 CHILD = """
 import json, sys, time, torch
 from powderdsl.worldmodel import Machine, TrainConfig, train
@@ -141,6 +200,7 @@ class Own(nn.Module):
     def __init__(self, slots: int):
         super().__init__()
         self.table = nn.Embedding(256, slots)
+        nn.init.zeros_(self.table.weight)  # not the state of torch's generator after other tests
 
     def forward(self, ids: Tensor) -> Tensor:
         found: Tensor = self.table(ids.long()).permute(0, 3, 1, 2)

@@ -53,6 +53,9 @@ MEANS = {
 }
 """The meaning of arguments and options, by their metavar."""
 
+EXECUTED = ("MODULE:CLASS",)
+"""Metavars of options that execute code, which no study may name: it may come from a stranger."""
+
 
 def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
     """These commands, with the meaning of their options and of their argument (``on``).
@@ -70,6 +73,8 @@ def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
                 FLAG if isinstance(one, click.Option) and one.is_flag else MEANS.get(one.metavar or "", TEXT)
             )
             if isinstance(one.type, click.Path) and means != FILE and "--run" not in one.opts:
+                continue
+            if one.metavar in EXECUTED:
                 continue
             found[words] |= {name[2:]: means for name in one.opts if name.startswith("--")}
     return found

@@ -17,6 +17,7 @@ from powderdsl.cli.output import print_json, progress, table
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.evaluation import Tested
+    from powderdsl.worldmodel.networks import CustomNetwork
     from powderdsl.worldmodel.training import Machine, TrainConfig, TrainingProgress
 
 
@@ -59,8 +60,15 @@ _data_options = opt.several(
 _machine_options = opt.several(
     opt.integer("--threads", 1, 1024, "CPU threads.", 1), opt.device, opt.backend("auto")
 )
+_network = opt.text(
+    "--network",
+    "MODULE:CLASS",
+    "Your own network, which this imports.  [default: the U-net]",
+    to="network_name",
+)
 _training_options = opt.several(
     _machine_options,
+    _network,
     opt.integer("--iterations", 1, 10**9, "Steps of Adam."),
     opt.integer("--batch", 1, 1 << 20, "Pairs per step."),
     click.option(
@@ -71,6 +79,7 @@ _training_options = opt.several(
     opt.choice("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
     click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
     opt.integer("--save-every", 1, 10**6, "Seconds between checkpoints.", 60),
+    opt.integer("--validate-every", 0, 10**9, "Iterations between tests on held-out worlds; 0: none.", 100),
 )
 
 
@@ -121,6 +130,8 @@ def train_command(
         raise BadInput(
             "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
         )
+    if values["network_name"] and values["width"]:
+        raise BadInput("--width is that of the U-net: leave it out with --network")
     config = PRESETS[preset]
     with user_values():
         differ = Variety(**variety)
@@ -150,11 +161,12 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 
     RUN is a run's folder, or its name in runs/. The result is a new run.
     """
-    from powderdsl.worldmodel.training import finetuned, load_trained
+    from powderdsl.worldmodel.trained import finetuned, load_trained
 
     if not packs:
         raise BadInput("--packs names what is to be learned")
-    trained = load_trained(run, device="cpu")
+    network = _own_network(values["network_name"])
+    trained = load_trained(run, device="cpu", network=network)
     config = finetuned(trained, packs, **_given(values, TRAINING))
     words = "-".join(config.data.only)
     target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
@@ -175,9 +187,16 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @opt.integer("--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.", 0)
 @opt.layouts("One JSON object instead of a table.")
 @opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
+@_network
 @_machine_options
 def eval_command(
-    run: str, only: tuple[str, ...], knobs: tuple[str, ...], layout: str, out: Path | None, **values: Any
+    run: str,
+    only: tuple[str, ...],
+    knobs: tuple[str, ...],
+    layout: str,
+    out: Path | None,
+    network_name: str | None,
+    **values: Any,
 ) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
@@ -187,10 +206,10 @@ def eval_command(
     from powderdsl.cli.task_sheets import knob_values
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.worldmodel.evaluation import evaluate
-    from powderdsl.worldmodel.training import load_trained
+    from powderdsl.worldmodel.trained import load_trained
 
     machine = _machine(values)
-    trained = load_trained(run, device=machine.device)
+    trained = load_trained(run, device=machine.device, network=_own_network(network_name))
     drawn = knob_values(knobs) if knobs else None
     tested = evaluate(trained, only=only or None, knobs=drawn, machine=machine, **values)
     plain = tested.plain()
@@ -213,8 +232,17 @@ def eval_command(
 @opt.text("--split", "SPLIT", "Split of the task.", "designed")
 @opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]")
 @opt.integer("--scale", 1, 16, "Pixels per cell.", 2)
+@_network
 @_machine_options
-def show_command(run: str, out: Path, steps: int | None, after: int, scale: int, **values: Any) -> None:
+def show_command(
+    run: str,
+    out: Path,
+    steps: int | None,
+    after: int,
+    scale: int,
+    network_name: str | None,
+    **values: Any,
+) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
     For several times the steps that the network was trained for, it is applied to what it predicted.
@@ -225,10 +253,10 @@ def show_command(run: str, out: Path, steps: int | None, after: int, scale: int,
     from powderdsl.simulation.media import write_png
     from powderdsl.worldmodel.evaluation import unseen_worlds
     from powderdsl.worldmodel.strips import sheet, strips
-    from powderdsl.worldmodel.training import load_trained
+    from powderdsl.worldmodel.trained import load_trained
 
     machine = _machine(values)
-    trained = load_trained(run, device=machine.device)
+    trained = load_trained(run, device=machine.device, network=_own_network(network_name))
     step = trained.config.data.steps
     if steps is not None and steps % step:
         raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
@@ -258,6 +286,15 @@ def _machine(values: dict[str, Any]) -> Machine:
     return Machine(**{name: values.pop(name) for name in MACHINE if name in values})
 
 
+def _own_network(name: str | None) -> CustomNetwork | None:
+    """The network that the user names, imported."""
+    if name is None:
+        return None
+    from powderdsl.worldmodel.networks import custom_network
+
+    return custom_network(name)
+
+
 def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
     """The rules of a run as text; empty if they are the task's own."""
     if not packs and not held_out:
@@ -273,15 +310,25 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
     """Train, and show the progress."""
     from powderdsl.worldmodel.training import train
 
-    machine = _machine(values)
+    machine, network = _machine(values), _own_network(values["network_name"])
     began = time.monotonic()
     with progress("wm", config.iterations, lines=True) as show:
 
         def tell(now: TrainingProgress) -> None:
-            show(now.done, "" if now.loss is None else f"loss {now.loss:.4f}")
+            said = [("loss", now.loss), ("held out", now.validation)]
+            show(now.done, ", ".join(f"{name} {one:.4f}" for name, one in said if one is not None))
 
         try:
-            run = train(config, folder, machine=machine, tell=tell, save_seconds=values["save_every"], **more)
+            run = train(
+                config,
+                folder,
+                machine=machine,
+                network=network,
+                tell=tell,
+                save_seconds=values["save_every"],
+                validate_every=values["validate_every"],
+                **more,
+            )
         except KeyboardInterrupt:
             click.echo(f"interrupted; the same command resumes {folder}", err=True)
             raise
@@ -324,8 +371,8 @@ def _figures(one: Mapping[str, Any]) -> str:
 def _reliability(tables: Mapping[str, Any]) -> list[list[str]]:
     """Rows by probability: what was predicted of all and of changed cells, and how likely a change was."""
     rows = [["probability", "cells", "right", "changed", "right", "of change", "changed"]]
-    by_low = {name: {one["low"]: one for one in table} for name, table in tables.items()}
-    for low, high in sorted({(one["low"], one["high"]) for table in tables.values() for one in table}):
+    by_low = {name: {one["low"]: one for one in bins} for name, bins in tables.items()}
+    for low, high in sorted({(one["low"], one["high"]) for bins in tables.values() for one in bins}):
         cells = []
         for name in ("all", "changed", "change"):
             one = by_low[name].get(low)

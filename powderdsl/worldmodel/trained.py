@@ -1,0 +1,134 @@
+"""Networks that have been trained: read from their runs, and taught packs that they have not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, no_run
+from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
+from powderdsl.model.types import Ruleset
+from powderdsl.tasks.shipped import load_task
+from powderdsl.worldmodel.networks import CustomNetwork, OneHot
+from powderdsl.worldmodel.rule_words import add, pack_names
+from powderdsl.worldmodel.training import (
+    KIND,
+    MAX_WIDTH,
+    TrainConfig,
+    load_rules_of,
+    network_missing,
+    recorded_palette,
+)
+from powderdsl.worldmodel.unet import UNet
+from powderdsl.worldmodel.weights import fit_weights, weights_in
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A network from a run, with its configuration and its slots."""
+
+    run: RunFolder
+    config: TrainConfig
+    palette: tuple[str | None, ...]
+    network: nn.Module
+    checkpoint: Checkpoint
+
+
+def load_trained(
+    path: str | Path | RunFolder,
+    *,
+    device: str = "cpu",
+    network: nn.Module | CustomNetwork | None = None,
+) -> Trained:
+    """The network of a run, with its newest weights, ready to predict.
+
+    Args:
+        network: that of the training, unless it was the U-net. A run only records its name.
+
+    Raises:
+        CompileError: PD620 if there is no run, or no checkpoint that can be read; PD623 if the weights do not fit, or the
+            network is not given, or another one; PD625 if it cannot be made.
+    """
+    run = path if isinstance(path, RunFolder) else find_run(path, KIND)
+    try:
+        config, palette = TrainConfig.of(run.config), recorded_palette(run)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise no_run(run.path, str(error)) from None
+    slots = len(palette)
+    if not 1 <= slots <= MAX_ELEMENTS:
+        raise no_run(run.path, "its network has sizes that no training gives")
+    if network is None and config.network is not None:
+        raise network_missing(run.path, config.network)
+    if isinstance(network, CustomNetwork) and network.name != config.network:
+        there = "the paper's U-net" if config.network is None else f"`{config.network}`"
+        raise does_not_fit(run.path, f"it was trained with {there}, not with `{network.name}`")
+    checkpoint = run.checkpoint(device)
+    if isinstance(network, CustomNetwork):
+        model: nn.Module = network.build(OneHot(slots), slots, slots, config.seed)
+    elif network is not None:
+        model = network
+    else:
+        _check_size(run, config, palette, checkpoint)
+        model = UNet(slots, config.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    fit_weights(model, checkpoint)
+    return Trained(run, config, palette, model.to(device).eval(), checkpoint)
+
+
+def _check_size(
+    run: RunFolder, config: TrainConfig, palette: tuple[str | None, ...], checkpoint: Checkpoint
+) -> None:
+    """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError."""
+    if type(config.width) is not int or not 1 <= config.width <= MAX_WIDTH:
+        raise no_run(run.path, "its network has sizes that no training gives")
+    with torch.device("meta"):
+        wanted = {name: one.shape for name, one in UNet(len(palette), config.width).state_dict().items()}
+    found = {name: getattr(one, "shape", None) for name, one in weights_in(checkpoint).items()}
+    if wanted != found:
+        raise does_not_fit(checkpoint.path, "its weights are those of another network")
+
+
+# Transfer: packs that a network has not seen are added to its rules, and it continues from its weights
+
+SIMPLER = "kinds"
+"""The knob that says how many elements are drawn: other packs' elements come after all of these."""
+
+
+def finetuned(
+    trained: Trained, packs: Sequence[str], *, iterations: int = 100, **changes: Any
+) -> TrainConfig:
+    """The configuration that continues from a network, on worlds in which elements of `packs` alone are drawn.
+
+    The rules are those of the run with the packs added. Elements that the network knows keep their slots; others get
+    its free slots, and where none are left the network grows. A knob for the number of elements is left at its default,
+    for its list may end before the packs' elements. Rulesets are not varied.
+
+    Args:
+        packs: names of shipped packs or of packs that the run left out, or files.
+        changes: other fields of `TrainConfig`.
+
+    Raises:
+        CompileError: what `load` raises.
+    """
+    config = trained.config
+    data = config.data
+    own = data.rules or "+".join(load_task(data.task).rules)
+    rules, names = add(own, packs), pack_names(own, packs)
+    knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
+    data = replace(data, rules=rules, only=names, knobs=knobs, rulesets=0)
+    palette = extended_palette(trained.palette, load_rules_of(data, trained.palette))
+    values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
+    return replace(config, data=data, palette=palette, **values)
+
+
+def extended_palette(palette: Palette, rules: Ruleset) -> tuple[str | None, ...]:
+    """A palette with the elements of rules that were loaded with it: in its free slots, then behind its end."""
+    ids = [element.id for element in rules.elements]
+    found = [*palette, *[None] * (max(ids) + 1 - len(palette))]
+    for element in rules.elements:
+        found[element.id] = element.qualified
+    return tuple(found)

@@ -1,0 +1,310 @@
+"""Users' own networks: built and checked from the command line, and never imported because a file names them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.worldmodel import (
+    CustomNetwork,
+    DataConfig,
+    Machine,
+    TrainConfig,
+    custom_network,
+    load_trained,
+    train,
+)
+from powderdsl.worldmodel.networks import OneHot, is_network_name
+from tests.cli.commands import powderdsl as run
+from tests.worldmodel.test_training import same, weights
+
+HERE = Machine(backend="torch")
+QUICK = ("--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 8, "--backend", "torch")
+
+NETS = """
+import torch
+from pathlib import Path
+from torch import nn
+
+if Path("watched").exists():
+    Path("imported").touch()
+
+class Wide(nn.Module):
+    def __init__(self, channels, slots):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(channels, 8, 3, padding=1), nn.ReLU(), nn.BatchNorm2d(8), nn.Dropout(0.2), nn.Conv2d(8, slots, 1)
+        )
+
+    def forward(self, cells):
+        assert cells.dtype == torch.float32 and cells.is_contiguous()
+        return self.layers(cells)
+
+def made(channels, slots):
+    return Wide(channels, slots)
+
+class Narrow(Wide):
+    def forward(self, cells):
+        return self.layers(cells)[:, :-1]
+
+class Flat(Wide):
+    def forward(self, cells):
+        return self.layers(cells).argmax(1)
+
+class Words(Wide):
+    def forward(self, cells):
+        return "sand"
+
+class Frozen(Wide):
+    def forward(self, cells):
+        return self.layers(cells).detach()
+
+class Still(nn.Module):
+    def __init__(self, channels, slots):
+        super().__init__()
+        self.unused = nn.Parameter(torch.zeros(3))
+
+    def forward(self, cells):
+        return cells
+
+class Broken(Wide):
+    def forward(self, cells):
+        raise RuntimeError("no such layer")
+
+class Other(nn.Module):
+    def __init__(self, width):
+        super().__init__()
+
+class NoModule:
+    def __init__(self, channels, slots):
+        pass
+
+number = 3
+"""
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    torch.set_num_threads(1)
+    Path(tmp_path, "nets.py").write_text(NETS, encoding="utf-8")
+    Path(tmp_path, "faulty.py").write_text("import nowhere\n", encoding="utf-8")
+    Path(tmp_path, "untidy.py").write_text("class Deep(:\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    sys.modules.pop("nets", None)
+    yield
+    for name in ("nets", "faulty", "untidy"):
+        sys.modules.pop(name, None)
+
+
+def was_imported(*words: object) -> tuple[int, str, bool]:
+    """The exit code and output of a command, and whether it imported `nets`."""
+    sys.modules.pop("nets", None)
+    Path("watched").touch()
+    Path("imported").unlink(missing_ok=True)
+    result = run(*words)
+    return result.exit_code, result.output, "nets" in sys.modules or Path("imported").exists()
+
+
+def tiny(task: str) -> TrainConfig:
+    data = DataConfig(task=task, states=60, steps=2, pairs=4, capacity=240, refresh=3)
+    return TrainConfig(data, iterations=12, batch=4, learning_rate=0.01, seed=3)
+
+
+@pytest.mark.parametrize("name", ["nets:Wide", "nets:made"])
+def test_a_network_of_ones_own_is_trained_and_tested(name: str, dunes: str) -> None:
+    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 3)
+    trained = run(*words, "--network", name)
+    assert trained.exit_code == 0, trained.output
+    config = json.loads(Path("run/run.json").read_text())["config"]
+    assert config["network"] == name
+    tested = run(
+        "wm", "eval", "run", "--network", name, "--split", "two", "--worlds", 1, "--backend", "torch"
+    )
+    assert tested.exit_code == 0, tested.output
+    out = ("--out", "strips.png", "--backend", "torch", "--split", "two")
+    assert run("wm", "show", "run", "--network", name, *out).exit_code == 0
+    again = run(*words, "--network", name)
+    assert again.exit_code == 0, again.output
+
+
+def test_an_interrupted_run_ends_with_the_same_weights(dunes: str) -> None:
+    """Also with layers that draw random numbers, and with those that keep statistics."""
+    network = custom_network("nets:Wide")
+    config = tiny(dunes)
+    whole = train(config, "whole", machine=HERE, network=network)
+
+    def stop(now: object) -> None:
+        if getattr(now, "done", 0) == 5:
+            raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        train(config, "parts", machine=HERE, network=network, save_seconds=0, tell=stop)
+    torch.rand(100)  # what else the process draws makes no difference
+    parts = train(config, "parts", machine=HERE, network=network, validate_every=3)
+    assert same(weights(parts), weights(whole))
+    before = torch.random.get_rng_state()
+    load_trained(parts, network=network)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_weights_of_a_network_depend_on_the_seed_alone(dunes: str) -> None:
+    network, encoder = custom_network("nets:Wide"), OneHot(5)
+    torch.rand(3)
+    one = network.build(encoder, 5, 5, 7).state_dict()
+    torch.rand(3)
+    other = network.build(encoder, 5, 5, 7).state_dict()
+    assert same(one, other)
+    assert not same(one, network.build(encoder, 5, 5, 8).state_dict())
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("nowhere:Net", "ModuleNotFoundError: No module named 'nowhere'"),
+        ("faulty:Net", "faulty.py:1"),
+        ("untidy:Net", "untidy.py:1"),
+        ("nets:Widee", "did you mean `Wide`?"),
+        ("nets:number", "is not a class but int"),
+        ("nets.Wide", "write MODULE:CLASS"),
+        ("../nets:Wide", "write MODULE:CLASS"),
+        ("nets:Wide()", "write MODULE:CLASS"),
+        ("nets:Other", "TypeError"),
+        ("nets:NoModule", "must give a torch.nn.Module, found NoModule"),
+        ("nets:Narrow", "must give logits [2, 10, 14, 18], found [2, 9, 14, 18]"),
+        ("nets:Flat", "must give logits [2, 10, 14, 18], found [2, 14, 18] of torch.int64"),
+        ("nets:Words", "must give logits [2, 10, 14, 18], found str"),
+        ("nets:Frozen", "no gradient reaches a parameter"),
+        ("nets:Still", "no gradient reaches a parameter"),
+        ("nets:Broken", "RuntimeError: no such layer"),
+    ],
+)
+def test_networks_that_cannot_be_trained_are_refused(name: str, said: str) -> None:
+    encoder = OneHot(10)
+    with pytest.raises(CompileError) as error:
+        custom_network(name).check(encoder, 10, 10, encoder.example(2, (14, 18)), 0)
+    (found,) = error.value.diagnostics
+    assert found.code == "PD625"
+    assert said in " ".join([found.message, *found.notes, *found.helps])
+
+
+def test_they_are_refused_before_a_run_begins(dunes: str) -> None:
+    result = run("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--network", "nets:Broken")
+    assert result.exit_code == 2, result.output
+    line = NETS[: NETS.index("no such layer")].count("\n") + 1
+    assert f"nets.py:{line}" in result.output
+    assert not Path("run").exists()
+
+
+# What files name is never imported
+
+
+@pytest.fixture
+def trained(dunes: str) -> Path:
+    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 1)
+    assert run(*words, "--network", "nets:Wide").exit_code == 0
+    return Path("run")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("eval", "run", "--backend", "torch"),
+        ("show", "run", "--out", "strips.png", "--backend", "torch"),
+        ("finetune", "run", "--packs", "stone", "--run", "tuned", "--backend", "torch"),
+    ],
+)
+def test_a_run_that_names_a_network_is_refused_without_the_option(
+    words: tuple[str, ...], trained: Path
+) -> None:
+    code, output, imported = was_imported("wm", *words)
+    assert (code, imported) == (2, False), output
+    assert "PD623" in output
+    assert "which it calls `nets:Wide`" in output
+    code, output, imported = was_imported("wm", *words, "--network", "nets:made")
+    assert code == 2, output
+    assert "it was trained with `nets:Wide`, not with `nets:made`" in output
+
+
+def test_training_that_continues_needs_the_same_network(trained: Path, dunes: str) -> None:
+    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 1)
+    code, output, imported = was_imported(*words)
+    assert (code, imported) == (2, False), output
+    assert '`network` is "nets:Wide" there, not set here' in output
+    config = TrainConfig.of(load_trained(trained, network=custom_network("nets:Wide")).run.config)
+    with pytest.raises(CompileError) as error:
+        train(config, "other", machine=HERE)  # what a run's file says decides nothing either
+    assert error.value.diagnostics[0].code == "PD623"
+    assert not Path("other").exists()
+
+
+def test_a_run_of_the_u_net_refuses_another_network(dunes: str) -> None:
+    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
+    assert run(*words).exit_code == 0
+    assert "network" not in json.loads(Path("run/run.json").read_text())["config"]
+    result = run("wm", "eval", "run", "--network", "nets:Wide", "--backend", "torch")
+    assert result.exit_code == 2
+    assert "it was trained with the paper's U-net, not with `nets:Wide`" in result.output
+    both = run(*words, "--network", "nets:Wide")
+    assert "--width is that of the U-net" in both.output
+
+
+@pytest.mark.parametrize("name", ["nets:Wide", 3, ["nets:Wide"], "nets", "os:system('x')", "a" * 5000 + ":b"])
+def test_hostile_names_in_a_run_are_text(name: object, dunes: str) -> None:
+    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
+    assert run(*words).exit_code == 0
+    about = json.loads(Path("run/run.json").read_text())
+    about["config"]["network"] = name
+    Path("run/run.json").write_text(json.dumps(about))
+    for command in (("wm", "eval", "run", "--backend", "torch"), words):
+        code, output, imported = was_imported(*command)
+        assert (code, imported) == (2, False), output
+        assert "Traceback" not in output
+
+
+def test_a_checkpoint_that_names_a_network_is_text(dunes: str) -> None:
+    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2)
+    assert run(*words, "--iterations", 1).exit_code == 0
+    found = load_trained("run")
+    state = {**found.checkpoint.state, "network": "nets:Wide", "module": "nets:Wide"}
+    found.run.save_checkpoint(1, state)
+    code, output, imported = was_imported("wm", "eval", "run", "--backend", "torch", "--split", "two")
+    assert (code, imported) == (0, False), output
+
+
+@pytest.mark.parametrize("command", ["wm train", "wm finetune, on: trained", "wm eval, on: trained"])
+def test_a_study_cannot_name_a_network(command: str) -> None:
+    text = f"""
+study: mine
+seeds: 1
+vary: {{elements: [1, 4]}}
+steps:
+  trained: {{command: wm train, elements: $elements}}
+  other: {{command: {command}, network: "nets:Wide"}}
+  tested: {{command: wm eval, on: trained}}
+measures:
+  loss: {{of: trained, value: mean/model/loss}}
+"""
+    Path("study.yaml").write_text(text, encoding="utf-8")
+    code, output, imported = was_imported("study", "study.yaml", "--dry-run")
+    assert (code, imported) == (2, False), output
+    assert "has no option `network`" in output
+
+
+def test_names_of_networks() -> None:
+    assert is_network_name("nets:Wide")
+    assert is_network_name("some.nets:Outer.Inner")
+    for wrong in ("nets", "nets:", ":Wide", "a:b:c", "a b:c", "a:b()", "../a:b", "", None, 3):
+        assert not is_network_name(wrong)
+
+
+def test_what_is_installed_comes_before_the_current_folder() -> None:
+    Path("torch.py").write_text("raise SystemExit\n", encoding="utf-8")
+    found = custom_network("torch.nn:Conv2d")
+    assert found == CustomNetwork("torch.nn:Conv2d", torch.nn.Conv2d)
