@@ -10,7 +10,8 @@ Fenced blocks are run page by page, in order, in one temporary directory:
   One with ``task:`` is a task, which must have no mistakes; one with ``scene:`` is drawn with those rules.
 * ``statements`` of a generator and ``rewards``, one a line, with the names of `TASK`.
 * ``rules``: one rule a line, each loaded in a pass of its own. ``expressions``: one value a line.
-* ``python``: one namespace a page. A line ``VALUE  # uint8 [8, 64, 64]`` is compared.
+* ``python``: one namespace a page. A line ``VALUE  # uint8 [8, 64, 64]`` is compared. With ``# file: nets.py`` at its
+  top, it is saved under that name for later blocks.
 * ``console``: what follows ``$ powderdsl`` is run; other lines must occur in what it prints. The exit code
   is 0, or 2 where the block shows an error.
 """
@@ -196,6 +197,8 @@ SHOWN = re.compile(r"^(\S.*?) +# (u?int\d+|float\d+) (\[[\d, ]+\])$", re.MULTILI
 
 
 def run_python(block: Block, namespace: dict[str, Any]) -> None:
+    if block.expected("file"):
+        Path(block.expected("file")).write_text(block.text, encoding="utf-8")
     exec(compile(block.text, "<documentation>", "exec"), namespace)
     for value, dtype, shape in SHOWN.findall(block.text):
         tensor = eval(value, namespace)
