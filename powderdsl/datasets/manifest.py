@@ -350,7 +350,7 @@ def recipe_of(
         palette={str(element.id): element.qualified for element in ruleset.elements},
         action_nvec=env.action_nvec,
         choices=tuple(names[choice] for choice in task.agent.choices),
-        actions=env.actions,
+        actions=env.max_episode_steps,
         last_action="terminates" if env.last_action_terminates else "truncates",
     )
     return replace(recipe, shard=_shard_size(recipe, shard))

@@ -125,7 +125,7 @@ def record(
     name = policy if isinstance(policy, str) else policy_name
     if not name:
         raise ValueError("a policy that is a function needs a policy_name, by which its data are known")
-    reserved = {"num_envs", "autoreset_mode"} & how.keys()
+    reserved = {"num_envs", "autoreset_mode", "actions", "action_mask"} & how.keys()
     if reserved:
         raise TypeError(f"record does not take {sorted(reserved)[0]}")
     env = TensorEnv(task, 1, observation=observation, autoreset_mode="disabled", **how)

@@ -30,7 +30,8 @@ def env_id(task: str) -> str:
 
 for _task in shipped_tasks():
     if env_id(_task) not in gymnasium.registry:
-        # Episodes end by themselves: no limit is set on them.
+        # Episodes end by themselves: no limit is set here, so `make` adds no `TimeLimit`, and the last action of a task
+        # may terminate an episode without truncating it. Environments fill `spec.max_episode_steps` in.
         gymnasium.register(
             env_id(_task),
             entry_point="powderdsl.envs.gym:PowderEnv",

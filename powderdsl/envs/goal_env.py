@@ -8,14 +8,16 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from powderdsl.envs.gym import PowderEnv
+from powderdsl.envs.tensor_env import TensorEnv
 
 Array = NDArray[Any]
 
 
-class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Asks for values of what a task measures, such as a count in a region or the match with a target.
 
     Observations are a dict: ``observation``; ``achieved_goal``, float32 [n], the n measures that the task's reward and
@@ -23,7 +25,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     reward is 0 where each is as near as its tolerance, else −1. Episodes last as long as the task's.
 
     Args:
-        env: the environment of one world.
+        env: the environment of one world, a `PowderEnv`; perhaps in wrappers, as `gymnasium.make` returns it.
         low, high: [n], between which goals are drawn, once an episode, by the environment's seed.
         tolerance: [n], or one number.
 
@@ -32,13 +34,19 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(
-        self, env: PowderEnv, low: Sequence[float], high: Sequence[float], tolerance: float | Sequence[float]
+        self,
+        env: gymnasium.Env[Any, Any],
+        low: Sequence[float],
+        high: Sequence[float],
+        tolerance: float | Sequence[float],
     ):
-        super().__init__(env)
-        count = len(env.tensors.program.measures)
+        RecordConstructorArgs.__init__(self, low=low, high=high, tolerance=tolerance)
+        gymnasium.Wrapper.__init__(self, env)
+        tensors = self._tensors
+        count = len(tensors.program.measures)
         self.low, self.high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         if count == 0:
-            raise ValueError(f"the task {env.tensors.task.name} measures nothing")
+            raise ValueError(f"the task {tensors.task.name} measures nothing")
         if self.low.shape != (count,) or self.high.shape != (count,) or not (self.low <= self.high).all():
             raise ValueError(f"low and high take {count} numbers each, low ones first: one for each measure")
         self.tolerance = np.broadcast_to(np.asarray(tolerance, np.float32), (count,)).copy()
@@ -48,6 +56,10 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.observation_space = spaces.Dict(
             {"observation": env.observation_space, "achieved_goal": box, "desired_goal": box}
         )
+
+    @property
+    def _tensors(self) -> TensorEnv:
+        return cast(PowderEnv, self.env.unwrapped).tensors
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -76,7 +88,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return near.all(-1).astype(np.float32) - 1
 
     def _with_goals(self, observed: Any) -> dict[str, Array]:
-        tensors = cast(PowderEnv, self.env.unwrapped).tensors
+        tensors = self._tensors
         assert tensors.episodes is not None  # reset and step have begun them
         measured = tensors.program.measured(tensors.episodes, tensors.params)
         achieved = measured[0].cpu().numpy().astype(np.float32)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import MultiDiscrete
 from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from powderdsl.envs import env_id
 from powderdsl.envs.tensor_env import Info, TensorEnv
 from powderdsl.simulation.draw import scale
 from powderdsl.tasks.episodes import TaskProgram
@@ -66,11 +68,43 @@ def objects(rows: Array, mask: Array) -> Array:
     return found
 
 
-class PowderVectorEnv(VectorEnv[Any, Any, Any]):
+def spec_of(env: TensorEnv, task: Any, how: Mapping[str, Any]) -> EnvSpec:
+    """The spec of an environment that was made directly; `how` are its arguments."""
+    return EnvSpec(
+        env_id(env.task.name),
+        entry_point="powderdsl.envs.gym:PowderEnv",
+        vector_entry_point="powderdsl.envs.gym:PowderVectorEnv",
+        max_episode_steps=env.max_episode_steps,
+        kwargs={"task": task, **how},
+    )
+
+
+class _Limited:
+    """An environment whose spec says how many actions an episode has.
+
+    Gymnasium sets the spec of an environment that it has made, and knows no limit there: none is set from outside.
+    """
+
+    tensors: TensorEnv
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        limit = self.tensors.max_episode_steps
+        self._spec = None if value is None else replace(value, max_episode_steps=limit)
+
+
+class PowderVectorEnv(_Limited, VectorEnv[Any, Any, Any]):
     """Many worlds of a task, stepped together. Rewards are float32; arrays are never written to after they are returned.
 
     Args:
         task, num_envs, and all others: those of `TensorEnv`.
+        autoreset_mode: Gymnasium's default, which its wrappers expect; Stable-Baselines3 and TorchRL take others.
+        actions: as in `TensorEnv`, but numbers that nothing reads are left out by default.
         render_mode: ``rgb_array`` (uint8 pictures) or ``ansi`` (text), of each world.
         render_scale: pixels along a cell's side.
     """
@@ -82,11 +116,13 @@ class PowderVectorEnv(VectorEnv[Any, Any, Any]):
         *,
         render_mode: str | None = None,
         render_scale: int = 8,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        actions: str = "multidiscrete",
         **how: Any,
     ):
         self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
-        self.tensors = TensorEnv(task, num_envs, autoreset_mode=autoreset_mode, **how)
+        how |= {"autoreset_mode": autoreset_mode, "actions": actions}
+        self.tensors = TensorEnv(task, num_envs, **how)
         """The same environment for tensors."""
         self.num_envs = num_envs
         self.autoreset_mode = self.tensors.autoreset_mode
@@ -96,9 +132,11 @@ class PowderVectorEnv(VectorEnv[Any, Any, Any]):
             "render_fps": 15,
         }
         self.single_observation_space = self.tensors.observation.space
-        self.single_action_space = MultiDiscrete(np.array(self.tensors.action_nvec))
+        self.single_action_space = self.tensors.single_action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        shown = {"render_mode": render_mode, "render_scale": render_scale}
+        self.spec = spec_of(self.tensors, task, {"num_envs": num_envs, **shown, **how})
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -113,9 +151,13 @@ class PowderVectorEnv(VectorEnv[Any, Any, Any]):
         """`TensorEnv.step` with arrays. ``final_obs`` is an array of objects: None unless the episode ended."""
         observed, reward, terminated, truncated, info = self.tensors.step(actions)
         found = arrays(info)
-        if "final_obs" in info:
+        if "final_obs" in found:
             found["final_obs"] = objects(found["final_obs"], found["_final_obs"])
         return array(observed), array(reward), array(terminated), array(truncated), found
+
+    def action_masks(self) -> Array:
+        """Which actions are allowed: bool [B, n], the values of the first number of an action, then of the next."""
+        return array(self.tensors.action_masks())
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture or text of each world, in the mode that was chosen."""
@@ -124,13 +166,14 @@ class PowderVectorEnv(VectorEnv[Any, Any, Any]):
         return frames(self.tensors, self.render_mode, self.render_scale)
 
 
-class PowderEnv(gymnasium.Env[Array, NDArray[np.int64]], EzPickle):
+class PowderEnv(_Limited, gymnasium.Env[Array, Any], EzPickle):
     """One world: the same episodes as environment 0 of a `PowderVectorEnv` with the same seed.
 
     Pickling keeps what it was made with, not the world in it.
 
     Args:
         task, and all others: those of `TensorEnv`, without `num_envs` and `autoreset_mode`.
+        actions: as in `PowderVectorEnv`.
         render_mode: ``rgb_array`` (a uint8 picture) or ``ansi`` (text). render_scale: pixels along a cell's side.
     """
 
@@ -142,32 +185,49 @@ class PowderEnv(gymnasium.Env[Array, NDArray[np.int64]], EzPickle):
         *,
         render_mode: str | None = None,
         render_scale: int = 8,
+        actions: str = "multidiscrete",
         **how: Any,
     ):
-        EzPickle.__init__(self, task, render_mode=render_mode, render_scale=render_scale, **how)
+        how["actions"] = actions
+        shown = {"render_mode": render_mode, "render_scale": render_scale}
+        EzPickle.__init__(self, task, **shown, **how)
         self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
         self.tensors = TensorEnv(task, 1, autoreset_mode="disabled", **how)
         """The same environment for tensors."""
         self.observation_space = self.tensors.observation.space
-        self.action_space = MultiDiscrete(np.array(self.tensors.action_nvec))
+        self.action_space = self.tensors.single_action_space
+        self.spec = spec_of(self.tensors, task, {**shown, **how})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode. Seeds and options are those of `TensorEnv.reset`; infos: ``world``."""
+        """Begin an episode. Seeds and options are those of `TensorEnv.reset`, infos those of `step`."""
         observed, info = self.tensors.reset(seed=seed, options=options)
         super().reset(seed=seed)
-        return array(observed[0]), {"world": int(info["world"][0])}
+        return array(observed[0]), self._info(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One action: x, y, choice, vx, vy. Infos: ``success``, ``world``; with the last step ``episode_return`` and
-        ``episode_length``."""
-        batch = np.asarray(action)
-        if batch.shape != (5,):
-            raise ValueError(f"an action has the shape [5], found {list(batch.shape)}")
+        """One action. Infos: ``success``, ``world``; ``episode_return`` and ``episode_length``, so far."""
+        batch, shape = np.asarray(action), self.tensors.single_action_space.shape
+        if batch.shape != shape:
+            raise ValueError(f"an action has the shape {list(shape or ())}, found {list(batch.shape)}")
         observed, reward, terminated, truncated, info = self.tensors.step(batch[None])
-        found = {name: one[0].item() for name, one in info.items() if not name.startswith("_")}
-        return array(observed[0]), float(reward[0]), bool(terminated[0]), bool(truncated[0]), found
+        return array(observed[0]), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
+
+    def _info(self, info: Info) -> dict[str, Any]:
+        """The infos of the one world there is."""
+        assert self.tensors.episodes is not None
+        found = {
+            "success": bool(info["success"][0]),
+            "world": int(info["world"][0]),
+            "episode_return": float(self.tensors.returns[0]),
+            "episode_length": int(self.tensors.episodes.acted[0]),
+        }
+        return found | ({"action_mask": array(info["action_mask"][0])} if "action_mask" in info else {})
+
+    def action_masks(self) -> Array:
+        """Which actions are allowed: bool [n], the values of the first number of an action, then of the next."""
+        return array(self.tensors.action_masks()[0])
 
     def render(self) -> Any:
         """A picture uint8 [H, W, 3], or text, in the mode that was chosen."""

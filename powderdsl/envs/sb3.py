@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import MultiDiscrete
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from powderdsl.envs.gym import array, arrays, check_render_mode, frames
+from powderdsl.envs.gym import array, arrays, check_render_mode, frames, spec_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
@@ -30,6 +29,7 @@ class PowderVecEnv(VecEnv):
 
     Args:
         task, num_envs, and all others: those of `TensorEnv`, without `autoreset_mode`.
+        actions: as in `TensorEnv`, but numbers that nothing reads are left out by default.
         render_mode: ``rgb_array`` or ``ansi``. render_scale: pixels along a cell's side.
     """
 
@@ -40,15 +40,17 @@ class PowderVecEnv(VecEnv):
         *,
         render_mode: str | None = None,
         render_scale: int = 8,
+        actions: str = "multidiscrete",
         **how: Any,
     ):
         self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
-        self.tensors = TensorEnv(task, num_envs, autoreset_mode="same_step", **how)
+        self.tensors = TensorEnv(task, num_envs, autoreset_mode="same_step", actions=actions, **how)
         """The same environment for tensors."""
         self._actions: Any = None
         self._began = time.time()
-        space = MultiDiscrete(np.array(self.tensors.action_nvec))
-        super().__init__(num_envs, self.tensors.observation.space, space)
+        how["actions"] = actions
+        self.spec = spec_of(self.tensors, task, how)
+        super().__init__(num_envs, self.tensors.observation.space, self.tensors.single_action_space)
 
     def reset(self) -> Array:
         """Begin all episodes with the seeds and options that `seed` and `set_options` have left; they count once."""
@@ -60,7 +62,7 @@ class PowderVecEnv(VecEnv):
         return array(observed)
 
     def step_async(self, actions: Any) -> None:
-        """Keep the actions, [B, 5], for `step_wait`."""
+        """Keep the actions, [B] or [B, k], for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
@@ -68,7 +70,7 @@ class PowderVecEnv(VecEnv):
         observed, reward, terminated, truncated, info = self.tensors.step(self._actions)
         done = array(terminated | truncated)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if "final_obs" in info:
+        if done.any():
             final, passed = arrays(info["final_info"]), round(time.time() - self._began, 6)
             for place, last in zip(np.flatnonzero(done), array(info["final_obs"]), strict=True):
                 returned, length = float(final["episode_return"][place]), int(final["episode_length"][place])
@@ -80,6 +82,10 @@ class PowderVecEnv(VecEnv):
                 if self.tensors.task.goal.success is not None:
                     infos[place]["is_success"] = bool(final["success"][place])
         return array(observed), array(reward), done, infos
+
+    def action_masks(self) -> Array:
+        """Which actions are allowed, as `MaskablePPO` asks for them: bool [B, n]."""
+        return array(self.tensors.action_masks())
 
     def state(self) -> dict[str, Any]:
         """The result of `TensorEnv.state`."""
@@ -113,7 +119,10 @@ class PowderVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method once; the result for each world."""
+        """Call a method once; the result for each world. Of `action_masks`, each world gets its own row."""
+        if method_name == "action_masks":
+            masks = self.action_masks()
+            return [masks[place] for place in self._chosen(indices)]
         owner = self if hasattr(self, method_name) else self.tensors
         result = getattr(owner, method_name)(*method_args, **method_kwargs)
         return [result] * len(self._chosen(indices))

@@ -12,13 +12,13 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from powderdsl.envs.actions import action_form
 from powderdsl.envs.observations import observation_of
 from powderdsl.simulation.simulator import MAX_CELLS
 from powderdsl.system.random import MASK, mix
 from powderdsl.tasks.episodes import (
     Episodes,
     TaskProgram,
-    check_actions,
     compile_task,
     integer_tensor,
     load_task,
@@ -63,6 +63,8 @@ class TensorEnv:
         last_action: whether the last action ``truncates`` or ``terminates`` an episode. ``auto``: it terminates if the task
             has a `final` reward, which has then been given, and truncates if rewards would continue.
         max_episode_steps: truncates earlier than the task does.
+        actions: a kind of `actions.KINDS`: the form of actions.
+        action_mask: whether infos have ``action_mask``, int8 [B, n]: see `action_masks`.
         backend, device, threads: those of `powderdsl.compile`.
 
     Raises:
@@ -82,6 +84,8 @@ class TensorEnv:
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         last_action: str = "auto",
         max_episode_steps: int | None = None,
+        actions: str = "full",
+        action_mask: bool = False,
         backend: str = "auto",
         device: str | torch.device = "cpu",
         threads: int | None = None,
@@ -104,11 +108,13 @@ class TensorEnv:
         self.device = self.simulator.device
         self.autoreset_mode = _mode(autoreset_mode)
         self.observation = observation_of(observation, self.simulator, self.task.size)
-        self.single_action_shape, self.action_nvec = (5,), self.program.action_nvec
+        self.action_form = action_form(actions, self.task.agent, self.device)
+        self.single_action_space, self.action_nvec = self.action_form.space, self.action_form.nvec
+        self.shows_mask = action_mask
         self.last_action_terminates = last_action == "terminates" or (
             last_action == "auto" and self.task.goal.final is not None
         )
-        self.actions = min(self.task.agent.actions, max_episode_steps or self.task.agent.actions)
+        self.max_episode_steps = min(self.task.agent.actions, max_episode_steps or self.task.agent.actions)
         self.episodes: Episodes | None = None
         """The current worlds, to read; the next call writes to their tensors."""
         self.params: dict[str, Tensor] = {}
@@ -137,7 +143,8 @@ class TensorEnv:
                 or [B]. ``reset_mask``: bool [B]: only these environments are reset.
 
         Returns:
-            observations [B, …], and infos: ``world``, int64 [B], which worlds they play.
+            observations [B, …], and infos as `step` gives them, without those of episodes that ended: ``world``, int64
+            [B], which worlds they play.
 
         Raises:
             TypeError, ValueError, KeyError: something is wrong with a seed or an option. Nothing has changed then.
@@ -162,8 +169,34 @@ class TensorEnv:
         self._base, self._episode, self.params = base, episode, params
         self._returned = self._returned.masked_fill(mask, 0)
         self._ended = self._ended & ~mask
-        info = {"world": self.episodes.seed.clone(), "_world": mask.clone()}
+        nobody = torch.zeros_like(mask)
+        info: Info = {"success": nobody, "_success": nobody.clone()}
+        self._add_ended(info, nobody)
+        self._add_shown(info, mask)
         return self.observation.of(self.episodes.world), info
+
+    def _add_ended(self, info: Info, ended: Tensor) -> None:
+        """Add what is known of episodes where `ended`, bool [B], is set; zeros elsewhere."""
+        assert self.episodes is not None
+        info["episode_return"] = (self._returned * ended).float()
+        info["episode_length"] = self.episodes.acted * ended
+        info["_episode_return"] = info["_episode_length"] = ended.clone()
+
+    def _add_shown(self, info: Info, mask: Tensor) -> None:
+        """Add what is known of the worlds that are shown, where `mask`, bool [B], is set."""
+        assert self.episodes is not None
+        info["world"], info["_world"] = self.episodes.seed.clone(), mask.clone()
+        if self.shows_mask:
+            info["action_mask"], info["_action_mask"] = self.action_masks().to(torch.int8), mask.clone()
+
+    def action_masks(self) -> Tensor:
+        """Which actions are allowed: bool [B, n], the `ActionForm.mask` in each world."""
+        return self.action_form.mask.expand(self.num_envs, -1).clone()
+
+    @property
+    def returns(self) -> Tensor:
+        """The return of each current episode so far: float64 [B]."""
+        return self._returned.clone()
 
     def _bases(self, seed: Any) -> tuple[Tensor, Tensor]:
         """The seed of each environment, and whether it is a new one."""
@@ -264,13 +297,14 @@ class TensorEnv:
         """One action in every episode.
 
         Args:
-            actions: integers [B, 5]: x, y, choice, vx, vy, each from 0 to ``action_nvec − 1``.
+            actions: integers [B, k], or [B] if they are discrete, each from 0 to ``action_nvec − 1``. Of `full` actions
+                these are x, y, choice, vx, vy.
 
         Returns:
-            observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; infos: ``success``, whether
-            the task's condition for it holds; ``world``, which worlds are shown; where episodes ended
-            ``episode_return`` and ``episode_length`` (zero elsewhere) and, under SAME_STEP, ``final_obs`` (their last
-            observations, [n, …] in the order of the environments) and ``final_info``.
+            observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; infos, which have the same keys
+            after every step: ``success``, whether the task's condition for it holds; ``world``, which worlds are shown;
+            where episodes ended ``episode_return`` and ``episode_length`` (zero elsewhere) and, under SAME_STEP,
+            ``final_obs`` (their last observations, [n, …] in the order of the environments) and ``final_info``.
 
         Raises:
             ResetNeeded: before the first reset, or under DISABLED in an episode that has ended. TypeError, ValueError:
@@ -278,7 +312,7 @@ class TensorEnv:
         """
         if self.episodes is None:
             raise ResetNeeded("reset the environment before its first step")
-        checked = check_actions(self.program, actions)
+        checked = self.action_form.decode(actions)
         if len(checked) != self.num_envs:
             raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
         waiting = self._ended
@@ -293,17 +327,14 @@ class TensorEnv:
         self.episodes = after
         failed, last = after.failed, after.acted >= self.task.agent.actions
         terminated = (success | failed | last) if self.last_action_terminates else success | failed
-        truncated = (last | (after.acted >= self.actions)) & ~terminated
+        truncated = (last | (after.acted >= self.max_episode_steps)) & ~terminated
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             reward = reward.masked_fill(waiting, 0)
             terminated, truncated, success = (one & ~waiting for one in (terminated, truncated, success))
         self._returned = self._returned + reward
         ended = terminated | truncated
         info: Info = {"success": success, "_success": ~waiting}
-        if bool(ended.any()):
-            info["episode_return"] = (self._returned * ended).float()
-            info["episode_length"] = after.acted * ended
-            info["_episode_return"], info["_episode_length"] = ended.clone(), ended.clone()
+        self._add_ended(info, ended)
         observed = self.observation.of(after.world)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             self._begin(ended, observed, info)
@@ -311,7 +342,7 @@ class TensorEnv:
             self._ended = ended
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._begin(waiting, observed)
-        info["world"], info["_world"] = self.episodes.seed.clone(), torch.ones_like(ended)
+        self._add_shown(info, torch.ones_like(ended))
         return observed, reward, terminated, truncated, info
 
     def _begin(self, mask: Tensor, observed: Tensor, info: Info | None = None) -> None:
@@ -322,14 +353,15 @@ class TensorEnv:
         assert self.episodes is not None
         assert self._base is not None
         places = mask.nonzero()[:, 0]
-        if not len(places):
-            return
         if info is not None:
             last = {"world": self.episodes.seed.clone()}
-            last |= {name: info[name].clone() for name in ("success", "episode_return", "episode_length")}
-            info["final_info"] = last | {f"_{name}": mask.clone() for name in last}
+            last |= {name: info[name] for name in ("success", "episode_return", "episode_length")}
+            masked = info["_episode_return"]
+            info["final_info"] = last | {f"_{name}": masked for name in last}
             info["final_obs"] = observed[places]
-            info["_final_obs"], info["_final_info"] = mask.clone(), mask.clone()
+            info["_final_obs"] = info["_final_info"] = masked
+        if not len(places):
+            return
         self._episode = self._episode + mask
         self._returned = self._returned.masked_fill(mask, 0)
         fresh = self.program.start(world_seeds(self._base, self._episode, self.worlds)[places])

@@ -78,7 +78,9 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         program = compile_task(
             task, split=config.split, backend=config.backend, device=config.device, threads=config.threads
         )
-        env = PowderVecEnv(program, config.envs, observation=config.observation, worlds=config.worlds)
+        env = PowderVecEnv(
+            program, config.envs, observation=config.observation, worlds=config.worlds, actions="full"
+        )
         model = _model(config, env)
         with run.metrics(step) as metrics:
             model.set_logger(Logger(None, [_MetricsWriter(metrics)]))

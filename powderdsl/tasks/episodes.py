@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -28,6 +29,9 @@ CLOCK = ("seed", "index", "step")
 
 Params = Mapping[str, Any] | None
 Seen = Callable[[World], None] | None
+
+ACTION = ("x", "y", "choice", "vx", "vy")
+"""What the numbers of an action say."""
 
 DONE = ("painted", "placed", "blown")
 """Numbers that `Hands.act` gives for rewards."""
@@ -80,9 +84,12 @@ class TaskProgram:
         """Whether measures are needed after every action, and not only after the last."""
         counts = any(part.op == "action" and part.value == "painted" for part in scalars_of(goal))
         self._hands = Hands(simulator, task.agent, task.size, counts=counts)
-        rows, columns = task.agent.bins
-        self.action_nvec: tuple[int, int, int, int, int] = (columns, rows, len(task.agent.choices), 3, 3)
+        self.action_nvec = task.agent.action_nvec
         """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
+
+    def __deepcopy__(self, memo: Any) -> TaskProgram:
+        """The same program: nothing in it changes, and copies of what uses it share it."""
+        return self
 
     # Beginning
 
@@ -307,15 +314,23 @@ def check_actions(program: TaskProgram, actions: Any) -> Tensor:
     Raises:
         TypeError: they are not integers. ValueError: a wrong shape, or a number out of range, with its index.
     """
+    return check_numbers(actions, program.action_nvec, ACTION).to(program.simulator.device)
+
+
+def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -> Tensor:
+    """Numbers from outside as int64 [B, k], those of column i from 0 to ``nvec[i] − 1``. Raises as `check_actions`."""
     tensor = integer_tensor("actions", actions)
-    if tensor.ndim != 2 or tensor.shape[1] != 5:
-        raise ValueError(f"actions must have the shape [episodes, 5], found {list(tensor.shape)}")
-    bounds = torch.tensor(program.action_nvec, device=tensor.device)
+    if tensor.ndim != 2 or tensor.shape[1] != len(nvec):
+        raise ValueError(f"actions must have the shape [episodes, {len(nvec)}], found {list(tensor.shape)}")
+    bounds = _bounds(nvec).to(tensor.device)
     bad = (tensor < 0) | (tensor >= bounds)
     if bool(bad.any()):
         row, column = bad.nonzero()[0].tolist()
-        name = ("x", "y", "choice", "vx", "vy")[column]
-        most = program.action_nvec[column] - 1
-        value = int(tensor[row, column])
-        raise ValueError(f"actions[{row}, {column}] ({name}) is {value}: it must lie in 0..{most}")
-    return tensor.to(program.simulator.device)
+        value, most = int(tensor[row, column]), nvec[column] - 1
+        raise ValueError(f"actions[{row}, {column}] ({names[column]}) is {value}: it must lie in 0..{most}")
+    return tensor
+
+
+@lru_cache(256)
+def _bounds(nvec: tuple[int, ...]) -> Tensor:
+    return torch.tensor(nvec)

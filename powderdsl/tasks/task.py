@@ -145,6 +145,12 @@ class Agent:
     speed_field: str | None
     speed: float
 
+    @property
+    def action_nvec(self) -> tuple[int, int, int, int, int]:
+        """How many values x, y, choice, vx and vy have."""
+        rows, columns = self.bins
+        return columns, rows, len(self.choices), 3, 3
+
     def first_line(self, axis: int, place: Any, side: int) -> Any:
         """The first row (axis 0) or column of the brush at bins `place`, integers or tensors; perhaps outside the grid."""
         return (2 * place + 1) * side // (2 * self.bins[axis]) - self.brush[axis] // 2

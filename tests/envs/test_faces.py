@@ -17,6 +17,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from powderdsl.envs.actions import KINDS as ACTIONS
 from powderdsl.envs.features import Expand, paper_policy
 from powderdsl.envs.goal_env import GoalEnv
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
@@ -37,7 +38,10 @@ def simulators() -> dict[str, Simulator]:
 
 @pytest.mark.parametrize("name", shipped_tasks())
 def test_both_checkers_pass_without_a_warning(name: str, simulators: dict[str, Simulator]) -> None:
-    """Stable-Baselines3 takes 3-D floats for ill-made pictures, so its checker is shown `matrix` flattened."""
+    """With all kinds of observations and actions.
+
+    Stable-Baselines3 takes 3-D floats for ill-made pictures, so its checker is shown `matrix` flattened.
+    """
     task = load_task(name)
     simulator = simulators.get(task.ruleset.name)
     if simulator is None or simulator.ruleset != task.ruleset:
@@ -45,8 +49,8 @@ def test_both_checkers_pass_without_a_warning(name: str, simulators: dict[str, S
     program = TaskProgram(task, "train", simulator)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for kind in KINDS:
-            env = PowderEnv(program, observation=kind)
+        for kind, actions in zip(KINDS, [*ACTIONS, "discrete"], strict=True):
+            env = PowderEnv(program, observation=kind, actions=actions, action_mask=kind == "ids")
             check_gymnasium(env, skip_render_check=True)
             check_sb3(FlattenObservation(env) if kind == "matrix" else env)
 
@@ -64,7 +68,8 @@ def test_the_checkers_look_at_rendering_and_specs_too() -> None:
 def test_one_world_a_slot_and_sb3_play_the_same(small: TaskProgram) -> None:
     steps, envs = 14, 3
     actions = np.random.default_rng(1).integers(0, small.action_nvec, (steps, envs, 5))
-    batch, sb3 = PowderVectorEnv(small, envs), PowderVecEnv(small, envs)
+    batch = PowderVectorEnv(small, envs, autoreset_mode="same_step")
+    sb3 = PowderVecEnv(small, envs)
     dummy = DummyVecEnv([lambda: PowderEnv(small)] * envs)
     sb3.seed(40)
     dummy.seed(40)

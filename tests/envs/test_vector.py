@@ -333,7 +333,7 @@ def test_every_shipped_task_is_registered_and_batched() -> None:
     assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())
     env = gymnasium.make_vec("powderdsl/SandPushing-v0", num_envs=3, backend="torch", observation="compact")
     assert isinstance(env.unwrapped, PowderVectorEnv)
-    assert env.metadata["autoreset_mode"] is env.unwrapped.autoreset_mode is AutoresetMode.SAME_STEP
+    assert env.metadata["autoreset_mode"] is env.unwrapped.autoreset_mode is AutoresetMode.NEXT_STEP
     observed, _ = env.reset(seed=0)
     assert observed.shape == (3, 6, 64, 64)
     assert load_task("sand-pushing").size == (64, 64)

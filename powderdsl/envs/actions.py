@@ -1,0 +1,166 @@
+"""The forms in which environments take actions, and their mapping to the five numbers that tasks take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Discrete, MultiDiscrete
+from torch import Tensor
+
+from powderdsl.diagnostics import suggest
+from powderdsl.tasks.episodes import ACTION, check_numbers, integer_tensor
+from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
+
+KINDS = ("multidiscrete", "discrete", "full")
+
+MAX_ACTIONS = 1 << 20
+"""The most actions of a discrete form."""
+
+UNREAD = (0, 0, 0, 1, 1)
+"""The values of numbers that nothing reads; vx and vy are those of a blow that moves nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class ActionForm:
+    """A form of the actions of one agent. Made by `action_form`; its tensors lie on one device.
+
+    ``full``: the five numbers x, y, choice, vx, vy. ``multidiscrete``: those of them that one of the agent's choices reads
+    and that can have several values; the choice alone if there are none. ``discrete``: one number, of which each value
+    does something different, see `table`.
+    """
+
+    kind: str
+    space: Discrete[Any] | MultiDiscrete
+    """Of one action."""
+    names: tuple[str, ...]
+    """What each number of an action says."""
+    nvec: tuple[int, ...]
+    """How many values each number of an action has."""
+    mask: Tensor
+    """bool [sum of `nvec`]: which values of the first number, then of the next, are allowed. Only `full` has others: of a
+    number that nothing reads, one value is allowed."""
+    full_nvec: tuple[int, ...]
+    """How many values the five numbers have."""
+    columns: Tensor
+    """int64 [k]: which of the five numbers stand in an action, if it is not ``discrete``."""
+    table: Tensor
+    """The five numbers of each value of a ``discrete`` action, int64 [n, 5]; of other forms UNREAD, [1, 5].
+
+    Values are ordered by what is done, then by y, then by x: ``value = (what · rows + y) · columns + x``. What is done are
+    the agent's choices in order; blowing counts once for each (vy, vx), vx counting fastest. Doing nothing has no place,
+    and is the last value.
+    """
+    weights: Tensor
+    """int64 [choices, 5]: a ``discrete`` action is ``weights[choice] · (x, y, 1, vx, vy)``."""
+
+    def decode(self, actions: Any) -> Tensor:
+        """The five numbers of actions: int64 [B, 5], from integers [B] (``discrete``) or [B, k].
+
+        Raises:
+            TypeError: they are not integers. ValueError: a wrong shape, or a number out of range, with its index.
+        """
+        device = self.table.device
+        if self.kind == "discrete":
+            return self.table[self._checked_values(actions).to(device)]
+        numbers = check_numbers(actions, self.nvec, self.names).to(device)
+        if len(self.columns) == len(ACTION):
+            return numbers
+        return self.table.expand(len(numbers), -1).clone().index_copy_(1, self.columns, numbers)
+
+    def _checked_values(self, actions: Any) -> Tensor:
+        """Discrete actions from outside, int64 [B]."""
+        values = integer_tensor("actions", actions)
+        if values.ndim != 1:
+            raise ValueError(f"actions must have the shape [episodes], found {list(values.shape)}")
+        bad = (values < 0) | (values >= self.nvec[0])
+        if bool(bad.any()):
+            place = int(bad.nonzero()[0])
+            most = self.nvec[0] - 1
+            raise ValueError(f"actions[{place}] is {int(values[place])}: it must lie in 0..{most}")
+        return values
+
+    def encode(self, numbers: Any) -> Tensor:
+        """The actions in this form, int64 [B] or [B, k], that do the same as five numbers each, [B, 5].
+
+        Raises:
+            TypeError, ValueError: as `decode`.
+        """
+        full = check_numbers(numbers, self.full_nvec, ACTION).to(self.table.device)
+        if self.kind != "discrete":
+            return full[:, self.columns]
+        terms = full.clone()
+        terms[:, 2] = 1
+        return (self.weights[full[:, 2]] * terms).sum(1)
+
+
+def action_form(kind: str, agent: Agent, device: torch.device) -> ActionForm:
+    """The form of a kind (one of KINDS) for an agent.
+
+    Raises:
+        ValueError: an unknown kind, or more than MAX_ACTIONS discrete actions.
+    """
+    if kind not in KINDS:
+        helps = suggest(str(kind), KINDS, "kinds") or ("kinds: " + ", ".join(KINDS),)
+        raise ValueError(f"no actions {kind!r}; {'; '.join(helps)}")
+    rows, columns = agent.bins
+    full_nvec = agent.action_nvec
+    read = (
+        columns > 1 and agent.choices != (NO_CHANGE,),
+        rows > 1 and agent.choices != (NO_CHANGE,),
+        len(agent.choices) > 1,
+        BLOW in agent.choices,
+        BLOW in agent.choices,
+    )
+    table, weights = torch.tensor([UNREAD]), torch.zeros(len(agent.choices), 5, dtype=torch.int64)
+    if kind == "discrete":
+        table, weights = _discrete(agent)
+        chosen: tuple[int, ...] = ()
+        names: tuple[str, ...] = ("action",)
+        nvec: tuple[int, ...] = (len(table),)
+        space: Discrete[Any] | MultiDiscrete = Discrete(len(table))
+    else:
+        chosen = tuple(place for place in range(5) if read[place] or kind == "full") or (2,)
+        names, nvec = tuple(ACTION[place] for place in chosen), tuple(full_nvec[place] for place in chosen)
+        space = MultiDiscrete(np.array(nvec))
+    mask = torch.ones(sum(nvec), dtype=torch.bool)
+    if kind == "full":
+        parts = mask.split(nvec)
+        for part, value, is_read in zip(parts, UNREAD, read, strict=True):
+            if not is_read:
+                part[:] = torch.arange(len(part)) == value
+    tensors = (torch.tensor(chosen, dtype=torch.int64), table, weights)
+    return ActionForm(
+        kind, space, names, nvec, mask.to(device), full_nvec, *(one.to(device) for one in tensors)
+    )
+
+
+def _discrete(agent: Agent) -> tuple[Tensor, Tensor]:
+    """The table and the weights of the discrete form."""
+    rows, columns = agent.bins
+    places = rows * columns
+    winds = [(vx, vy) for vy in range(3) for vx in range(3)]
+    done = [
+        (number, *wind)
+        for number, choice in enumerate(agent.choices)
+        if choice != NO_CHANGE
+        for wind in (winds if choice == BLOW else [UNREAD[3:]])
+    ]
+    idle = NO_CHANGE in agent.choices
+    count = len(done) * places + idle
+    if count > MAX_ACTIONS:
+        raise ValueError(f"this task has {count:,} actions: a discrete space takes {MAX_ACTIONS:,} at most")
+    y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    where = torch.stack([x.flatten(), y.flatten()], 1).repeat(len(done), 1)
+    what = torch.tensor(done, dtype=torch.int64).view(-1, 3).repeat_interleave(places, 0)
+    table, weights = torch.cat([where, what], 1), []
+    for number, choice in enumerate(agent.choices):
+        first = next((place for place, one in enumerate(done) if one[0] == number), 0) * places
+        wind = (places, 3 * places) if choice == BLOW else (0, 0)
+        weights.append((0, 0, count - 1, 0, 0) if choice == NO_CHANGE else (1, columns, first, *wind))
+    if idle:
+        nothing = (*UNREAD[:2], agent.choices.index(NO_CHANGE), *UNREAD[3:])
+        table = torch.cat([table, torch.tensor([nothing])])
+    return table, torch.tensor(weights)
