@@ -11,7 +11,8 @@ Fenced blocks are run page by page, in order, in one temporary directory:
 * ``statements`` of a generator and ``rewards``, one a line, with the names of `TASK`.
 * ``rules``: one rule a line, each loaded in a pass of its own. ``expressions``: one value a line.
 * ``python``: one namespace a page. A line ``VALUE  # uint8 [8, 64, 64]`` is compared. With ``# file: nets.py`` at its
-  top, it is saved under that name for later blocks.
+  top, it is saved under that name for later blocks. One with ``# needs: MODULE`` is left out where an optional dependency
+  is not installed, and the page is then reported as skipped.
 * ``console``: what follows ``$ powderdsl`` is run; other lines must occur in what it prints. The exit code
   is 0, or 2 where the block shows an error.
 """
@@ -39,6 +40,7 @@ from powderdsl.worlds.scene import load_start
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+SLOW = {"docs/libraries.md"}
 MANY_STEPS = 4
 """Commands that run longer are cut to this many steps: what they print does not depend on it."""
 
@@ -231,18 +233,29 @@ def runnable(page: Path) -> bool:
     return any(block.language in RUNNABLE for block in blocks_of(read(page)))
 
 
+def marked(page: Path) -> Any:
+    return pytest.param(page, id=page_name(page), marks=[pytest.mark.slow] if page_name(page) in SLOW else [])
+
+
 # Of workers of a DataLoader: torch warns on one core, Python from 3.12 on of a fork beside other threads.
 @pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-@pytest.mark.parametrize("page", [page for page in PAGES if runnable(page)], ids=page_name)
+@pytest.mark.parametrize("page", [marked(page) for page in PAGES if runnable(page)])
 def test_blocks_run(page: Path, folder: Path) -> None:
     namespace: dict[str, Any] = {"__name__": "documentation"}
+    missing = []
     for block in blocks_of(read(page)):
+        needed = block.expected("needs")
+        if block.language == "python" and needed and importlib.util.find_spec(needed) is None:
+            missing.append(needed)
+            continue
         try:
             run_block(block, namespace)
         except BaseException as error:
             error.add_note(f"in the {block.language} block at {page_name(page)}:{block.line}")
             raise
+    if missing:
+        pytest.skip(f"not installed: {', '.join(dict.fromkeys(missing))}")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

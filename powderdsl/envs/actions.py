@@ -141,12 +141,12 @@ def _discrete(agent: Agent) -> tuple[Tensor, Tensor]:
     """The table and the weights of the discrete form."""
     rows, columns = agent.bins
     places = rows * columns
-    winds = [(vx, vy) for vy in range(3) for vx in range(3)]
+    motions = [(vx, vy) for vy in range(3) for vx in range(3)]
     done = [
-        (number, *wind)
+        (number, *motion)
         for number, choice in enumerate(agent.choices)
         if choice != NO_CHANGE
-        for wind in (winds if choice == BLOW else [UNREAD[3:]])
+        for motion in (motions if choice == BLOW else [UNREAD[3:]])
     ]
     idle = NO_CHANGE in agent.choices
     count = len(done) * places + idle
@@ -158,8 +158,8 @@ def _discrete(agent: Agent) -> tuple[Tensor, Tensor]:
     table, weights = torch.cat([where, what], 1), []
     for number, choice in enumerate(agent.choices):
         first = next((place for place, one in enumerate(done) if one[0] == number), 0) * places
-        wind = (places, 3 * places) if choice == BLOW else (0, 0)
-        weights.append((0, 0, count - 1, 0, 0) if choice == NO_CHANGE else (1, columns, first, *wind))
+        motion = (places, 3 * places) if choice == BLOW else (0, 0)
+        weights.append((0, 0, count - 1, 0, 0) if choice == NO_CHANGE else (1, columns, first, *motion))
     if idle:
         nothing = (*UNREAD[:2], agent.choices.index(NO_CHANGE), *UNREAD[3:])
         table = torch.cat([table, torch.tensor([nothing])])
