@@ -153,4 +153,5 @@ THIRD_PARTIES: dict[str, Home] = {
     "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
     "click": Home(("cli",), ("cli",)),
     "matplotlib": Home(("experiments.bench", "experiments.studies", "cli"), ()),
+    "ray": Home(("experiments.studies.cluster",), ()),
 }

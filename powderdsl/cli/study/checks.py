@@ -58,13 +58,19 @@ class Call:
         return next(iter(self.all(option)), None)
 
 
-def check_study(study: Study, reporter: Reporter, find: Callable[[tuple[str, ...]], click.Command]) -> None:
+def check_study(
+    study: Study,
+    reporter: Reporter,
+    find: Callable[[tuple[str, ...]], click.Command],
+    *,
+    devices: bool = True,
+) -> None:
     """Report what a study's commands would refuse, measures that lead to no number, and settings that nothing uses.
 
     Args:
-        find: the command of some words.
+        find: the command of some words. devices: whether the study runs on this machine, with its devices.
     """
-    check = _StudyCheck(study, reporter, find)
+    check = _StudyCheck(study, reporter, find, devices)
     for step in study.steps:
         check.step(step)
     for measure in study.measures:
@@ -89,7 +95,14 @@ def _loaded(text: str, knobs: Pairs, params: Pairs, stamp: int) -> Task:
 class _StudyCheck:
     """The check of one study."""
 
-    def __init__(self, study: Study, reporter: Reporter, find: Callable[[tuple[str, ...]], click.Command]):
+    def __init__(
+        self,
+        study: Study,
+        reporter: Reporter,
+        find: Callable[[tuple[str, ...]], click.Command],
+        devices: bool,
+    ):
+        self.devices = devices
         self.places, self.reporter, self.find = Places(study, reporter), reporter, find
         self.report, self.told = self.places.report, self.places.told
         self.done: set[tuple[object, ...]] = set()
@@ -196,7 +209,7 @@ class _StudyCheck:
         from powderdsl.simulation.programs import find_device
 
         word = call.first("device")
-        if word is not None and self.first_time(word.step, "device", word.filled):
+        if self.devices and word is not None and self.first_time(word.step, "device", word.filled):
             with self.told(word):
                 find_device(word.filled)
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, write_json
+from powderdsl.experiments.runs.folder import ABOUT, held, new_folder, write_json
+from powderdsl.experiments.studies.claims import Claim, Claims, Held, Lost
 from powderdsl.experiments.studies.study import (
     FLAG,
     TEXT,
@@ -31,19 +32,23 @@ from powderdsl.experiments.studies.study import (
 )
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json
-from powderdsl.system.writing import failure
+from powderdsl.system.scratch import sweep
+from powderdsl.system.writing import failure, not_writable
 
-EVALUATION = "evaluation.json"
+EVALUATION, ABOUT_STUDY = "evaluation.json", "study.json"
 LOG_LINES = 6
+RETRY = 1.0
+"""Seconds between two attempts at points that other processes hold."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A finished point: its measures by name, or the problem."""
+    """A finished point: its measures by name, or the problem. `held`: the problem is that another process works on it."""
 
     point: Point
     values: Mapping[str, float]
     problem: str | None = None
+    held: bool = False
 
 
 class Canceled(Exception):
@@ -63,6 +68,9 @@ class StudyRun:
         self._running: set[subprocess.Popen[bytes]] = set()
         self._starting = threading.Lock()
         """Held while a process is started or all are ended, so that none escapes."""
+        self._claims = Claims()
+        self._undecided: set[Point] = set()
+        """Points that other processes hold, which may be dead."""
 
     def prepare(self) -> None:
         """Make the folder, or resume in it. Values, seeds and measures may have changed, but no step.
@@ -70,53 +78,67 @@ class StudyRun:
         Raises:
             CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
         """
-        # What its words mean follows from a step's command.
-        steps = [asdict(step) for step in self.study.steps]
-        decides: dict[str, Any] = {
-            "study": self.study.name,
-            "size": self.size,
-            "varied": [axis.name for axis in self.study.axes],
-            "steps": [{name: value for name, value in step.items() if name != "means"} for step in steps],
-        }
-        decides = json.loads(json.dumps(decides))  # as it will be read
-        if self.folder.is_dir():
-            check_folder(self.folder)
-        kept = self.folder / "study.json"
-        if kept.exists():
-            found = read_json(kept)
-            if not isinstance(found, dict) or any(found.get(key) != value for key, value in decides.items()):
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise not_writable(self.folder, error) from None
+        with held(self.folder, GRACE):  # others may begin the same study here
+            if not (self.folder / ABOUT_STUDY).exists():
+                new_folder(self.folder)
+            elif not self.is_prepared():
                 what = "another study, or this one as it was before its steps changed"
                 helps = ("choose another folder with `--out`",)
                 raise failure("PD621", f"{self.folder} holds {what}", helps=helps)
-        else:
-            new_folder(self.folder)
-        write_json(kept, {**decides, "text": self.study.text})
+            write_json(self.folder / ABOUT_STUDY, {**decides(self.study, self.size), "text": self.study.text})
+
+    def is_prepared(self) -> bool:
+        """Whether the folder holds this study."""
+        found = read_json(self.folder / ABOUT_STUDY)
+        wanted = decides(self.study, self.size)
+        return isinstance(found, dict) and all(found.get(key) == value for key, value in wanted.items())
 
     def run(
-        self, points: Sequence[Point], jobs: int, told: Callable[[Outcome], None] | None = None
+        self,
+        points: Sequence[Point],
+        jobs: int,
+        told: Callable[[Outcome], None] | None = None,
+        patience: float = 0.0,
     ) -> list[Outcome]:
         """Run points to their end, `jobs` at a time. Signals end all processes; the same call resumes them.
 
-        Raises:
-            CompileError: PD622 if another process runs a study in this folder.
+        Args:
+            patience: seconds to wait for points that other processes hold, once all others have ended. Where it is not
+                known whether such a process lives, the wait is as long as that takes.
         """
-        done: list[Outcome] = []
-        with held(self.folder):
-            pool = ThreadPoolExecutor(jobs)
-            try:
-                waiting: set[Future[Outcome]] = {pool.submit(self._point, point) for point in points}
-                while waiting:
-                    ended, waiting = wait(waiting, timeout=0.5, return_when=FIRST_COMPLETED)
-                    for one in ended:
-                        done.append(one.result())
-                        if told is not None:
-                            told(done[-1])
-            except BaseException:
-                self._end_all(pool)
-                raise
-            pool.shutdown()
-        order = {point: number for number, point in enumerate(points)}
-        return sorted(done, key=lambda outcome: order[outcome.point])
+        done: dict[Point, Outcome] = {}
+        waiting, end = list(points), 0.0
+        pool = ThreadPoolExecutor(jobs)
+        try:
+            while True:
+                for one in self._attempts(pool, waiting):
+                    done[one.point] = one
+                    if told is not None and not one.held:
+                        told(one)
+                waiting = [point for point in waiting if done[point].held]
+                end = end or time.monotonic() + patience
+                if not self._undecided.intersection(waiting) and (not waiting or time.monotonic() >= end):
+                    break
+                time.sleep(RETRY)
+        except BaseException:
+            self._end_all(pool)
+            raise
+        pool.shutdown()
+        if told is not None:
+            for point in waiting:
+                told(done[point])
+        return [done[point] for point in points]
+
+    def _attempts(self, pool: ThreadPoolExecutor, points: Sequence[Point]) -> Iterator[Outcome]:
+        """The outcome of each point, in the order in which they end."""
+        waiting: set[Future[Outcome]] = {pool.submit(self._point, point) for point in points}
+        while waiting:
+            ended, waiting = wait(waiting, timeout=0.5, return_when=FIRST_COMPLETED)
+            yield from (one.result() for one in ended)
 
     def _end_all(self, pool: ThreadPoolExecutor) -> None:
         """End all processes and wait for them to save. A second signal does not wait."""
@@ -137,33 +159,91 @@ class StudyRun:
                 with suppress(OSError):
                     process.send_signal(number)
 
-    def _point(self, point: Point) -> Outcome:
-        kept = self.folder / "done" / f"{point.name}.json"
-        place = self.folder / "runs" / point.name
-        # Values by where they come from: measures may change later, and runs may be deleted.
-        known = read_json(kept)
+    def finished(self, point: Point) -> Outcome | None:
+        """The outcome of a point whose steps are done here; None if they are not."""
         try:
-            if not isinstance(known, dict):
-                place.mkdir(parents=True, exist_ok=True)
-                kept.parent.mkdir(exist_ok=True)
-                for step in self.study.steps:
-                    problem = self._step(step, point, place)
-                    if problem is not None:
-                        return Outcome(point, {}, problem)
-                known = {}
-            values, found = {}, dict(known)
-            for one in self.study.measures:
-                key = "/".join((one.step, *one.keys))
-                if key not in found:
-                    found[key] = value_of(one, place / one.step, point, self.size)
-                values[one.name] = found[key]
-                if one.scale == "log" and not found[key] > 0:
-                    raise ValueError(f"{key} is {found[key]}; the scale `log` needs numbers above 0")
-            if found != known:
-                write_json(kept, found)
+            known = self._known(point)
+            return None if known is None else Outcome(point, self._values(point, known))
+        except ValueError as error:
+            return Outcome(point, {}, str(error))
+
+    def _point(self, point: Point) -> Outcome:
+        place = self.folder / "runs" / point.name
+        self._undecided.discard(point)
+        try:
+            known = self._known(point)
+            if known is not None and all(_key(one) in known for one in self.study.measures):
+                return Outcome(point, self._values(point, known))
+            place.mkdir(parents=True, exist_ok=True)
+            claim, elsewhere = self._claims.take(place)
+            with claim:
+                known = self._known(point)  # somebody may have finished it in between
+                if known is None:
+                    sweep(place)
+                    if elsewhere:
+                        self._forget_locks(place)
+                    for step in self.study.steps:
+                        problem = self._step(step, point, place, claim)
+                        if problem is not None:
+                            return Outcome(point, {}, problem)
+                    known = {}
+                values = self._values(point, known)
+                claim.check()
+                self._keep(point, known)
+                return Outcome(point, values)
+        except Held as error:
+            if not error.sure:
+                self._undecided.add(point)
+            return Outcome(point, {}, f"held by {error}", held=True)
+        except Lost as error:
+            self._undecided.add(point)
+            return Outcome(point, {}, f"lost: {error}", held=True)
         except (OSError, Canceled, ValueError) as error:
             return Outcome(point, {}, str(error) or "stopped")
-        return Outcome(point, values)
+
+    def _known(self, point: Point) -> dict[str, float] | None:
+        """The values of a finished point, by where they come from: measures may change, and runs may be deleted.
+
+        Raises:
+            ValueError: they are not numbers.
+        """
+        path = self.folder / "done" / f"{point.name}.json"
+        known = read_json(path)
+        if not isinstance(known, dict):
+            return None
+        if not all(is_number(value) for value in known.values()):
+            raise ValueError(f"{path} has values that are not numbers")
+        return known
+
+    def _values(self, point: Point, known: dict[str, float]) -> dict[str, float]:
+        """The measures of a finished point. Those that are not in `known` are read from its runs, and added there.
+
+        Raises:
+            ValueError: one is not there, or cannot be used.
+        """
+        values = {}
+        for one in self.study.measures:
+            key = _key(one)
+            if key not in known:
+                place = self.folder / "runs" / point.name
+                known[key] = value_of(one, place / one.step, point, self.size)
+            values[one.name] = known[key]
+            if one.scale == "log" and not known[key] > 0:
+                raise ValueError(f"{key} is {known[key]}; the scale `log` needs numbers above 0")
+        return values
+
+    def _keep(self, point: Point, known: Mapping[str, float]) -> None:
+        """Record that a point is done: from here on it is not run again."""
+        place, done = self.folder / "runs" / point.name, self.folder / "done"
+        done.mkdir(exist_ok=True)
+        # Written where nobody else writes, and moved in one step.
+        os.replace(write_json(place / "done.json", known), done / f"{point.name}.json")
+
+    def _forget_locks(self, place: Path) -> None:
+        """Remove the locks of a machine that is dead: a file server may keep them until it is started again."""
+        for step in self.study.steps:
+            with suppress(OSError):
+                (place / step.name / ".lock").unlink()
 
     def command(self, step: StudyStep, point: Point, place: Path) -> list[str]:
         """The words of a step's command for a point whose runs lie in `place`."""
@@ -193,7 +273,7 @@ class StudyRun:
             notes = (f"in the step `{step.name}`: {error}",)
             raise failure("PD112", f"the path `{word}` leaves the study's folder", notes=notes) from None
 
-    def _step(self, step: StudyStep, point: Point, place: Path) -> str | None:
+    def _step(self, step: StudyStep, point: Point, place: Path, claim: Claim) -> str | None:
         """Run a step. Returns the problem if it failed, else None."""
         if step.makes_run:
             self._wait_for_last_call(place / step.name)
@@ -215,12 +295,14 @@ class StudyRun:
                     start_new_session=True,  # Ctrl-C reaches us alone: we pass it on once
                 )
                 self._running.add(process)
+            claim.stop_if_lost(process.kill)
             try:
                 status = process.wait()
             finally:
                 self._running.discard(process)
                 assert process.stdin is not None
                 process.stdin.close()
+        claim.check()
         if status == 0:
             return None
         last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
@@ -237,8 +319,33 @@ class StudyRun:
                 continue
 
 
+def decides(study: Study, size: str) -> dict[str, Any]:
+    """What makes results those of one study, as JSON has it."""
+    # What its words mean follows from a step's command.
+    steps = [asdict(step) for step in study.steps]
+    found = {
+        "study": study.name,
+        "size": size,
+        "varied": [axis.name for axis in study.axes],
+        "steps": [{name: value for name, value in step.items() if name != "means"} for step in steps],
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(found))
+    return plain
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of a JSON file is a finite number."""
+    largest = sys.float_info.max
+    return isinstance(value, int | float) and not isinstance(value, bool) and -largest <= value <= largest
+
+
+def _key(measure: Measure) -> str:
+    """Where a measure's value comes from."""
+    return "/".join((measure.step, *measure.keys))
+
+
 def value_of(measure: Measure, run: Path, point: Point, size: str) -> float:
-    """A measure out of a run's evaluation. Raises ValueError where it is not there."""
+    """A measure out of a run's evaluation. Raises ValueError where it is not there, or not a number."""
     found: Any = read_json(run / EVALUATION)
     for key in measure.keys:
         word = filled(key, point, size)
@@ -248,6 +355,6 @@ def value_of(measure: Measure, run: Path, point: Point, size: str) -> float:
                 f"{run / EVALUATION} has no `{word}` for the measure `{measure.name}`: it has {there}"
             )
         found = found[word]
-    if isinstance(found, bool) or not isinstance(found, (int, float)):
-        raise ValueError(f"the measure `{measure.name}` is not a number in {run / EVALUATION}")
+    if not is_number(found):
+        raise ValueError(f"the measure `{measure.name}` is not a finite number in {run / EVALUATION}")
     return float(found)
