@@ -1,0 +1,161 @@
+"""Running a study on Ray: each point is a task, wherever there is room for it. The study's folder holds all state.
+
+Nodes share the storage of the folder. Ray repeats the task of a node that dies; a new driver repeats what was not done.
+Claims keep two tasks from working on the same point, whatever Ray believes about the first.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from powderdsl.experiments.studies.claims import LEASE
+from powderdsl.experiments.studies.run import ABOUT_STUDY, Outcome, StudyRun
+from powderdsl.experiments.studies.study import Point, Study, filled
+from powderdsl.system.interrupts import GRACE
+from powderdsl.system.reading import read_json
+from powderdsl.system.writing import failure
+
+RETRIES = 20
+"""How often Ray repeats the task of a node or process that died."""
+PATIENCE = LEASE + GRACE
+"""Seconds that a task waits for a process that holds its point: one of a dead driver's saves its last checkpoint."""
+AHEAD = 1000
+"""Tasks that are submitted at a time."""
+
+
+def require_ray() -> None:
+    """Raise CompileError (PD612) if Ray is not installed."""
+    if find_spec("ray") is None:
+        raise failure(
+            "PD612",
+            "running a study on a cluster needs Ray, which is not installed",
+            helps=("pip install 'powderdsl[ray]'", "or split the study: `--shard 1/4` to `--shard 4/4`"),
+        )
+
+
+def resources(study: Study, point: Point, size: str, threads: int) -> dict[str, float]:
+    """What Ray reserves for a point: a CPU core per thread, and a GPU if a step's `device` is a CUDA device."""
+    words = [
+        word for step in study.steps for name, words in step.options if name == "device" for word in words
+    ]
+    gpu = any(filled(word, point, size).strip().startswith("cuda") for word in words)
+    return {"num_cpus": threads, "num_gpus": 1 if gpu else 0}
+
+
+def run_on_ray(
+    run: StudyRun,
+    points: Sequence[Point],
+    address: str,
+    jobs: int | None,
+    told: Callable[[Outcome], None],
+    note: Callable[[str], None],
+) -> list[Outcome]:
+    """Run points to their end as Ray tasks. Signals end all of them; the same call resumes them.
+
+    Args:
+        address: of the cluster, as `ray.init` takes it. jobs: how many tasks there are at a time; None: as many as fit.
+        note: shows a sentence to the user.
+
+    Raises:
+        CompileError: PD612 without Ray, PD626 if there is no such cluster.
+    """
+    require_ray()
+    # Commands are run elsewhere, in other working directories.
+    study = replace(run.study, folder=run.study.folder.resolve(), places={})
+    folder = run.folder.resolve()
+    done: dict[Point, Outcome] = {}
+    with _connected(address) as ray:
+        for lacking in _lacking(ray, [resources(study, point, run.size, run.threads) for point in points]):
+            note(f"no node of the cluster has {lacking} yet: runs wait for one")
+        task = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD")(run_point)
+        waiting = list(reversed(points))
+        running: dict[Any, Point] = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < (jobs or AHEAD):
+                    point = waiting.pop()
+                    asked = resources(study, point, run.size, run.threads)
+                    name = f"{study.name} {point.name}"
+                    arguments = (study, str(folder), run.size, run.threads, point, _version())
+                    running[task.options(name=name, **asked).remote(*arguments)] = point
+                ended, _ = ray.wait(list(running), timeout=1.0)
+                for one in ended:
+                    point = running.pop(one)
+                    done[point] = _outcome(ray, one, point)
+                    told(done[point])
+        except BaseException:
+            for one in running:
+                with suppress(Exception):
+                    ray.cancel(one)
+            if running:
+                ray.wait(list(running), num_returns=len(running), timeout=GRACE)
+            raise
+    return [done[point] for point in points]
+
+
+def run_point(study: Study, folder: str, size: str, threads: int, point: Point, version: str) -> Outcome:
+    """Run a point on a node of the cluster."""
+    host = platform.node()
+    if version != _version():
+        return Outcome(point, {}, f"{host} has powderdsl {_version()}; {version} is needed")
+    run = StudyRun(study, Path(folder), size, threads)
+    found = read_json(Path(folder) / ABOUT_STUDY)
+    if not isinstance(found, dict) or found.get("text") != study.text or not run.is_prepared():
+        return Outcome(point, {}, f"{host} does not see {folder}: it must be on storage that all nodes share")
+    (outcome,) = run.run([point], 1, patience=PATIENCE)
+    return outcome
+
+
+def _lacking(ray: Any, asked: Sequence[dict[str, float]]) -> list[str]:
+    """What no node of a cluster has, however idle it is."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    found = {}
+    for kind, key, thing in (("num_cpus", "CPU", "CPU cores"), ("num_gpus", "GPU", "GPUs")):
+        wanted = max(one[kind] for one in asked)
+        if all(node.get(key, 0) < wanted for node in nodes):
+            found[key] = f"{wanted:g} {thing}"
+    return list(found.values())
+
+
+def _outcome(ray: Any, task: Any, point: Point) -> Outcome:
+    try:
+        found: Outcome = ray.get(task)
+    except Exception as error:  # whatever ended the task, the others continue
+        lines = str(error).strip().splitlines() or [""]
+        return Outcome(point, {}, f"{type(error).__name__}: {lines[-1].strip()[:300]}")
+    return found
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[Any]:
+    """The module `ray`, connected to a cluster. Raises CompileError (PD626)."""
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # it warns otherwise
+    ray = import_module("ray")
+    try:
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+    except Exception as error:
+        words = " ".join(str(error).split())[:400] or type(error).__name__
+        helps = (
+            "start one with `ray start --head`, and give its HOST:PORT",
+            "`ray status --address HOST:PORT` shows what it has",
+        )
+        raise failure("PD626", f"no Ray cluster at `{address}`", notes=(words,), helps=helps) from None
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _version() -> str:
+    found: str = sys.modules["powderdsl"].__version__  # our own package, so it has been imported
+    return found
