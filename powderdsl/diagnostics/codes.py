@@ -118,6 +118,8 @@ _ROWS = (
     ("PD623", "run-does-not-fit", _ERROR),
     ("PD624", "training-diverged", _ERROR),
     ("PD625", "invalid-network", _ERROR),
+    ("PD626", "no-cluster", _ERROR),
+    ("PD627", "results-differ", _ERROR),
     ("PD630", "invalid-dataset", _ERROR),
     ("PD631", "dataset-mismatch", _ERROR),
     ("PD640", "invalid-setting", _ERROR),

@@ -28,11 +28,14 @@ import powderdsl
 from powderdsl.analysis.ledger import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.datasets.manifest import read_manifest
-from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Severity
+from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Reporter, Severity, Source
 from powderdsl.diagnostics.codes import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.experiments.runs import does_not_fit, find_run, open_run
-from powderdsl.experiments.studies.file import load_study
+from powderdsl.experiments.studies.cluster import check_address
+from powderdsl.experiments.studies.collect import collected, read_folders
+from powderdsl.experiments.studies.file import load_study, read_study
+from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import TEXT
 from powderdsl.rl import preset
 from powderdsl.system.writing import replacing
@@ -276,6 +279,19 @@ def learn_too_fast() -> None:
     raise diverged(Path("runs/dunes"), 40, 0.5)
 
 
+def collect_different_results() -> None:
+    known = {("train",): {"on": TEXT, "run": TEXT, "steps": TEXT}}
+    text = "study: s\nseeds: 1\nvary: {steps: [100]}\nsteps: {t: {command: train, on: x, steps: $steps}}\n"
+    source = Source("study.yaml", text + "measures: {reward: {of: t, value: mean}}\n")
+    study = read_study(source, Reporter(), known)
+    for name, reward in (("one", 2.5), ("two", 3.0)):
+        StudyRun(study, Path(name), "small").prepare()
+        done = Path(name) / "done"
+        done.mkdir()
+        (done / "steps=100,seed=0.json").write_text(f'{{"t/mean": {reward}}}', encoding="utf-8")
+    collected(read_folders([Path("one"), Path("two")], known), list(study.points("small")))
+
+
 SITUATIONS: dict[str, Callable[[], object]] = {
     "PD101": lambda: powderdsl.load("rules/snd.yaml"),
     "PD102": read_a_large_file,
@@ -291,6 +307,8 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD623": use_a_run_that_does_not_fit,
     "PD624": learn_too_fast,
     "PD625": lambda: custom_network("nets:Deep"),
+    "PD626": lambda: check_address("127.0.0.1:1"),
+    "PD627": collect_different_results,
     "PD630": lambda: read_manifest(Path("recorded")),
     "PD631": record_with_another_seed,
     "PD640": lambda: preset("paper", "sand-pushing", batch=1),

@@ -183,6 +183,7 @@ def command(
         return OK
     if ray is not None:
         cluster.require_ray()
+        cluster.check_address(ray)
     run.prepare()
     try:
         outcomes = _with_progress(run, points, jobs, ray)

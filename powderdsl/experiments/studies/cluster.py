@@ -9,6 +9,8 @@ from __future__ import annotations
 import logging
 import os
 import platform
+import re
+import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -18,6 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.studies.claims import LEASE
 from powderdsl.experiments.studies.run import ABOUT_STUDY, Outcome, StudyRun
 from powderdsl.experiments.studies.study import Point, Study, filled
@@ -29,6 +32,12 @@ RETRIES = 20
 """How often Ray repeats the task of a node or process that died."""
 PATIENCE = LEASE + GRACE
 """Seconds that a task waits for a process that holds its point: one of a dead driver's saves its last checkpoint."""
+QUIET = {
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_BACKEND_LOG_LEVEL": "error",
+    "RAY_NUM_REDIS_GET_RETRIES": "2",
+}
+"""Environment of the driver, where the user has not set it: fewer warnings, and fewer attempts to connect."""
 AHEAD = 1000
 """Tasks that are submitted at a time."""
 
@@ -139,21 +148,36 @@ def _outcome(ray: Any, task: Any, point: Point) -> Outcome:
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
     """The module `ray`, connected to a cluster. Raises CompileError (PD626)."""
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # it warns otherwise
+    check_address(address)
+    for name, value in QUIET.items():
+        os.environ.setdefault(name, value)
     ray = import_module("ray")
     try:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:
-        words = " ".join(str(error).split())[:400] or type(error).__name__
-        helps = (
-            "start one with `ray start --head`, and give its HOST:PORT",
-            "`ray status --address HOST:PORT` shows what it has",
-        )
-        raise failure("PD626", f"no Ray cluster at `{address}`", notes=(words,), helps=helps) from None
+        raise _no_cluster(address, " ".join(str(error).split())[:400] or type(error).__name__) from None
     try:
         yield ray
     finally:
         ray.shutdown()
+
+
+def check_address(address: str) -> None:
+    """Raise CompileError (PD626) if nobody listens at an address. Ray itself would try for minutes."""
+    if address in ("auto", "local"):
+        return
+    match = re.fullmatch(r"(?:ray://)?\[?([^\s/\[\]]+)\]?:([0-9]{1,5})", address)
+    if match is None:
+        raise _no_cluster(address, "an address is `auto` or HOST:PORT")
+    try:
+        socket.create_connection((match[1], int(match[2])), timeout=10).close()
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise _no_cluster(address, getattr(error, "strerror", None) or str(error)) from None
+
+
+def _no_cluster(address: str, reason: str) -> CompileError:
+    helps = ("start one with `ray start --head`, which prints its address",)
+    return failure("PD626", f"no Ray cluster at `{address[:80]}`", notes=(reason,), helps=helps)
 
 
 def _version() -> str:

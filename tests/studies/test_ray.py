@@ -1,0 +1,201 @@
+"""Studies on Ray: what a cluster computes is what one machine computes, whoever dies on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.experiments.studies import cluster as on_cluster
+from powderdsl.experiments.studies.file import read_study
+from powderdsl.experiments.studies.study import TEXT, Study
+from powderdsl.system.scratch import is_scratch
+from tests.cli.commands import command_line, environment_with, powderdsl
+from tests.cli.endless import TASK
+from tests.processes import started, waited
+from tests.studies.ray_nodes import Nodes, cluster
+
+needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray: pip install 'powderdsl[ray]'")
+needs_proc = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="finds processes in /proc")
+
+RESULTS = ("results.md", "results.json", "figure.png")
+STUDY = """
+study: tiny
+about: Many small runs.
+seeds: {seeds}
+vary: {{steps: {steps}}}
+steps:
+  trained: {{command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: torch, steps: $steps, seed: $seed, checkpoint-every: 0}}
+  tested: {{command: evaluate, on: trained, episodes: 4, policies: "trained,random"}}
+measures:
+  reward: {{of: trained, value: splits/test/trained/mean, expect: rises}}
+"""
+
+
+def written(folder: Path, seeds: int, steps: list[int]) -> None:
+    (folder / "dig.yaml").write_text(TASK, encoding="utf-8")
+    (folder / "study.yaml").write_text(STUDY.format(seeds=seeds, steps=steps), encoding="utf-8")
+
+
+def run_study(folder: Path, *words: str, seconds: float = 900) -> subprocess.CompletedProcess[str]:
+    command = command_line("study", "study.yaml", *words)
+    options = {"capture_output": True, "text": True, "timeout": seconds, "check": False}
+    return subprocess.run(command, env=environment_with(), cwd=folder, **options)  # type: ignore[call-overload, no-any-return]
+
+
+def read(text: str) -> Study:
+    names = ("on", "run", "seed", "steps", "device", "policies", "episodes", "checkpoint-every")
+    names += ("preset", "envs", "rollout", "batch", "backend")
+    known = {("train",): dict.fromkeys(names, TEXT), ("evaluate",): dict.fromkeys(names[:-6], TEXT)}
+    del known["evaluate",]["run"]
+    return read_study(Source("study.yaml", text), Reporter(), known)
+
+
+def test_a_run_declares_what_it_needs() -> None:
+    text = STUDY.format(seeds=1, steps=[12]).replace("seed: $seed", "seed: $seed, device: cpu")
+    study, gpu = read(text), read(text.replace("device: cpu", "device: cuda"))
+    (point,) = study.points("small")
+    assert on_cluster.resources(study, point, "small", 2) == {"num_cpus": 2, "num_gpus": 0}
+    assert on_cluster.resources(gpu, point, "small", 1) == {"num_cpus": 1, "num_gpus": 1}
+
+
+def test_a_node_without_the_folder_runs_nothing(tmp_path: Path) -> None:
+    study = read(STUDY.format(seeds=1, steps=[12]))
+    (point,) = study.points("small")
+    folder = tmp_path / "elsewhere"
+    found = on_cluster.run_point(study, str(folder), "small", 1, point, on_cluster._version())
+    assert "it must be on storage that all nodes share" in str(found.problem)
+    assert not folder.exists()
+    found = on_cluster.run_point(study, str(folder), "small", 1, point, "0.0.1")
+    assert "0.0.1 is needed" in str(found.problem)
+
+
+def test_without_ray_the_user_learns_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path, 1, [12])
+    monkeypatch.setattr(on_cluster, "find_spec", lambda name: None)
+    result = powderdsl("study", "study.yaml", "--ray", "auto")
+    assert result.exit_code == 2
+    assert "pip install 'powderdsl[ray]'" in result.stderr
+    assert not (tmp_path / "studies").exists()
+
+
+@needs_ray
+@pytest.mark.parametrize("address", ["nonsense", "127.0.0.1:1", "127.0.0.1:99999", "", "ray://"])
+def test_where_no_cluster_is_the_user_is_told_at_once(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path, 1, [12])
+    result = powderdsl("study", "study.yaml", "--ray", address)
+    assert result.exit_code == 2
+    assert "error[PD626]" in result.stderr
+    assert not (tmp_path / "studies").exists()
+
+
+@pytest.mark.slow
+@needs_ray
+@needs_proc
+def test_a_cluster_runs_a_study(tmp_path: Path) -> None:
+    written(tmp_path, 1, [12, 24])
+    with cluster(1) as nodes:
+        found = run_study(tmp_path, "--out", "out", "--ray", nodes.address)
+    assert found.returncode == 0, found.stderr
+    results = json.loads((tmp_path / "out/results.json").read_text(encoding="utf-8"))
+    assert [one["problem"] for one in results["points"]] == [None, None]
+    again = run_study(tmp_path, "--out", "out")  # from what is there
+    assert (again.returncode, again.stdout) == (0, found.stdout)
+
+
+KILLS = ("worker", "worker", "worker", "worker", "node", "node", "node", "driver", "driver", "driver")
+
+
+@pytest.mark.campaign
+@needs_ray
+@needs_proc
+def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
+    """24 runs on two nodes, and ten kills at random moments: the table is that of an undisturbed study."""
+    written(tmp_path, 8, [300, 600, 900])
+    undisturbed = run_study(tmp_path, "--out", "undisturbed", seconds=3600)
+    assert undisturbed.returncode == 0, undisturbed.stderr
+    chance = random.Random(os.environ.get("POWDERDSL_KILLS", "powderdsl"))
+    kills = chance.sample(KILLS, len(KILLS))
+    done: dict[str, tuple[int, int]] = {}
+    with cluster(2) as nodes, ExitStack() as stack:
+        study = _Driver(tmp_path, nodes, stack)
+        node = nodes.started
+        for kill in kills:
+            assert waited(nodes.workers, 300), study.said()
+            time.sleep(chance.uniform(0.5, 12))
+            assert waited(nodes.workers, 300), study.said()
+            assert study.running.poll() is None, study.said()
+            match kill:
+                case "worker":
+                    os.kill(chance.choice(nodes.workers()), 9)
+                case "node":
+                    assert nodes.kill_node(node) > 1
+                    node = nodes.start_node()
+                case "driver":
+                    study.running.kill()
+                    study.running.wait()
+                    study.start()
+            print(f"killed a {kill}; done: {len(_finished(tmp_path / 'out'))}")
+            _compare(done, _finished(tmp_path / "out"))
+        study.running.wait(timeout=3600)
+        assert study.running.returncode == 0, study.said()
+    _compare(done, _finished(tmp_path / "out"))
+    assert len(done) == 24
+    for name in RESULTS:
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
+    for run in (tmp_path / "out/runs").glob("*"):
+        steps = list(_steps(run / "trained/metrics.jsonl"))
+        assert steps == list(range(12, steps[-1] + 1, 12)), run  # no line is lost or written twice
+        assert steps == list(_steps(tmp_path / "undisturbed/runs" / run.name / "trained/metrics.jsonl"))
+    left = [path for path in (tmp_path / "out").rglob("*") if is_scratch(path.name) or "claim-" in path.name]
+    assert left == []
+
+
+class _Driver:
+    """The process that submits the study, which may be killed and started again."""
+
+    def __init__(self, folder: Path, nodes: Nodes, stack: ExitStack):
+        self.folder, self.nodes, self.stack = folder, nodes, stack
+        self.start()
+
+    def start(self) -> None:
+        log = (self.folder / "driver.log").open("a", encoding="utf-8")
+        command = command_line("study", "study.yaml", "--out", "out", "--ray", self.nodes.address)
+        options = {"stdout": log, "stderr": log, "cwd": self.folder, "env": environment_with()}
+        self.running = self.stack.enter_context(started(command, **options))
+        log.close()
+
+    def said(self) -> str:
+        return (self.folder / "driver.log").read_text(encoding="utf-8")
+
+
+def _finished(folder: Path) -> dict[str, tuple[int, int]]:
+    found = {}
+    for path in folder.glob("done/*.json"):
+        about = path.stat()
+        found[path.name] = about.st_ino, about.st_mtime_ns
+    return found
+
+
+def _compare(before: dict[str, tuple[int, int]], now: dict[str, tuple[int, int]]) -> None:
+    """What is done stays done, and is not done again."""
+    assert {name: now.get(name) for name in before} == before
+    before.update(now)
+
+
+def _steps(metrics: Path) -> Iterator[int]:
+    for line in metrics.read_text(encoding="utf-8").splitlines():
+        yield json.loads(line)["step"]
