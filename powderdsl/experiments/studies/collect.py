@@ -68,22 +68,28 @@ def _told(outcome: Outcome) -> str:
 
 
 def _read(folder: Path, commands: Commands) -> StudyRun:
-    found = read_json(folder / ABOUT_STUDY)
-    if (
-        not isinstance(found, dict)
-        or not isinstance(found.get("text"), str)
-        or found.get("size") not in SIZES
-    ):
+    kept = folder / ABOUT_STUDY
+    if not kept.exists():
         why = f"it has no {ABOUT_STUDY}" if folder.is_dir() else "there is no such folder"
-        if (folder / ABOUT_STUDY).exists():
-            why = f"its {ABOUT_STUDY} is damaged"
         raise no_run(folder, why, ("give folders of results, those that `powderdsl study --out` named",))
+    damaged = no_run(folder, f"its {ABOUT_STUDY} is damaged")
+    found = read_json(kept)
+    if not isinstance(found, dict) or not _is_text(found.get("text")) or found.get("size") not in SIZES:
+        raise damaged
     check_folder(folder)
     source = Source(str(folder / ABOUT_STUDY), found["text"])
     run = StudyRun(read_study(source, Reporter(), commands), folder, found["size"])
     if not run.is_prepared():
-        raise no_run(folder, f"its {ABOUT_STUDY} is damaged")
+        raise damaged
     return run
+
+
+def _is_text(value: object) -> bool:
+    """Whether a value of a JSON file can be the text of a file: JSON also has halves of characters."""
+    try:
+        return isinstance(value, str) and bool(value.encode())
+    except UnicodeEncodeError:
+        return False
 
 
 def _bare(study: Study) -> Study:

@@ -33,7 +33,7 @@ from powderdsl.experiments.studies.study import (
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json
 from powderdsl.system.scratch import sweep
-from powderdsl.system.writing import failure, not_writable
+from powderdsl.system.writing import failure
 
 EVALUATION, ABOUT_STUDY = "evaluation.json", "study.json"
 LOG_LINES = 6
@@ -78,18 +78,19 @@ class StudyRun:
         Raises:
             CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise not_writable(self.folder, error) from None
-        with held(self.folder, GRACE):  # others may begin the same study here
-            if not (self.folder / ABOUT_STUDY).exists():
+        kept = self.folder / ABOUT_STUDY
+        if not kept.exists():
+            try:
                 new_folder(self.folder)
-            elif not self.is_prepared():
+            except CompileError:
+                if not kept.exists():  # else somebody has just begun the same study
+                    raise
+        with held(self.folder, GRACE):
+            if kept.exists() and not self.is_prepared():
                 what = "another study, or this one as it was before its steps changed"
                 helps = ("choose another folder with `--out`",)
                 raise failure("PD621", f"{self.folder} holds {what}", helps=helps)
-            write_json(self.folder / ABOUT_STUDY, {**decides(self.study, self.size), "text": self.study.text})
+            write_json(kept, {**decides(self.study, self.size), "text": self.study.text})
 
     def is_prepared(self) -> bool:
         """Whether the folder holds this study."""

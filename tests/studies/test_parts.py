@@ -1,0 +1,378 @@
+"""Studies in parts: selections and shards, points that others hold, and results merged out of several folders."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from powderdsl.cli.commands.study import commands
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.study.selection import SHARD, part, selected
+from powderdsl.experiments.studies import claims, run
+from powderdsl.experiments.studies.claims import LEASE, Claim, Claims
+from powderdsl.experiments.studies.file import load_study
+from powderdsl.experiments.studies.run import Outcome, StudyRun
+from powderdsl.experiments.studies.study import Point, StudyStep
+from tests.cli.commands import command_line, environment_with, powderdsl
+from tests.cli.endless import TASK
+
+STUDY = """
+study: patience
+about: Longer training, more reward.
+seeds: 2
+vary:
+  steps: {about: interactions, small: [100, 200, 300], paper: [1000]}
+  obstacles: {small: [none, some], paper: [none], sets: {none: {lines: 0}, some: {lines: 5}}}
+steps:
+  trained: {command: train, on: sand-pushing, steps: $steps, knob: lines=$lines, seed: $seed}
+  tested: {command: evaluate, on: trained, episodes: 4}
+measures:
+  reward: {of: trained, value: splits/test/trained/mean, about: mean reward, expect: rises}
+"""
+RESULTS = ("results.md", "results.json", "figure.png")
+POINTS = 12
+
+
+@pytest.fixture
+def steps_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Work in a folder with `study.yaml`, whose steps write a number at once. The names of the points that were run."""
+    found: list[str] = []
+
+    def step(self: StudyRun, step: StudyStep, point: Point, place: Path, claim: Claim) -> None:
+        folder = place / "trained"
+        folder.mkdir(exist_ok=True)
+        reward = int(dict(point.values)["steps"]) / 100 + 0.1 * point.seed + len(dict(point.sets)["lines"])
+        about = {"splits": {"test": {"trained": {"mean": reward}}}}
+        (folder / "evaluation.json").write_text(json.dumps(about), encoding="utf-8")
+        if step.name == "tested":
+            found.append(point.name)
+
+    monkeypatch.setattr(StudyRun, "_step", step)
+    monkeypatch.chdir(tmp_path)
+    Path("study.yaml").write_text(STUDY, encoding="utf-8")
+    return found
+
+
+@pytest.fixture
+def quick(steps_run: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figures."""
+    monkeypatch.setattr("powderdsl.cli.commands.study.find_spec", lambda name: None)
+
+
+def contents(folder: str) -> list[bytes]:
+    return [(Path(folder) / name).read_bytes() for name in RESULTS]
+
+
+# Selections
+
+
+@pytest.mark.parametrize("of", [1, 2, 3, 5, 12, 13, 40])
+def test_shards_are_all_points_each_once(of: int, tmp_path: Path) -> None:
+    (tmp_path / "study.yaml").write_text(STUDY, encoding="utf-8")
+    study = load_study(str(tmp_path / "study.yaml"), commands())
+    points = selected(study, "small", None, ())
+    shards = [part(points, (number, of)) for number in range(1, of + 1)]
+    assert [point for shard in shards for point in shard] == points
+    assert max(map(len, shards)) - min(map(len, shards)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("only", "count"),
+    [
+        (["steps=100"], 4),
+        (["steps=100,300"], 8),
+        (["steps=100", "steps=300"], 8),
+        (["steps=100,200", "seed=1"], 4),
+        (["seed=0,1"], 12),
+        (["obstacles=some", "seed=1"], 3),
+        (["lines=5"], 6),
+        (["lines=5", "obstacles=none"], "no combination has lines=5 and obstacles=none"),
+        (["steps=150"], "`steps` has no value `150` here"),
+        (["seed=2"], "`seed` has no value `2` here"),
+        (["steps"], "write NAME=VALUE"),
+        (["stpes=100"], "with one of steps, obstacles, lines, seed as NAME"),
+        (["steps="], "`steps` has no value ``"),
+    ],
+)
+def test_only_selects_settings_and_seeds(only: list[str], count: int | str, tmp_path: Path) -> None:
+    (tmp_path / "study.yaml").write_text(STUDY, encoding="utf-8")
+    study = load_study(str(tmp_path / "study.yaml"), commands())
+    if isinstance(count, int):
+        assert len(selected(study, "small", None, only)) == count
+        return
+    with pytest.raises(BadInput) as caught:
+        selected(study, "small", None, only)
+    assert count in caught.value.message
+
+
+@pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2", "1/99999999", ""])
+def test_a_wrong_shard_is_told(text: str, steps_run: list[str]) -> None:
+    result = powderdsl("study", "study.yaml", "--shard", text)
+    assert result.exit_code == 2
+    assert "is not a part: write 1/4" in result.stderr
+    assert steps_run == []
+
+
+def test_a_shard_is_read() -> None:
+    assert SHARD.convert("2/7", None, None) == (2, 7)
+
+
+# Shards and `collect`
+
+
+def test_shards_in_folders_of_their_own_are_collected(steps_run: list[str]) -> None:
+    whole = powderdsl("study", "study.yaml", "--out", "whole")
+    assert whole.exit_code == 0
+    assert len(steps_run) == POINTS
+    for number in (1, 2, 3):
+        found = powderdsl("study", "study.yaml", "--shard", f"{number}/3", "--out", f"part{number}")
+        assert found.exit_code == 0
+        assert "other parts have 8 combinations that are not done in part" in found.stdout
+        assert not Path(f"part{number}/results.md").exists()
+    assert len(steps_run) == 2 * POINTS
+    collected = powderdsl("study", "collect", "part2", "part1", "part3", "--out", "all")
+    assert collected.exit_code == 0
+    assert contents("all") == contents("whole")
+    assert collected.stdout == whole.stdout.replace("whole/", "all/")
+    again = powderdsl("study", "collect", "part2", "part1", "part3", "whole")
+    assert again.exit_code == 0
+    assert contents("part2") == contents("whole")  # the first folder
+
+
+def test_the_last_shard_in_a_common_folder_writes_the_table(steps_run: list[str]) -> None:
+    powderdsl("study", "study.yaml", "--out", "whole")
+    for number in (2, 1):
+        assert not Path("common/results.md").exists()
+        assert powderdsl("study", "study.yaml", "--shard", f"{number}/2", "--out", "common").exit_code == 0
+    assert contents("common") == contents("whole")
+
+
+def test_collect_takes_the_same_selection(steps_run: list[str]) -> None:
+    chosen = ("--only", "steps=100,300", "--seeds", "3")
+    assert powderdsl("study", "study.yaml", "--out", "whole", *chosen).exit_code == 0
+    for number in (1, 2):
+        powderdsl("study", "study.yaml", "--out", f"part{number}", "--shard", f"{number}/2", *chosen)
+    assert powderdsl("study", "collect", "part1", "part2", "--out", "all", *chosen).exit_code == 0
+    assert contents("all") == contents("whole")
+
+
+def test_collect_tells_what_is_missing(steps_run: list[str], quick: None) -> None:
+    powderdsl("study", "study.yaml", "--out", "part", "--shard", "1/2")
+    result = powderdsl("study", "collect", "part", "--out", "all")
+    assert result.exit_code == 1
+    assert "6 combinations did not finish" in result.stderr
+    text = Path("all/results.md").read_text(encoding="utf-8")
+    assert text.count("not done in any of these folders") == 6
+
+
+def test_collect_needs_results_of_one_study(steps_run: list[str], quick: None) -> None:
+    powderdsl("study", "study.yaml", "--out", "one")
+    Path("study.yaml").write_text(STUDY.replace("of: trained", "scale: log, of: trained"), encoding="utf-8")
+    powderdsl("study", "study.yaml", "--out", "two")
+    Path("plain").mkdir()
+    for folders, code in (
+        (("one", "two"), "PD621"),
+        (("plain",), "PD620"),
+        (("one", "nowhere"), "PD620"),
+    ):
+        result = powderdsl("study", "collect", *folders, "--out", "all")
+        assert result.exit_code == 2
+        assert f"error[{code}]" in result.stderr
+    assert powderdsl("study", "collect").exit_code == 2
+    assert not Path("all").exists()
+
+
+def test_collect_refuses_two_results_of_one_point(steps_run: list[str], quick: None) -> None:
+    powderdsl("study", "study.yaml", "--out", "one")
+    powderdsl("study", "study.yaml", "--out", "two")
+    path = Path("two/done/steps=200,obstacles=some,seed=1.json")
+    path.write_text(json.dumps({"trained/splits/test/trained/mean": 99.0}), encoding="utf-8")
+    result = powderdsl("study", "collect", "one", "two", "--out", "all")
+    assert result.exit_code == 2
+    assert (
+        "error[PD625]: one and two have different results of steps=200,obstacles=some,seed=1" in result.stderr
+    )
+
+
+@pytest.mark.parametrize(
+    "value", ['"5"', "NaN", "1e999", "1" + "0" * 400, "true", "null", "[1]", '{"a": 1}', '"\\u001b[2J"']
+)
+def test_results_of_strangers_are_numbers(value: str, quick: None) -> None:
+    powderdsl("study", "study.yaml", "--out", "one")
+    path = Path("one/done/steps=100,obstacles=none,seed=0.json")
+    path.write_text(f'{{"trained/splits/test/trained/mean": {value}}}', encoding="utf-8")
+    for words in (("collect", "one"), ("study.yaml", "--out", "one")):
+        result = powderdsl("study", *words)
+        assert result.exit_code == 1
+        assert "values that are not numbers" in Path("one/results.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"size": "small"', '"size": "../x"'),
+        ('"size": "small"', '"size": ["small"]'),
+        ('"text": "', '"text": "]'),
+        ('"text": "', '"text": "\\ud800'),
+        ('"text": "', '"text": "\\u0000'),
+        ('"text": "', '"txet": "'),
+        ("sand-pushing", "../sand-pushing.yaml"),
+        ("about: Longer", "about: \\u001b[2J"),
+    ],
+)
+def test_results_of_strangers_have_a_right_study(old: str, new: str, quick: None) -> None:
+    powderdsl("study", "study.yaml", "--out", "one")
+    path = Path("one/study.json")
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    result = powderdsl("study", "collect", "one", "--out", "all")
+    assert result.exit_code == 2
+    assert "error[PD" in result.stderr
+    assert "\x1b" not in result.stderr
+    assert not Path("all").exists()
+
+
+def test_collect_follows_no_link_out_of_a_folder(quick: None, tmp_path: Path) -> None:
+    powderdsl("study", "study.yaml", "--out", "one")
+    os.rename("one/done", "elsewhere")
+    Path("one/done").symlink_to(tmp_path / "elsewhere")
+    result = powderdsl("study", "collect", "one")
+    assert result.exit_code == 2
+    assert "PD112" in result.stderr
+
+
+# Points that others hold
+
+
+def test_points_that_others_hold_are_left_to_them(steps_run: list[str], quick: None) -> None:
+    prepared("out")
+    place = Path("out/runs/steps=200,obstacles=none,seed=1")
+    place.mkdir()
+    with Claims().take(place)[0]:
+        result = powderdsl("study", "study.yaml", "--out", "out")
+        assert result.exit_code == 1
+        assert "the study is not complete: other processes hold 1 combination" in result.stderr
+        assert f"{place.name}: held by " in result.stderr
+        assert len(steps_run) == POINTS - 1
+        assert place.name not in steps_run
+        assert not Path("out/results.md").exists()
+    assert powderdsl("study", "study.yaml", "--out", "out").exit_code == 0
+    assert steps_run[-1] == place.name
+    assert len(steps_run) == POINTS
+
+
+def prepared(folder: str) -> tuple[StudyRun, Point, Path]:
+    study = load_study("study.yaml", commands())
+    found = StudyRun(study, Path(folder), "small")
+    found.prepare()
+    point = next(study.points("small"))
+    place = Path(folder) / "runs" / point.name
+    place.mkdir(parents=True)
+    return found, point, place
+
+
+def test_patience_waits_for_who_is_about_to_end(
+    steps_run: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "RETRY", 0.01)
+    study, point, place = prepared("out")
+    claim, _ = Claims().take(place)
+    held = threading.Event()
+    taken = claims.Claims.take
+
+    def take(self: Claims, folder: Path) -> tuple[Claim, bool]:
+        try:
+            return taken(self, folder)
+        except claims.Held:
+            held.set()
+            raise
+
+    monkeypatch.setattr(claims.Claims, "take", take)
+
+    def end() -> None:
+        with claim:
+            assert held.wait(30)
+
+    thread = threading.Thread(target=end)
+    thread.start()
+    (found,) = study.run([point], 1, patience=30)
+    thread.join()
+    assert found.problem is None
+
+
+def test_the_point_of_a_dead_machine_is_taken_over_with_its_locks(
+    steps_run: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file server may keep the lock of a dead machine: the file makes way, whoever holds it."""
+    monkeypatch.setattr(run, "RETRY", 0.01)
+    now = [0.0]
+
+    def clock() -> float:
+        now[0] += LEASE / 10
+        return now[0]
+
+    study, point, place = prepared("out")
+    (place / "trained").mkdir()
+    (place / "trained" / ".lock").touch()
+    about = {"machine": "another", "host": "node7", "pid": 7, "locked": True}
+    (place / "claim-000001").write_text(json.dumps(about), encoding="utf-8")
+    monkeypatch.setattr(claims, "_clock", clock)
+    monkeypatch.setattr(claims, "BEAT", 3600)
+    monkeypatch.setattr(claims.Claim, "check", lambda self: None)  # the clock runs fast
+    told: list[Outcome] = []
+    (found,) = study.run([point], 1, told.append)
+    assert found.problem is None
+    assert told == [found]
+    assert not (place / "trained" / ".lock").exists()
+    assert not list(place.glob("claim-*"))
+
+
+def test_who_has_lost_a_point_keeps_nothing(steps_run: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an owner computes after others have taken over is not kept; it then waits for them."""
+    monkeypatch.setattr(run, "RETRY", 0.01)
+    study, point, _ = prepared("out")
+    usual: Callable[..., None] = StudyRun._step
+
+    def step(self: StudyRun, step: StudyStep, point: Point, place: Path, claim: Claim) -> None:
+        usual(self, step, point, place, claim)
+        if step.name == "tested" and len(steps_run) == 1:
+            claim._lost.set()  # as its thread does
+            claim.path.unlink()
+            assert not (place.parents[1] / "done").exists()
+
+    monkeypatch.setattr(StudyRun, "_step", step)
+    (found,) = study.run([point], 1)
+    assert found.problem is None
+    assert len(steps_run) == 2
+
+
+@pytest.mark.slow
+def test_two_processes_and_collect_give_the_table_of_one(tmp_path: Path) -> None:
+    (tmp_path / "dig.yaml").write_text(TASK, encoding="utf-8")
+    text = STUDY.replace("[100, 200, 300]", "[12, 24]").replace("small: [none, some]", "small: [none]")
+    text = text.replace("seeds: 2", "seeds: 1").replace("on: sand-pushing", "on: dig.yaml")
+    text = text.replace("knob: lines=$lines", "preset: small, envs: 4, rollout: 3, batch: 12, backend: torch")
+    text = text.replace("sets: {none: {lines: 0}, some: {lines: 5}}", "sets: {none: {episodes: 4}}")
+    text = text.replace("episodes: 4}\n", "episodes: $episodes}\n")
+    (tmp_path / "study.yaml").write_text(text, encoding="utf-8")
+
+    def begin(*words: str) -> subprocess.Popen[str]:
+        command = command_line("study", *words)
+        quiet = subprocess.DEVNULL
+        return subprocess.Popen(
+            command, cwd=tmp_path, env=environment_with(), text=True, stdout=quiet, stderr=quiet
+        )
+
+    parts = [begin("study.yaml", "--shard", f"{number}/2", "--out", f"part{number}") for number in (1, 2)]
+    assert [one.wait(timeout=240) for one in parts] == [0, 0]
+    assert begin("collect", "part1", "part2", "--out", "all").wait(timeout=60) == 0
+    assert begin("study.yaml", "--out", "whole").wait(timeout=240) == 0
+    for name in RESULTS:
+        assert (tmp_path / "all" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
