@@ -37,8 +37,8 @@ $(VENV)/.core: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/.ready: $(VENV)/.core
-	@echo "setting up $(VENV): tools for tests, checks, training and video"
-	@$(INSTALL) --no-build-isolation --editable '.[dev,rl,sb3-contrib,torchrl,video]'
+	@echo "setting up $(VENV): tools for tests, checks, training, video and clusters"
+	@$(INSTALL) --no-build-isolation --editable '.[dev,rl,sb3-contrib,torchrl,video,ray]'
 	@touch $@
 
 setup: $(VENV)/.ready  ## make .venv with everything a developer needs

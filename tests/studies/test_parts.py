@@ -196,7 +196,7 @@ def test_collect_refuses_two_results_of_one_point(steps_run: list[str], quick: N
     result = powderdsl("study", "collect", "one", "two", "--out", "all")
     assert result.exit_code == 2
     assert (
-        "error[PD625]: one and two have different results of steps=200,obstacles=some,seed=1" in result.stderr
+        "error[PD627]: one and two have different results of steps=200,obstacles=some,seed=1" in result.stderr
     )
 
 

@@ -41,7 +41,7 @@ def collected(runs: Sequence[StudyRun], points: Sequence[Point]) -> list[Outcome
     """The outcome of each point, from the folders that have it; the problem where none has it.
 
     Raises:
-        CompileError: PD625 if folders have different results of a point.
+        CompileError: PD627 if folders have different results of a point.
     """
     return [_outcome(runs, point) for point in points]
 
@@ -55,7 +55,7 @@ def _outcome(runs: Sequence[StudyRun], point: Point) -> Outcome:
     for other, another in good[1:]:
         if another != outcome:
             raise failure(
-                "PD625",
+                "PD627",
                 f"{folder} and {other} have different results of {point.name}",
                 notes=(f"{folder}: {_told(outcome)}", f"{other}: {_told(another)}"),
                 helps=(f"remove done/{point.name}.json from one of them, or leave that folder out",),
