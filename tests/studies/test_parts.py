@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import threading
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from powderdsl.cli.commands.study import command as study_command
 from powderdsl.cli.commands.study import commands
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.study.selection import SHARD, part, selected
@@ -19,7 +21,7 @@ from powderdsl.experiments.studies.claims import LEASE, Claim, Claims
 from powderdsl.experiments.studies.file import load_study
 from powderdsl.experiments.studies.run import Outcome, StudyRun
 from powderdsl.experiments.studies.study import Point, StudyStep
-from tests.cli.commands import command_line, environment_with, powderdsl
+from tests.cli.commands import ROOT, command_line, environment_with, powderdsl
 from tests.cli.endless import TASK
 
 STUDY = """
@@ -351,6 +353,36 @@ def test_who_has_lost_a_point_keeps_nothing(steps_run: list[str], monkeypatch: p
     (found,) = study.run([point], 1)
     assert found.problem is None
     assert len(steps_run) == 2
+
+
+def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8")
+    script = next(block for block in page.split("```") if "#SBATCH" in block).removeprefix("text\n")
+    jobs = re.search(r"--array=1-(\d+)\n", script)
+    assert jobs
+    called = tmp_path / "powderdsl"
+    called.write_text('#!/bin/sh\necho "$@"\n', encoding="utf-8")
+    called.chmod(0o755)
+    known = commands()
+    found = []
+    for job in range(1, int(jobs[1]) + 1):
+        slurm = {
+            "SLURM_ARRAY_TASK_ID": str(job),
+            "SLURM_ARRAY_TASK_COUNT": jobs[1],
+            "SLURM_CPUS_PER_TASK": "2",
+        }
+        environment = {**os.environ, **slurm, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+        said = subprocess.run(
+            ["bash", "-c", script], env=environment, capture_output=True, text=True, check=True
+        )
+        words = said.stdout.split()
+        assert words[0] == "study"
+        options = dict(zip(words[2::2], words[3::2], strict=True))
+        assert set(options) <= {name for one in study_command.params for name in one.opts}
+        points = selected(load_study(words[1], known), options["--size"], None, ())
+        found.append(part(points, SHARD.convert(options["--shard"], None, None)))
+    assert all(len(points) == 1 for points in found)
+    assert [points[0] for points in found] == list(load_study("start-states", known).points("paper"))
 
 
 @pytest.mark.slow
