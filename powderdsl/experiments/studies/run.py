@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs.folder import ABOUT, held, new_folder, write_json
+from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, write_json
 from powderdsl.experiments.studies.claims import Claim, Claims, Held, Lost
 from powderdsl.experiments.studies.study import (
     FLAG,
@@ -80,6 +80,8 @@ class StudyRun:
         """
         kept = self.folder / ABOUT_STUDY
         if not kept.exists():
+            if self.folder.is_dir():
+                check_folder(self.folder)
             try:
                 new_folder(self.folder)
             except CompileError:
