@@ -242,6 +242,10 @@ def marked(page: Path) -> Any:
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("page", [marked(page) for page in PAGES if runnable(page)])
 def test_blocks_run(page: Path, folder: Path) -> None:
+    run_page(page)
+
+
+def run_page(page: Path) -> None:
     namespace: dict[str, Any] = {"__name__": "documentation"}
     missing = []
     for block in blocks_of(read(page)):
@@ -252,7 +256,7 @@ def test_blocks_run(page: Path, folder: Path) -> None:
         try:
             run_block(block, namespace)
         except BaseException as error:
-            error.add_note(f"in the {block.language} block at {page_name(page)}:{block.line}")
+            error.add_note(f"in the {block.language} block at {page}:{block.line}")
             raise
     if missing:
         pytest.skip(f"not installed: {', '.join(dict.fromkeys(missing))}")
@@ -336,6 +340,16 @@ def test_every_table_of_keys_is_shown(generate: Any) -> None:
 def test_blocks_can_fail(language: str, text: str, folder: Path) -> None:
     with pytest.raises((AssertionError, CompileError)):
         run_block(Block(language, text, 1), {})
+
+
+def test_a_page_without_an_optional_dependency_is_skipped_visibly(folder: Path) -> None:
+    page = folder / "page.md"
+    page.write_text(
+        "```python\n# needs: no_such_module\nassert False\n```\n```python\n__import__('pathlib').Path('ran').touch()\n```\n"
+    )
+    with pytest.raises(pytest.skip.Exception, match="not installed: no_such_module"):
+        run_page(page)
+    assert Path("ran").exists()
 
 
 def test_a_wrong_test_of_a_pack_fails(folder: Path) -> None:
