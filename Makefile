@@ -38,7 +38,7 @@ $(VENV)/.core: pyproject.toml constraints.txt
 
 $(VENV)/.ready: $(VENV)/.core
 	@echo "setting up $(VENV): tools for tests, checks, training, video and clusters"
-	@$(INSTALL) --no-build-isolation --editable '.[dev,rl,sb3-contrib,torchrl,video,ray]'
+	@$(INSTALL) --no-build-isolation --editable '.[dev,minari,ray,rl,sb3-contrib,torchrl,video]'
 	@touch $@
 
 setup: $(VENV)/.ready  ## make .venv with everything a developer needs

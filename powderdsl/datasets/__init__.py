@@ -6,12 +6,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from powderdsl.datasets.dataset import Dataset
+    from powderdsl.datasets.minari import from_minari, to_minari
     from powderdsl.datasets.recorder import record
     from powderdsl.datasets.transitions import Transitions, split
 
-__all__ = ["Dataset", "Transitions", "record", "split"]
+__all__ = ["Dataset", "Transitions", "from_minari", "record", "split", "to_minari"]
 
-_HOMES = {"Dataset": "dataset", "Transitions": "transitions", "record": "recorder", "split": "transitions"}
+_HOMES = {
+    "Dataset": "dataset",
+    "Transitions": "transitions",
+    "from_minari": "minari",
+    "record": "recorder",
+    "split": "transitions",
+    "to_minari": "minari",
+}
 
 
 def __getattr__(name: str) -> Any:

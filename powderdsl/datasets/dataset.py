@@ -23,7 +23,7 @@ from powderdsl.datasets.manifest import (
     read_manifest,
     recipe_of,
 )
-from powderdsl.datasets.shards import DTYPES, Shard, open_shard, read_episodes, row_shape
+from powderdsl.datasets.shards import DTYPES, Shard, knows_ids, open_shard, read_episodes, row_shape
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.system.random import MASK, base_keys, mix
@@ -150,7 +150,7 @@ class Dataset:
             self._shards.pop(number, None)
             try:
                 shard = self._shard(number)
-                if not self._known_ids(shard):
+                if not knows_ids(self.recipe, shard.arrays["observation"]):
                     raise damaged(
                         f"the shard {self.folder / row.file} is damaged", "it has ids that its palette lacks"
                     )
@@ -158,13 +158,6 @@ class Dataset:
                 found.extend(error.diagnostics)
         if found:
             raise CompileError(found)
-
-    def _known_ids(self, shard: Shard) -> bool:
-        known = np.zeros(256, bool)
-        known[[int(number) for number in self.recipe.palette]] = True
-        where = self.recipe.channels.index("element") if "element" in self.recipe.channels else 0
-        rows = shard.arrays["observation"][:, where]
-        return all(bool(known[rows[at : at + 256]].all()) for at in range(0, len(rows), 256))
 
     def episode(self, number: int) -> Episode:
         """One episode. Raises IndexError."""

@@ -226,26 +226,33 @@ def read_manifest(folder: Path) -> Manifest:
             f"{path} has the version {_short(data.get('version'))}", f"this powderdsl reads {VERSION}"
         )
     problems = [f"`{key}` must be {rule.says}" for key, rule in _TOP.items() if not rule.holds(data.get(key))]
-    recipe, rules = data.get("recipe"), _rules_of(Recipe)
-    recipe = recipe if isinstance(recipe, dict) else {}
-    if recipe:
-        problems += [
-            f"`recipe.{key}` must be {rule.says}, found {_short(recipe.get(key))}"
-            for key, rule in rules.items()
-            if not rule.holds(recipe.get(key))
-        ]
-        problems += [f"`recipe.{_short(key)}` is unknown" for key in recipe if key not in rules]
-    if problems:
+    checked = checked_recipe(data.get("recipe"), problems)
+    rows = [] if problems or checked is None else _rows(checked, data["shards"], problems)
+    if problems or checked is None:
         raise many_damaged(path, problems)
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in recipe.items()}
     if data["version"] == 1:
-        values |= dict.fromkeys(FINGERPRINTS, "")
-    checked = Recipe(**values)
-    problems = list(_misfits(checked))
-    rows = [] if problems else _rows(checked, data["shards"], problems)
-    if problems:
-        raise many_damaged(path, problems)
+        checked = replace(checked, task_fingerprint="", ruleset_fingerprint="")
     return Manifest(checked, data["created"], tuple(rows))
+
+
+def checked_recipe(data: Any, problems: list[str]) -> Recipe | None:
+    """A recipe as a file has it, every value checked; what is wrong with it is added to `problems`."""
+    recipe, rules = data if isinstance(data, dict) else {}, _rules_of(Recipe)
+    found = [
+        f"`recipe.{key}` must be {rule.says}, found {_short(recipe.get(key))}"
+        for key, rule in rules.items()
+        if recipe and not rule.holds(recipe.get(key))
+    ]
+    found += [f"`recipe.{_short(key)}` is unknown" for key in recipe if key not in rules]
+    problems += found
+    if found or not recipe:
+        return None
+    values: dict[str, Any] = {
+        key: tuple(one) if isinstance(one, list) else one for key, one in recipe.items()
+    }
+    checked = Recipe(**values)
+    problems += _misfits(checked)
+    return checked
 
 
 def check_place(folder: Path) -> None:

@@ -133,8 +133,8 @@ def record(
     sight = observation_of(sees or observation, env.simulator, env.task.size)
     act = SCRIPTED[policy](env.program) if isinstance(policy, str) else policy
     place = Path(folder)
-    with _held(place):
-        recording = _Recording(env, act, sight, place, _begun(place, recipe))
+    with held_place(place):
+        recording = _Recording(env, act, sight, place, begun(place, recipe))
         recording.play(envs, progress or (lambda done, total: None))
     return Dataset.open(place)
 
@@ -143,7 +143,7 @@ def record(
 
 
 @contextmanager
-def _held(folder: Path) -> Iterator[None]:
+def held_place(folder: Path) -> Iterator[None]:
     """Make the folder and lock it."""
     check_place(folder)
     try:
@@ -154,7 +154,7 @@ def _held(folder: Path) -> Iterator[None]:
         yield
 
 
-def _begun(folder: Path, recipe: Recipe) -> Manifest:
+def begun(folder: Path, recipe: Recipe) -> Manifest:
     """The manifest to continue with: a new one, or the one of the same recipe with its intact shards."""
     for left in sorted([*folder.glob(".shard-*.npz"), *folder.glob(".dataset-*.json")]):
         left.unlink(missing_ok=True)  # of a process that was killed

@@ -122,9 +122,9 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
     with _defects(path):
         _check_size(path, row)
         if not is_whole(folder, row):
-            raise _Wrong("its SHA-256 is another than the manifest's")
+            raise Defect("its SHA-256 is another than the manifest's")
         shard = _read(path, shapes(recipe, row.number, row.transitions))
-        _check_episodes(shard.arrays, recipe)
+        check_episodes(shard.arrays, recipe)
     return shard
 
 
@@ -146,7 +146,7 @@ def _check_size(path: Path, row: ShardRow) -> None:
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
     if size != row.bytes:
-        raise _Wrong(f"{size:,} bytes instead of {row.bytes:,}")
+        raise Defect(f"{size:,} bytes instead of {row.bytes:,}")
 
 
 @contextmanager
@@ -154,7 +154,7 @@ def _defects(path: Path) -> Iterator[None]:
     """Turns whatever reading a damaged shard raises into CompileError (PD630)."""
     try:
         yield
-    except _Wrong as error:
+    except Defect as error:
         reason = str(error)
     except OSError as error:
         reason = error.strerror or str(error)
@@ -165,7 +165,7 @@ def _defects(path: Path) -> Iterator[None]:
     raise damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it again")
 
 
-class _Wrong(Exception):
+class Defect(Exception):
     """A defect of a shard."""
 
 
@@ -176,7 +176,7 @@ def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...
     whole = np.memmap(path, np.uint8, "r")
     with zipfile.ZipFile(path) as archive:
         if sorted(archive.namelist()) != sorted(f"{name}.npy" for name in expected):
-            raise _Wrong(f"it must hold {', '.join(expected)}, and nothing else")
+            raise Defect(f"it must hold {', '.join(expected)}, and nothing else")
         for name in only:
             shape = expected[name]
             entry = archive.getinfo(f"{name}.npy")
@@ -185,13 +185,13 @@ def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...
             with archive.open(entry) as member:
                 version = np.lib.format.read_magic(member)
                 if version != (1, 0):
-                    raise _Wrong(f"`{name}` has the npy version {version}")
+                    raise Defect(f"`{name}` has the npy version {version}")
                 header = np.lib.format.read_array_header_1_0(member, max_header_size=10_000)
                 if header != (shape, False, dtype):
-                    raise _Wrong(f"`{name}` is {header[2]} {list(header[0])}, not {dtype} {list(shape)}")
+                    raise Defect(f"`{name}` is {header[2]} {list(header[0])}, not {dtype} {list(shape)}")
                 ahead = member.tell()
                 if entry.file_size != ahead + size:
-                    raise _Wrong(f"`{name}` has {entry.file_size - ahead:,} bytes, not {size:,}")
+                    raise Defect(f"`{name}` has {entry.file_size - ahead:,} bytes, not {size:,}")
                 if entry.compress_type == zipfile.ZIP_STORED:
                     start = _data_offset(whole, entry) + ahead
                     arrays[name] = np.ndarray(shape, dtype, buffer=whole, offset=start)
@@ -210,19 +210,28 @@ def _data_offset(whole: Array, entry: zipfile.ZipInfo) -> int:
 
 def _check_lengths(length: Array, recipe: Recipe, transitions: int) -> None:
     if length.min() < 1 or length.max() > recipe.actions or length.sum() != transitions:
-        raise _Wrong("the lengths of its episodes do not fit")
+        raise Defect("the lengths of its episodes do not fit")
 
 
-def _check_episodes(arrays: dict[str, Array], recipe: Recipe) -> None:
-    """Check that episodes end where their lengths say, and that actions are in range."""
+def knows_ids(recipe: Recipe, observation: Array) -> bool:
+    """Whether the palette has all ids of observations, uint8 [n, C, H, W]."""
+    known = np.zeros(256, bool)
+    known[[int(number) for number in recipe.palette]] = True
+    where = recipe.channels.index("element") if "element" in recipe.channels else 0
+    rows = observation[:, where]
+    return all(bool(known[rows[at : at + 256]].all()) for at in range(0, len(rows), 256))
+
+
+def check_episodes(arrays: Mapping[str, Array], recipe: Recipe) -> None:
+    """Check that episodes end where their lengths say, and that actions are in range. Raises Defect."""
     length, action = arrays["length"].astype(np.int64), arrays["action"]
     _check_lengths(length, recipe, len(action))
     ended = arrays["terminated"].astype(np.int64) + arrays["truncated"]
     last = np.zeros_like(ended)
     last[np.cumsum(length) - 1] = 1
     if not np.array_equal(ended, last):
-        raise _Wrong("episodes do not end where their lengths say")
+        raise Defect("episodes do not end where their lengths say")
     if (action < 0).any() or (action >= np.array(recipe.action_nvec)).any():
-        raise _Wrong("it has actions out of range")
+        raise Defect("it has actions out of range")
     if (arrays["world"] < 0).any():
-        raise _Wrong("it has worlds out of range")
+        raise Defect("it has worlds out of range")

@@ -170,3 +170,31 @@ def test_a_trained_agent_is_recorded(task: Path, tmp_path: Path) -> None:
             acted = policy(observed, action_keys(0, torch.tensor([number]), step))
             assert acted[0].tolist() == action.tolist()
             observed = env.step(acted)[0]
+
+
+def test_a_dataset_goes_to_minari_and_back(
+    task: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    out, again, third = tmp_path / "data", tmp_path / "again", tmp_path / "third"
+    data = record(str(task), "random", out, episodes=3, backend="arrays")
+    written = powderdsl("record", "--out", out, "--to-minari", "me/small-v0")
+    assert written.exit_code == 0, written.stderr
+    assert written.stderr == f"me/small-v0: 3 episodes, {data.steps} transitions\n"
+    assert powderdsl("record", "--out", again, "--from-minari", "me/small-v0").exit_code == 0
+    assert (again / "shard-000000.npz").read_bytes() == (out / "shard-000000.npz").read_bytes()
+    done = powderdsl("record", task, "--out", third, "--from-minari", "me/small-v0", "--backend", "arrays")
+    assert done.exit_code == 0, done.stderr
+    assert (third / "shard-000000.npz").read_bytes() == (out / "shard-000000.npz").read_bytes()
+    for words, says in (
+        (("--out", out, "--to-minari", "me/small-v0"), "there is a Minari dataset me/small-v0"),
+        (("--out", out, "--to-minari", "small"), "a Minari dataset is named namespace/name-v0"),
+        (("--to-minari", "me/small-v1"), "--to-minari and --from-minari take --out"),
+        (("--out", out, "--to-minari", "me/a-v0", "--from-minari", "me/a-v0"), "give one of them"),
+        ((task, "--out", out, "--to-minari", "me/a-v0"), "--to-minari takes no TASK"),
+        (("--out", tmp_path / "no", "--from-minari", "me/none-v0"), "cannot be imported"),
+    ):
+        refused = powderdsl("record", *words)
+        assert refused.exit_code == 2
+        assert says in refused.stderr

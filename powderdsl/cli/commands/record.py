@@ -46,8 +46,23 @@ SCRIPTED = ("expert", "random", "nothing")
 @opt.backend("auto")
 @opt.device
 @opt.path("--verify", "FOLDER", "Record nothing: read every byte of a dataset.")
+@opt.text(
+    "--to-minari", "ID", "Record nothing: write the dataset --out as a Minari dataset, namespace/name-v0."
+)
+@opt.text(
+    "--from-minari",
+    "ID",
+    "Record nothing: read a Minari dataset into the folder --out; of TASK, unless --to-minari wrote it.",
+)
 def command(
-    task: str | None, out: Path | None, episodes: int | None, policy: str, verify: Path | None, **how: Any
+    task: str | None,
+    out: Path | None,
+    episodes: int | None,
+    policy: str,
+    verify: Path | None,
+    to_minari: str | None,
+    from_minari: str | None,
+    **how: Any,
 ) -> int:
     """Record whole episodes of TASK: observations, actions, rewards, ends.
 
@@ -56,11 +71,14 @@ def command(
     \b
         powderdsl record TASK --out data --episodes 1000
         powderdsl record --verify data
+        powderdsl record --out data --to-minari me/data-v0
     """
     if verify is not None:
         if task is not None or out is not None or episodes is not None:
             raise BadInput("--verify takes a folder, and no TASK, --out or --episodes")
         return _verify(verify)
+    if to_minari is not None or from_minari is not None:
+        return _exchanged(task, out, episodes, to_minari, from_minari, how)
     named = {name: how.pop(name) for name in ("knobs", "settings", "packs")}
     found = _checked(task, out, episodes, policy, how["split"], **named)
     if found is None or out is None or episodes is None:
@@ -202,6 +220,43 @@ def _verify(folder: Path) -> int:
         f"{folder}: {counted(len(dataset), 'episode')} of {recipe.task} ({recipe.split}, {recipe.policy}), "
         f"{dataset.steps:,} transitions, {counted(recipe.shards, 'shard')}: all as recorded"
     )
+    return OK
+
+
+def _exchanged(
+    task: str | None,
+    out: Path | None,
+    episodes: int | None,
+    to_minari: str | None,
+    from_minari: str | None,
+    how: dict[str, Any],
+) -> int:
+    """Write a dataset as a Minari dataset, or read one."""
+    if out is None or episodes is not None or None not in (to_minari, from_minari):
+        raise BadInput("--to-minari and --from-minari take --out and no --episodes; give one of them")
+    if to_minari is not None and task is not None:
+        raise BadInput("--to-minari takes no TASK: it writes what --out holds")
+    _require_gymnasium()
+    from powderdsl.datasets import minari
+    from powderdsl.datasets.dataset import Dataset
+
+    minari.require_minari()
+    with user_values():
+        if to_minari is not None:
+            dataset = Dataset.open(out)
+            minari.to_minari(dataset, to_minari)
+        elif task is None:
+            dataset = minari.from_minari(str(from_minari), out)
+        else:
+            loaded = load_task(
+                task, knobs=knob_values(how["knobs"]), params=how["settings"], packs=how["packs"]
+            )
+            names = ("split", "observation", "worlds", "shard", "compress", "backend", "device")
+            dataset = minari.from_minari(
+                str(from_minari), out, task=loaded, **{name: how[name] for name in names}
+            )
+    counts = f"{counted(len(dataset), 'episode')}, {dataset.steps:,} transitions"
+    click.echo(f"{to_minari or out}: {counts}", err=True)
     return OK
 
 

@@ -1,0 +1,357 @@
+"""Datasets go to Minari and come back bit for bit, and those of others come in with every value checked."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from powderdsl.datasets import Dataset, from_minari, record, to_minari
+from powderdsl.diagnostics import CompileError
+from powderdsl.envs import PowderEnv, TensorEnv
+from powderdsl.tasks.episodes import TaskProgram
+
+pytest.importorskip("minari")
+h5py = pytest.importorskip("h5py")
+
+ID = "powderdsl/small-v0"
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder of Minari's."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari"
+
+
+def shards(data: Dataset) -> list[tuple[int, str]]:
+    return [(row.number, row.sha256) for row in data.manifest.shards]
+
+
+@pytest.mark.parametrize("observation", ["ids", "compact"])
+@pytest.mark.parametrize("compress", [False, True])
+def test_a_dataset_comes_back_byte_for_byte(
+    small: TaskProgram, observation: str, compress: bool, tmp_path: Path
+) -> None:
+    data = record(
+        small, "random", tmp_path / "a", episodes=7, shard=3, observation=observation, compress=compress
+    )
+    to_minari(data, ID)
+    again = from_minari(ID, tmp_path / "b")
+    assert shards(again) == shards(data)
+    assert again.recipe == data.recipe
+
+
+def test_minari_shows_what_was_recorded(recorded: Dataset) -> None:
+    found = to_minari(recorded, ID, author="somebody", description="a test")
+    assert found.total_episodes == len(recorded)
+    assert found.total_steps == recorded.steps
+    assert found.env_spec is None, "the task is in a file of the user's"
+    assert found.storage.metadata["author"] == {"somebody"}
+    for one in found.iterate_episodes():
+        wanted = recorded.episode(int(one.id))
+        assert one.observations.dtype == np.uint8
+        assert one.rewards.dtype == np.float32
+        assert np.array_equal(one.observations, wanted.observation)
+        assert np.array_equal(one.actions, wanted.action)
+        assert np.array_equal(one.rewards, wanted.reward)
+        assert np.array_equal(one.terminations, wanted.terminated)
+        assert np.array_equal(one.truncations, wanted.truncated)
+        assert np.array_equal(one.infos["success"][1:], wanted.success)
+        assert set(one.infos["world"].tolist()) == {wanted.world}
+        assert all(found.action_space.contains(action) for action in one.actions)
+        assert all(found.observation_space.contains(shown) for shown in one.observations)
+
+
+def test_images_are_not_stored_as_jpeg(recorded: Dataset, tmp_path: Path) -> None:
+    """An observation that Minari takes for a picture: 40 channels of 40×40 bytes."""
+    from tests.datasets.test_reading import new_manifest, write_manifest, write_shard
+
+    channels = tuple(f"c{i}" for i in range(40))
+    palette = {str(i): f"e.{i}" for i in range(256)}
+    recipe = replace(
+        recorded.recipe, episodes=1, shard=1, channels=channels, shape=(40, 40, 40), palette=palette
+    )
+    noise = np.random.default_rng(0).integers(0, 256, (3, 40, 40, 40), np.uint8)
+    parts: dict[str, Any] = {
+        "observation": [noise],
+        "action": [np.zeros((2, 5))],
+        "reward": [np.array([0.1, 1 / 3])],
+        "length": [np.array([2])],
+        "world": [np.array([1 << 40])],
+        **{name: [np.array([False, last])] for name, last in (("terminated", True), ("truncated", False))},
+        "success": [np.array([True, False])],
+    }
+    (tmp_path / "a").mkdir()
+    row = write_shard(tmp_path / "a", 0, parts, compress=False)
+    write_manifest(tmp_path / "a", replace(new_manifest(recipe), shards=(row,)))
+    data = Dataset.open(tmp_path / "a")
+    found = to_minari(data, ID)
+    assert np.array_equal(found[0].observations, noise)
+    assert shards(from_minari(ID, tmp_path / "b")) == shards(data)
+
+
+@pytest.mark.parametrize("params", [{}, {"water.melt": 0.75}])
+def test_a_shipped_task_is_recovered(tmp_path: Path, params: dict[str, float]) -> None:
+    data = record(
+        "sand-pushing",
+        "random",
+        tmp_path / "a",
+        episodes=1,
+        max_episode_steps=3,
+        seed=11,
+        backend="arrays",
+        knobs={"complexity": 2},
+        params=params,
+    )
+    found = to_minari(data, ID)
+    env = found.recover_environment(backend="arrays")
+    assert found.env_spec.kwargs["params"] == params
+    one = found[0]
+    assert env.action_space == found.action_space
+    assert env.observation_space == found.observation_space
+    observed, info = env.reset(seed=data.episode(0).world)
+    assert np.array_equal(observed, one.observations[0])
+    for step, action in enumerate(one.actions):
+        observed, reward, terminated, truncated, info = env.step(action)
+        assert np.array_equal(observed, one.observations[step + 1])
+        assert reward == one.rewards[step]
+        assert (terminated, truncated) == (one.terminations[step], one.truncations[step])
+        assert info["success"] == one.infos["success"][step + 1]
+
+
+def test_an_id_is_taken_once(recorded: Dataset, root: Path) -> None:
+    to_minari(recorded, ID)
+    with pytest.raises(CompileError) as caught:
+        to_minari(recorded, ID)
+    assert caught.value.diagnostics[0].code == "PD613"
+    for wrong in ("small", "../small-v0", "a b-v0", ""):
+        with pytest.raises(ValueError, match="namespace/name-v0"):
+            to_minari(recorded, wrong)
+    assert sorted(path.name for path in (root / "powderdsl").iterdir() if path.is_dir()) == ["small-v0"]
+
+
+def test_a_failed_export_leaves_nothing(
+    recorded: Dataset, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(number: int) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(recorded, "episode", broken)
+    with pytest.raises(CompileError, match="PD613"):
+        to_minari(recorded, ID)
+    assert not (root / "powderdsl" / "small-v0").exists()
+    assert [path for path in (root / "powderdsl").iterdir() if path.is_dir()] == []
+
+
+# Minari datasets of others
+
+
+def collect(program: TaskProgram, kind: str, episodes: int = 3, **how: Any) -> None:
+    """What Minari's DataCollector makes of an environment, without jax."""
+    import minari
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    env = PowderEnv(program, observation=how.pop("observation", "ids"), actions=kind)
+    env.action_space.seed(3)
+    buffers = []
+    for seed in range(episodes):
+        shown, info = env.reset(seed=seed)
+        rows: dict[str, list[Any]] = {
+            "observations": [shown], "actions": [], "rewards": [], "terminations": [], "truncations": []
+        }  # fmt: skip
+        infos = {name: [info[name]] for name in ("success", "world")}
+        over = False
+        while not over:
+            action = env.action_space.sample()
+            shown, reward, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+            for name, value in zip(rows, (shown, action, reward, terminated, truncated), strict=True):
+                rows[name].append(value)
+            for name, values in infos.items():
+                values.append(info[name])
+        buffers.append(EpisodeBuffer(seed=seed, infos=infos, **rows))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of authors that are not named
+        minari.create_dataset_from_buffers(
+            ID,
+            buffers,
+            observation_space=env.observation_space,
+            action_space=env.action_space,
+            algorithm_name="collected",
+            **how,
+        )
+
+
+@pytest.mark.parametrize("kind", ["multidiscrete", "discrete", "full"])
+def test_collected_episodes_come_in(small: TaskProgram, kind: str, tmp_path: Path) -> None:
+    collect(small, kind)
+    data = from_minari(ID, tmp_path / "a", task=small, shard=2)
+    assert data.recipe.policy == "collected"
+    assert len(data) == 3
+    data.check()
+    data.require(TensorEnv(small, 1), same_rules=True)
+    env = TensorEnv(small, 1, autoreset_mode="disabled")
+    for number in range(3):
+        one = data.episode(number)
+        assert one.world == number
+        observed, _ = env.reset(options={"worlds": one.world})
+        assert torch.equal(observed[0], one.observation[0])
+        for step, action in enumerate(one.action):
+            observed, reward, terminated, truncated, info = env.step(action[None].long())
+            assert torch.equal(observed[0], one.observation[step + 1])
+            ends = (reward, terminated, truncated, info["success"])
+            wanted = (one.reward, one.terminated, one.truncated, one.success)
+            assert [value[0] for value in ends] == [value[step] for value in wanted]
+
+
+def test_strangers_need_a_task(small: TaskProgram, recorded: Dataset, tmp_path: Path) -> None:
+    collect(small, "full")
+    with pytest.raises(CompileError) as caught:
+        from_minari(ID, tmp_path / "a")
+    (found,) = caught.value.diagnostics
+    assert found.code == "PD630"
+    assert "task=" in found.helps[0]
+    with pytest.raises(CompileError, match="its observations are not uint8"):
+        from_minari(ID, tmp_path / "a", task="sand-pushing", max_episode_steps=3, backend="arrays")
+    with pytest.raises(TypeError, match="only with a task"):
+        from_minari(ID, tmp_path / "a", shard=3)
+    with pytest.raises(CompileError, match="No such file"):
+        from_minari("powderdsl/none-v0", tmp_path / "a")
+
+
+def broken_metadata(change: Any) -> Any:
+    def damage(folder: Path) -> None:
+        path = folder / "metadata.json"
+        data = json.loads(path.read_text())
+        change(data)
+        path.write_text(json.dumps(data))
+
+    return damage
+
+
+def broken_file(change: Any) -> Any:
+    def damage(folder: Path) -> None:
+        with h5py.File(folder / "main_data.hdf5", "a") as file:
+            change(file, file["episode_1"])
+
+    return damage
+
+
+def swapped(name: str, make: Any) -> Any:
+    def change(file: Any, group: Any) -> None:
+        old = group[name][()]
+        del group[name]
+        make(file, group, old)
+
+    return broken_file(change)
+
+
+def vast(file: Any, group: Any, old: Any) -> None:
+    group.create_dataset("observations", (1 << 40, 1, 16, 16), np.uint8, chunks=(1, 1, 16, 16))
+
+
+def elsewhere(file: Any, group: Any, old: Any) -> None:
+    group.create_dataset("rewards", old.shape, "<f4", external=[("/etc/hostname", 0, 4 * len(old))])
+
+
+def linked(file: Any, group: Any, old: Any) -> None:
+    group["rewards"] = h5py.ExternalLink("/etc/passwd", "/")
+
+
+def value(name: str, new: Any) -> Any:
+    def change(file: Any, group: Any) -> None:
+        group[name][0] = new
+
+    return broken_file(change)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda folder: (folder / "metadata.json").write_text("{"), "metadata.json"),
+        (lambda folder: (folder / "metadata.json").write_text("[]"), "not a mapping"),
+        (lambda folder: (folder / "main_data.hdf5").write_bytes(b"no"), "main_data.hdf5"),
+        (lambda folder: (folder / "main_data.hdf5").unlink(), "main_data.hdf5"),
+        (broken_metadata(lambda data: data.update(total_episodes="7")), "total_episodes"),
+        (broken_metadata(lambda data: data.update(total_episodes=21)), "episode_20"),
+        (broken_metadata(lambda data: data.update(data_format="arrow")), "hdf5"),
+        (broken_metadata(lambda data: data["powderdsl"].update(recipe=3)), "no recipe"),
+        (broken_metadata(lambda data: data["powderdsl"]["recipe"].update(seed=-1)), "recipe.seed"),
+        (swapped("observations", vast), "observations has the shape"),
+        (swapped("rewards", elsewhere), "lies in other files"),
+        (swapped("rewards", linked), "rewards is a link"),
+        (swapped("rewards", lambda file, group, old: group.create_group("rewards")), "its rewards must be"),
+        (swapped("actions", lambda file, group, old: group.create_dataset("actions", data=old * 1.0)), "dtype float64"),
+        (swapped("infos/world", lambda file, group, old: group.attrs.pop("seed")), "neither a seed nor"),
+        (value("actions", 99), "actions out of range"),
+        (value("observations", 200), "ids that the palette lacks"),
+        (value("terminations", True), "do not end"),
+    ],
+)  # fmt: skip
+def test_damaged_ones_are_refused(
+    recorded: Dataset, root: Path, damage: Any, says: str, tmp_path: Path
+) -> None:
+    to_minari(recorded, ID)
+    damage(root / ID / "data")
+    with pytest.raises(CompileError) as caught:
+        from_minari(ID, tmp_path / "a")
+    assert {one.code for one in caught.value.diagnostics} == {"PD630"}
+    assert any(says in note for one in caught.value.diagnostics for note in one.notes)
+
+
+def test_an_interrupted_import_is_completed(recorded: Dataset, root: Path, tmp_path: Path) -> None:
+    to_minari(recorded, ID)
+    whole = (root / ID / "data" / "main_data.hdf5").read_bytes()
+    swapped("rewards", linked)(root / ID / "data")  # of episode 1, in the first shard
+    with h5py.File(root / ID / "data" / "main_data.hdf5", "a") as file:
+        file.move("episode_1", "spare")
+        file.move("episode_9", "episode_1")  # so that the second shard is the damaged one
+    with pytest.raises(CompileError, match="PD630"):
+        from_minari(ID, tmp_path / "a")
+    assert not (tmp_path / "a" / "shard-000002.npz").exists()
+    (root / ID / "data" / "main_data.hdf5").write_bytes(whole)
+    (tmp_path / "a" / "shard-000000.npz").unlink()  # it has episode 9 in the place of 1
+    assert shards(from_minari(ID, tmp_path / "a")) == shards(recorded)
+
+
+def test_jpeg_is_refused(small: TaskProgram, tmp_path: Path) -> None:
+    collect(small, "full")
+    wide = {"type": "Box", "dtype": "uint8", "shape": [40, 40, 3], "low": 0, "high": 255}
+
+    from powderdsl.datasets.minari import _place, _Source
+
+    metadata = _place(ID) / "data" / "metadata.json"
+    data = json.loads(metadata.read_text())
+    assert data["jpeg_encoding"] is True
+    metadata.write_text(json.dumps(data | {"observation_space": json.dumps(wide)}))
+    env = TensorEnv(small, 1, observation="rgb")
+
+    class Wide:
+        observation = replace(
+            env.observation, space=__import__("gymnasium").spaces.Box(0, 255, (40, 40, 3), np.uint8)
+        )
+        task, device = env.task, env.device
+
+    with pytest.raises(CompileError, match="stored as JPEG"):
+        _Source(_place(ID) / "data").form(Wide)  # type: ignore[arg-type]
+
+
+def test_without_minari_there_is_a_plain_error(
+    recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "minari", None)
+    for call in (lambda: to_minari(recorded, ID), lambda: from_minari(ID, tmp_path / "a")):
+        with pytest.raises(CompileError) as caught:
+            call()
+        (found,) = caught.value.diagnostics
+        assert found.code == "PD612"
+        assert found.helps == ("pip install 'powderdsl[minari]'",)
