@@ -355,7 +355,7 @@ def recipe_of(
         channels=tuple(env.observation.channels),
         shape=tuple(int(one) for one in env.observation.space.shape),
         palette={str(element.id): element.qualified for element in ruleset.elements},
-        action_nvec=env.action_nvec,
+        action_nvec=env.program.action_nvec,  # data have all five numbers, whatever form the environment takes
         choices=tuple(names[choice] for choice in task.agent.choices),
         actions=env.max_episode_steps,
         last_action="terminates" if env.last_action_terminates else "truncates",
