@@ -89,7 +89,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "envs": (*_SCREEN, "tasks", "tasks.episodes"),
     "datasets": (*_SCREEN, *_LEARNING[:6]),
     "rl": (*_SCREEN, *_LEARNING[:6]),
-    "worldmodel": (*_SCREEN, *_LEARNING[:5]),
+    "worldmodel": (*_SCREEN, *_LEARNING[:7]),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
     "cli": (*_SCREEN, *_TESTING, "testing.mutation", *_LEARNING, "experiments.bench", "experiments.studies"),

@@ -4,13 +4,14 @@
 other: a callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
 """
 
+from powderdsl.worldmodel.config import PRESETS, Machine, TrainConfig
 from powderdsl.worldmodel.evaluation import Tested, evaluate
 from powderdsl.worldmodel.networks import CustomNetwork, custom_network
 from powderdsl.worldmodel.pairs import DataConfig, TaskWorlds, Worlds, pairs_of, task_worlds, unseen_seeds
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.scores import Score, frequent, outcomes, score, still
 from powderdsl.worldmodel.trained import Trained, finetuned, load_trained
-from powderdsl.worldmodel.training import PRESETS, Machine, TrainConfig, train
+from powderdsl.worldmodel.training import train
 from powderdsl.worldmodel.unet import UNet, fresh_unet
 
 __all__ = [

@@ -11,16 +11,25 @@ from typing import Any, TypedDict, Unpack
 import torch
 from torch import Tensor
 
+from powderdsl.experiments.runs import does_not_fit
+from powderdsl.worldmodel.config import HERE, Machine
+from powderdsl.worldmodel.networks import without_actions
 from powderdsl.worldmodel.pairs import DataConfig, TaskWorlds, pairs_of, task_worlds, unseen_seeds
+from powderdsl.worldmodel.recordings import Recording
 from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, VariedWorlds
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
 from powderdsl.worldmodel.trained import Trained
-from powderdsl.worldmodel.training import HERE, Machine, check_palette, load_rules_of
+from powderdsl.worldmodel.training import check_palette, load_rules_of
 
 FIT_WORLDS = 64
 """The most training worlds that baselines are fitted on."""
 
+TRANSITIONS = 2048
+"""The most recorded transitions that a network is tested on, and that baselines are fitted on."""
+
 MODEL, STILL, FREQUENT = "model", "nothing changes", "most frequent outcome"
+BLIND = "action hidden"
+"""The same network, shown that nothing was done."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,7 @@ class Tested:
     split: str
     only: tuple[str, ...]
     worlds: int
+    """Worlds of each test, or transitions that were recorded."""
     scores: Mapping[str, Mapping[str, Score]]
     missing: Mapping[str, tuple[str, ...]]
     palette: tuple[str | None, ...]
@@ -43,7 +53,7 @@ class Tested:
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
-        names = [MODEL, STILL, FREQUENT]
+        names = list(next(iter(self.scores.values())))
         whole = {name: reduce(add, [one[name] for one in self.scores.values()]) for name in names}
         return {
             "rules": self.rules,
@@ -76,6 +86,8 @@ def evaluate(
 ) -> Tested:
     """Test a network and both baselines on worlds that training never uses.
 
+    Networks that learned from a dataset are tested by `evaluate_recording`.
+
     Args:
         worlds: worlds of a split, or random futures of each of its stands; by default 32 and 4.
         split: ``designed`` unless another is given.
@@ -86,6 +98,8 @@ def evaluate(
     Raises:
         CompileError: as `task_worlds`; PD623 if the rules have elements that the network has no slots for.
     """
+    if trained.config.recorded is not None:
+        raise does_not_fit(trained.run.path, "it predicts recorded transitions, with actions")
     fit = _counted(trained, machine)
     data = _data_of(trained, **tested_on)
     found = _worlds_of(trained, data, machine)
@@ -114,6 +128,52 @@ def evaluate(
     )
 
 
+def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machine = HERE) -> Tested:
+    """Test a network on recorded transitions: those of the test worlds if it learned from this dataset, otherwise all.
+
+    Beside both baselines, fitted on the training worlds' transitions of this dataset, the network is tested with its
+    actions hidden, unless it never sees them. At most `TRANSITIONS` transitions, evenly spread, are used.
+
+    Raises:
+        CompileError: PD623 if the network did not learn from a dataset, or the numbers mean something else in this one.
+    """
+    known, here, device = trained.config.recorded, recording.recorded, machine.device
+    if known is None:
+        raise does_not_fit(trained.run.path, "it learned from worlds, without actions")
+    check_palette(trained.run.path, trained.palette, recording.rules)
+    names = ("channels", "steps", "speed")
+    why = [
+        f"`{name}` is {getattr(known, name)} there, {getattr(here, name)} in {recording.dataset.folder}"
+        for name in names
+        if getattr(known, name) != getattr(here, name)
+    ]
+    if why:
+        raise does_not_fit(trained.run.path, *why)
+    own = known.digest == here.digest
+    slots, ids = len(trained.palette), [element.id for element in recording.rules.elements]
+    fit = outcomes(
+        ((starts[:, 0], ends) for starts, ends in recording.spread(recording.parts[0], TRANSITIONS)), slots
+    )
+    tables = {STILL: still(fit, ids), FREQUENT: frequent(fit, ids)}
+    predictors: dict[str, Network] = {MODEL: trained.network}
+    if known.actions:
+        predictors[BLIND] = lambda inputs: trained.network(without_actions(inputs))
+    for name, one in tables.items():
+        predictors[name] = lambda inputs, one=one: one(inputs[:, 0])  # type: ignore[misc]
+    pairs = recording.spread(recording.parts[2] if own else recording.all, TRANSITIONS, device)
+    return Tested(
+        rules=recording.rules.name,
+        task=recording.task.name,
+        split=recording.dataset.recipe.split,
+        only=(),
+        worlds=sum(len(ends) for _, ends in pairs),
+        scores={"transitions": {name: score(one, pairs, slots) for name, one in predictors.items()}},
+        missing={},
+        palette=trained.palette,
+        step=trained.checkpoint.step,
+    )
+
+
 def unseen_worlds(
     trained: Trained, *, machine: Machine = HERE, **tested_on: Unpack[TestedOn]
 ) -> TaskWorlds | VariedWorlds:
@@ -121,6 +181,8 @@ def unseen_worlds(
 
     Worlds that the rules cannot have are left out, as long as others remain.
     """
+    if trained.config.recorded is not None:
+        raise does_not_fit(trained.run.path, "it predicts recorded transitions, with actions")
     return _worlds_of(trained, _data_of(trained, **tested_on), machine)
 
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from importlib import import_module
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -25,8 +25,16 @@ from powderdsl.system.writing import failure
 
 CONTRACT = "it is called as NAME(channels, slots) and gives a torch.nn.Module: float32 [B, channels, H, W] -> logits [B, slots, H, W]"
 
-Encoder = Callable[[Tensor], Tensor]
-"""What a world model is given, uint8 -> channels float32 [B, C, H, W]."""
+
+class Encoder(Protocol):
+    """What a world model is given, uint8 -> float32 [B, channels, H, W]."""
+
+    @property
+    def channels(self) -> int:
+        """How many there are."""
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """The channels of some inputs."""
 
 
 def is_network_name(text: Any) -> bool:
@@ -46,7 +54,7 @@ class CustomNetwork:
     name: str
     make: Callable[[int, int], Any]
 
-    def build(self, encoder: Encoder, channels: int, slots: int, seed: int) -> Encoded:
+    def build(self, encoder: Encoder, slots: int, seed: int) -> Encoded:
         """A network whose random weights depend on the seed alone.
 
         Raises:
@@ -54,22 +62,22 @@ class CustomNetwork:
         """
         with torch.random.fork_rng(devices=[]), self._told("cannot be made"):
             torch.manual_seed(seed)
-            network = self.make(channels, slots)
+            network = self.make(encoder.channels, slots)
         if not isinstance(network, nn.Module):
             found = type(network).__name__
             raise _invalid(self.name, f"must give a torch.nn.Module, found {found}", helps=(CONTRACT,))
         return Encoded(encoder, network)
 
-    def check(self, encoder: Encoder, channels: int, slots: int, inputs: Tensor, seed: int) -> None:
+    def check(self, encoder: Encoder, slots: int, inputs: Tensor, seed: int) -> None:
         """Try a network on some inputs: the shape of its logits, and whether it can learn.
 
         Raises:
             CompileError: PD625.
         """
-        network = self.build(encoder, channels, slots, seed).to(inputs.device)
+        network = self.build(encoder, slots, seed).to(inputs.device)
         with torch.random.fork_rng(devices=[]), self._told("fails on a batch"):
             logits = network(inputs)
-        given = f"for channels [{len(inputs)}, {channels}, {inputs.shape[-2]}, {inputs.shape[-1]}]"
+        given = f"for channels [{len(inputs)}, {encoder.channels}, {inputs.shape[-2]}, {inputs.shape[-1]}]"
         expected = [len(inputs), slots, *inputs.shape[-2:]]
         if not isinstance(logits, Tensor):
             found = type(logits).__name__
@@ -80,7 +88,7 @@ class CustomNetwork:
         weights = [one for one in network.parameters() if one.requires_grad]
         if logits.requires_grad and weights:
             with self._told("has no gradient"):
-                truth = torch.zeros(len(inputs), *inputs.shape[-2:], dtype=torch.int64)
+                truth = torch.zeros(len(inputs), *inputs.shape[-2:], dtype=torch.int64, device=inputs.device)
                 F.cross_entropy(logits.float(), truth).backward()
         if all(one.grad is None for one in weights):
             helps = ("its logits must depend on parameters that require a gradient",)
@@ -117,13 +125,57 @@ class OneHot:
     def channels(self) -> int:
         return self.slots
 
-    def __call__(self, ids: Tensor) -> Tensor:
-        return F.one_hot(ids.long(), self.slots).permute(0, 3, 1, 2).float().contiguous()
+    def __call__(self, inputs: Tensor) -> Tensor:
+        return F.one_hot(inputs.long(), self.slots).permute(0, 3, 1, 2).float().contiguous()
 
     def example(self, count: int, size: tuple[int, int]) -> Tensor:
         """Some inputs: uint8 [count, H, W]."""
         cells = torch.arange(count * size[0] * size[1]) % self.slots
         return cells.to(torch.uint8).view(count, *size)
+
+
+NO_ELEMENT = 255
+"""In inputs with actions: nothing is placed on this cell."""
+
+
+@dataclass(frozen=True)
+class ActionChannels:
+    """A state and an action, uint8 [B, observed + 3, H, W] as `recordings` has them -> float32 [B, channels, H, W].
+
+    The channels: the elements, one-hot, after the action has placed its own; the other channels of the observation,
+    about −1 to 1; and, with `actions`, 1 where the action places an element, 1 where it blows, and its speed there in
+    rows and columns, −1 to 1. Without, nothing of the action is seen.
+    """
+
+    slots: int
+    observed: int
+    actions: bool = True
+
+    @property
+    def channels(self) -> int:
+        return self.slots + self.observed - 1 + (4 if self.actions else 0)
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        ids, placed, speed = inputs[:, 0], inputs[:, self.observed], inputs[:, self.observed + 1 :]
+        found = [inputs[:, 1 : self.observed].float() / 128 - 1]
+        if self.actions:
+            here = placed != NO_ELEMENT
+            ids = torch.where(here, placed, ids)
+            blown = (speed[:, :1] != 0).float()
+            found += [here[:, None].float(), blown, (speed.float() - 2) * blown]
+        return torch.cat([OneHot(self.slots)(ids), *found], 1)
+
+    def example(self, count: int, size: tuple[int, int]) -> Tensor:
+        """Some inputs."""
+        ids = OneHot(self.slots).example(count, size)[:, None]
+        return torch.cat([ids, torch.zeros(count, self.observed + 2, *size, dtype=torch.uint8)], 1)
+
+
+def without_actions(inputs: Tensor) -> Tensor:
+    """Inputs in which nothing was done: uint8 [B, C + 3, H, W]."""
+    found = inputs.clone()
+    found[:, -3], found[:, -2:] = NO_ELEMENT, 0
+    return found
 
 
 def custom_network(name: str) -> CustomNetwork:

@@ -152,7 +152,10 @@ MEASURES = (
 
 
 def score(predict: Network, pairs: Iterable[Pairs], slots: int) -> Score:
-    """The score of a network, or of any callable from ids to logits [B, slots, H, W], on some pairs."""
+    """The score of a network, or of any callable from ids to logits [B, slots, H, W], on some pairs.
+
+    Inputs with actions, uint8 [B, C, H, W], have the ids in their first channel.
+    """
     total = Score.none(slots)
     for starts, ends in pairs:
         few = max(1, TOGETHER // (starts.shape[-2] * starts.shape[-1]))
@@ -164,6 +167,7 @@ def score(predict: Network, pairs: Iterable[Pairs], slots: int) -> Score:
 @torch.no_grad()
 def _score(predict: Network, starts: Tensor, ends: Tensor, slots: int) -> Score:
     logits = predict(starts).float()
+    starts = starts if starts.ndim == 3 else starts[:, 0]
     truth = ends.long()
     loss = F.cross_entropy(logits, truth, reduction="none").double().sum()
     chances, predicted = logits.softmax(1), logits.argmax(1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
 from powderdsl.worldmodel.pairs import TaskWorlds, unseen_seeds
+from powderdsl.worldmodel.recordings import Recording
 from powderdsl.worldmodel.rulesets import VariedWorlds
 from powderdsl.worldmodel.scores import Network
 
@@ -53,6 +54,17 @@ def strips(
     truth = worlds.later(world, step * times).ids
     three = [ids.cpu().numpy() for ids in (world.ids, truth, predicted)]
     return [Strip(name, *(ids[n] for ids in three)) for n, name in enumerate(worlds.names)]
+
+
+@torch.no_grad()
+def recorded_strips(predict: Network, recording: Recording, count: int = 8) -> list[Strip]:
+    """Strips of transitions of test worlds, evenly spread."""
+    found: list[Strip] = []
+    for inputs, ends in recording.spread(recording.parts[2], count):
+        predicted = predict(inputs).argmax(1).to(torch.uint8)
+        for three in zip(inputs[:, 0], ends, predicted, strict=True):
+            found.append(Strip(f"transition {len(found) + 1}", *(ids.cpu().numpy() for ids in three)))
+    return found
 
 
 def sheet(found: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.uint8]:

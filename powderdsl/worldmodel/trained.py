@@ -14,16 +14,10 @@ from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find
 from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task
-from powderdsl.worldmodel.networks import CustomNetwork, OneHot
+from powderdsl.worldmodel.config import MAX_WIDTH, TrainConfig
+from powderdsl.worldmodel.networks import CustomNetwork, Encoded, OneHot
 from powderdsl.worldmodel.rule_words import add, pack_names
-from powderdsl.worldmodel.training import (
-    KIND,
-    MAX_WIDTH,
-    TrainConfig,
-    load_rules_of,
-    network_missing,
-    recorded_palette,
-)
+from powderdsl.worldmodel.training import KIND, encoder_of, load_rules_of, network_missing, recorded_palette
 from powderdsl.worldmodel.unet import UNet
 from powderdsl.worldmodel.weights import fit_weights, weights_in
 
@@ -67,26 +61,32 @@ def load_trained(
     if isinstance(network, CustomNetwork) and network.name != config.network:
         there = "the paper's U-net" if config.network is None else f"`{config.network}`"
         raise does_not_fit(run.path, f"it was trained with {there}, not with `{network.name}`")
-    checkpoint = run.checkpoint(device)
+    checkpoint, encoder = run.checkpoint(device), encoder_of(config, slots)
     if isinstance(network, CustomNetwork):
-        model: nn.Module = network.build(OneHot(slots), slots, slots, config.seed)
+        model: nn.Module = network.build(encoder, slots, config.seed)
     elif network is not None:
         model = network
     else:
-        _check_size(run, config, palette, checkpoint)
-        model = UNet(slots, config.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        _check_size(run, config, slots, checkpoint)
+        model = _u_net(config, slots).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     fit_weights(model, checkpoint)
     return Trained(run, config, palette, model.to(device).eval(), checkpoint)
 
 
-def _check_size(
-    run: RunFolder, config: TrainConfig, palette: tuple[str | None, ...], checkpoint: Checkpoint
-) -> None:
+def _u_net(config: TrainConfig, slots: int) -> nn.Module:
+    """The U-net of a configuration, with any weights."""
+    encoder = encoder_of(config, slots)
+    if isinstance(encoder, OneHot):
+        return UNet(slots, config.width)
+    return Encoded(encoder, UNet(slots, config.width, encoder.channels))
+
+
+def _check_size(run: RunFolder, config: TrainConfig, slots: int, checkpoint: Checkpoint) -> None:
     """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError."""
     if type(config.width) is not int or not 1 <= config.width <= MAX_WIDTH:
         raise no_run(run.path, "its network has sizes that no training gives")
     with torch.device("meta"):
-        wanted = {name: one.shape for name, one in UNet(len(palette), config.width).state_dict().items()}
+        wanted = {name: one.shape for name, one in _u_net(config, slots).state_dict().items()}
     found = {name: getattr(one, "shape", None) for name, one in weights_in(checkpoint).items()}
     if wanted != found:
         raise does_not_fit(checkpoint.path, "its weights are those of another network")
@@ -115,6 +115,8 @@ def finetuned(
         CompileError: what `load` raises.
     """
     config = trained.config
+    if config.recorded is not None:
+        raise does_not_fit(trained.run.path, "it learned from a dataset, and other packs are not in it")
     data = config.data
     own = data.rules or "+".join(load_task(data.task).rules)
     rules, names = add(own, packs), pack_names(own, packs)

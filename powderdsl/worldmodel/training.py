@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -22,114 +22,33 @@ from powderdsl.experiments.runs import (
     open_run,
     read_run,
 )
-from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
+from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.system.interrupts import held_back
 from powderdsl.system.random import base_keys, mix
-from powderdsl.system.settings import check_bounds, setting
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
-from powderdsl.worldmodel.networks import CustomNetwork, OneHot, is_network_name
+from powderdsl.worldmodel.config import HERE, Machine, TrainConfig
+from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork, Encoded, OneHot
 from powderdsl.worldmodel.pairs import DataConfig, Pairs, Worlds, task_worlds, validation_pairs
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.scores import Network, score
 from powderdsl.worldmodel.unet import fresh_unet
 from powderdsl.worldmodel.weights import fit_weights
 
+if TYPE_CHECKING:
+    from powderdsl.worldmodel.recordings import Recording
+
 KIND = "worldmodel"
 
 LOG_EVERY = 10
 """Iterations whose mean loss makes a line of the metrics."""
 
-LATER = ("network",)
-"""Settings that the first runs do not have, with the default None."""
-
-MAX_WIDTH = 1024
-"""Features of the first block."""
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Everything that decides the weights (on one kind of device). The defaults are the paper's.
-
-    `parent` is the name of the checkpoint that a fine-tuned network starts from; without it weights are random.
-    `palette` has the qualified name of the element of each of the network's slots, or None; empty: those of the task's
-    and the data's rules. `slots` is how many there are at least: free ones are room for packs that come later.
-    `network` is the name of a `CustomNetwork`, as text: what it names is imported only if the user gives it again.
-    """
-
-    data: DataConfig = field(default_factory=DataConfig)
-    width: int = setting(32, low=1, high=MAX_WIDTH)
-    iterations: int = setting(5000, low=1, high=1 << 40)
-    batch: int = setting(256, low=1, high=1 << 20)
-    learning_rate: float = 0.005
-    seed: int = setting(0, low=0, high=2**63 - 1)
-    parent: str | None = None
-    slots: int = setting(0, low=0, high=MAX_ELEMENTS)
-    palette: tuple[str | None, ...] = ()
-    network: str | None = None
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for values out of range."""
-        check_bounds(self)
-        if not 0 < self.learning_rate < float("inf"):
-            raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
-        if len(self.palette) > MAX_ELEMENTS:
-            raise ValueError(f"palette has more than {MAX_ELEMENTS} slots")
-        if self.network is not None and not is_network_name(self.network):
-            raise ValueError("network must have the form module:Class")
-
-    @property
-    def plain(self) -> dict[str, Any]:
-        """For ``run.json``. Settings that came later are left out unless they are used: older runs lack them."""
-        found = asdict(self)
-        return {name: value for name, value in found.items() if name not in LATER or value is not None}
-
-    @staticmethod
-    def of(values: Mapping[str, Any]) -> TrainConfig:
-        """The configuration in a run's JSON, without the run's other settings. Raises TypeError, ValueError."""
-        own = {one.name: values[one.name] for one in fields(TrainConfig) if one.name in values}
-        return TrainConfig(**{**own, "data": DataConfig.of(own["data"]), "palette": ()})
-
-
-PAPER = TrainConfig()
-"""5,000 iterations of 256 pairs, width 32, a buffer of 1024·256: for a GPU."""
-
-SMALL = TrainConfig(
-    data=DataConfig(capacity=4096, refresh=8), width=16, iterations=1200, batch=8, learning_rate=0.002
-)
-"""The same network, narrower, on fewer pairs: minutes on one CPU core."""
-
-PRESETS = {"paper": PAPER, "small": SMALL}
-
-
-@dataclass(frozen=True)
-class Machine:
-    """Where a run is computed. A run may continue on another machine.
-
-    `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`.
-    """
-
-    device: str = "cpu"
-    threads: int = 1
-    backend: str = "auto"
-    store: str = "auto"
-    compiled: bool = False
-
-    @property
-    def simulation(self) -> dict[str, Any]:
-        """The settings that `task_worlds` takes."""
-        return {"device": self.device, "threads": self.threads, "backend": self.backend}
-
-
 VALIDATED = ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece")
 """Measures of a validation besides the loss."""
 
 Tell = Callable[["TrainingProgress"], None]
-
-HERE = Machine()
-"""One thread of this CPU."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +70,7 @@ def train(
     *,
     machine: Machine = HERE,
     worlds: Worlds | None = None,
+    recording: Recording | None = None,
     identity: Mapping[str, Any] | None = None,
     network: nn.Module | CustomNetwork | None = None,
     parent: Checkpoint | None = None,
@@ -165,6 +85,7 @@ def train(
 
     Args:
         worlds: your own, instead of those of the task that `config.data` names, whose rules and split then say nothing.
+        recording: transitions with actions, instead of worlds: see `recordings.open_recording`.
         identity: what else decides which weights come out, such as what your own worlds depend on: kept in ``run.json``,
             and compared when a run continues.
         network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W], or a `CustomNetwork`, whose name the run
@@ -186,27 +107,82 @@ def train(
         config = replace(config, network=network.name)
     elif network is None and config.network is not None:
         raise network_missing(Path(folder), config.network)
+    if recording is not None:
+        config = recording.configured(config)
+        note = {"dataset": str(recording.dataset.folder), **(note or {})}
+    elif config.recorded is not None:
+        raise does_not_fit(Path(folder), "it learns from a dataset, which is not given")
     palette = _palette_for(config, Path(folder), worlds)
-    if worlds is None:
+    if recording is None and worlds is None:
         found = task_worlds(config.data, **machine.simulation, palette=palette)
         worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
-    check_palette(Path(folder), palette, worlds.rules)
-    own = {"palette": palette, "rules_fingerprint": fingerprint(worlds.rules), **(identity or {})}
-    slots, encoder = len(palette), OneHot(len(palette))
+    given: Worlds | Recording = recording or worlds  # type: ignore[assignment]
+    check_palette(Path(folder), palette, given.rules)
+    own = {"palette": palette, "rules_fingerprint": fingerprint(given.rules), **(identity or {})}
+    slots, encoder = len(palette), encoder_of(config, len(palette))
     if isinstance(network, CustomNetwork):
-        network.check(encoder, encoder.channels, slots, encoder.example(2, worlds.size), config.seed)
+        network.check(encoder, slots, encoder.example(2, given.size), config.seed)
     run = open_run(folder, KIND, {**config.plain, **own}, note={"machine": asdict(machine), **(note or {})})
     with run.locked():
         if isinstance(network, CustomNetwork):
-            network = network.build(encoder, encoder.channels, slots, config.seed)
-        model = network or fresh_unet(slots, config.width, config.seed)
+            network = network.build(encoder, slots, config.seed)
+        model = network or _fresh(config, encoder, slots)
         trainer = _Trainer(config, machine, run, model.to(machine.device), slots)
         trainer.restore(parent)
         if trainer.done < config.iterations:
-            pairs = validation_pairs(worlds, config.data, machine.device) if validate_every else []
+            source, pairs = _material(config, machine, run, recording, worlds, validate_every > 0)
             validation = Validation(validate_every, pairs)
-            trainer.train(worlds, validation, tell or (lambda progress: None), save_seconds)
+            trainer.train(source, validation, tell or (lambda progress: None), save_seconds)
     return run
+
+
+class Source(Protocol):
+    """Where batches come from: a `Replay`, or transitions that were recorded."""
+
+    def go_to(self, iteration: int) -> None:
+        """Get ready for an iteration."""
+
+    def advance(self) -> None:
+        """Go to the next iteration."""
+
+    def batch(self, iteration: int, count: int) -> Pairs:
+        """The pairs of an iteration's batch, which the seed and the iteration decide."""
+
+    def close(self) -> None:
+        """Delete what was made."""
+
+
+def _material(
+    config: TrainConfig,
+    machine: Machine,
+    run: RunFolder,
+    recording: Recording | None,
+    worlds: Worlds | None,
+    validated: bool,
+) -> tuple[Source, Sequence[Pairs]]:
+    """What a network is trained on, and validated on if asked for."""
+    device = machine.device
+    if recording is not None:
+        return recording.source(config.seed, device), recording.validation(device) if validated else ()
+    assert worlds is not None
+    replay = Replay(
+        worlds, config.data, seed=config.seed, device=device, store=machine.store, folder=run.path
+    )
+    return replay, validation_pairs(worlds, config.data, device) if validated else ()
+
+
+def encoder_of(config: TrainConfig, slots: int) -> OneHot | ActionChannels:
+    """What makes channels of the inputs."""
+    if config.recorded is None:
+        return OneHot(slots)
+    return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)
+
+
+def _fresh(config: TrainConfig, encoder: OneHot | ActionChannels, slots: int) -> nn.Module:
+    """The paper's network with random weights. It encodes worlds without actions by itself."""
+    if isinstance(encoder, OneHot):
+        return fresh_unet(slots, config.width, config.seed)
+    return Encoded(encoder, fresh_unet(slots, config.width, config.seed, encoder.channels))
 
 
 @dataclass(frozen=True)
@@ -262,20 +238,16 @@ class _Trainer:
             why = " ".join(str(error).split())[:300]
             raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
 
-    def train(self, worlds: Worlds, validation: Validation, tell: Tell, save_seconds: float) -> None:
+    def train(self, source: Source, validation: Validation, tell: Tell, save_seconds: float) -> None:
         """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""
-        device, store = self.machine.device, self.machine.store
-        replay = Replay(
-            worlds, self.config.data, seed=self.config.seed, device=device, store=store, folder=self.run.path
-        )
         try:
-            replay.go_to(self.done)
-            with _random_numbers_kept(torch.device(device)):
-                self._iterate(replay, validation, tell, save_seconds)
+            source.go_to(self.done)
+            with _random_numbers_kept(torch.device(self.machine.device)):
+                self._iterate(source, validation, tell, save_seconds)
         finally:
-            replay.close()
+            source.close()
 
-    def _iterate(self, replay: Replay, validation: Validation, tell: Tell, save_seconds: float) -> None:
+    def _iterate(self, source: Source, validation: Validation, tell: Tell, save_seconds: float) -> None:
         config, total = self.config, self.config.iterations
         loss, held_out, simulated, making = None, None, 0.0, 0.0
         saved = since = time.monotonic()
@@ -283,9 +255,9 @@ class _Trainer:
         # An iteration is never left half done.
         with self.run.metrics(self.done) as metrics, held_back() as interrupted:
             while self.done < total and not interrupted():
-                self.recent.append(self.step(*replay.batch(self.done, config.batch)))
+                self.recent.append(self.step(*source.batch(self.done, config.batch)))
                 began = time.monotonic()
-                replay.advance()
+                source.advance()
                 making += time.monotonic() - began
                 self.done += 1
                 values: dict[str, float] = {}
@@ -321,7 +293,7 @@ class _Trainer:
         cuda = torch.device(self.machine.device).type == "cuda"
         with torch.autocast("cuda", torch.bfloat16, enabled=cuda):
             logits = self.forward(starts)
-        expected = (len(starts), self.slots, *starts.shape[1:])
+        expected = (len(starts), self.slots, *starts.shape[-2:])
         if logits.shape != expected:
             raise ValueError(f"the network must give logits {list(expected)}, found {list(logits.shape)}")
         loss = F.cross_entropy(logits.float(), ends.long())

@@ -157,11 +157,11 @@ def test_an_interrupted_run_ends_with_the_same_weights(dunes: str) -> None:
 def test_weights_of_a_network_depend_on_the_seed_alone(dunes: str) -> None:
     network, encoder = custom_network("nets:Wide"), OneHot(5)
     torch.rand(3)
-    one = network.build(encoder, 5, 5, 7).state_dict()
+    one = network.build(encoder, 5, 7).state_dict()
     torch.rand(3)
-    other = network.build(encoder, 5, 5, 7).state_dict()
+    other = network.build(encoder, 5, 7).state_dict()
     assert same(one, other)
-    assert not same(one, network.build(encoder, 5, 5, 8).state_dict())
+    assert not same(one, network.build(encoder, 5, 8).state_dict())
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_weights_of_a_network_depend_on_the_seed_alone(dunes: str) -> None:
 def test_networks_that_cannot_be_trained_are_refused(name: str, said: str) -> None:
     encoder = OneHot(10)
     with pytest.raises(CompileError) as error:
-        custom_network(name).check(encoder, 10, 10, encoder.example(2, (14, 18)), 0)
+        custom_network(name).check(encoder, 10, encoder.example(2, (14, 18)), 0)
     (found,) = error.value.diagnostics
     assert found.code == "PD625"
     assert said in " ".join([found.message, *found.notes, *found.helps])

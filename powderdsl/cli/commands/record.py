@@ -83,7 +83,7 @@ def command(
     found = _checked(task, out, episodes, policy, how["split"], **named)
     if found is None or out is None or episodes is None:
         return BAD_INPUT
-    _require_gymnasium()
+    require_gymnasium()
     from powderdsl.datasets.recorder import record
 
     try:
@@ -172,7 +172,7 @@ def _checked(
             check_split(found, split)
     if found is not None and policy == "nothing":
         with mistakes.collected():
-            _require_gymnasium()
+            require_gymnasium()
             from powderdsl.datasets.recorder import still_action
 
             still_action(found)
@@ -198,7 +198,7 @@ def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:
     return {"policy": load_policy(run, env), "policy_name": name, "sees": sees}
 
 
-def _require_gymnasium() -> None:
+def require_gymnasium() -> None:
     """Raises CompileError (PD612) if the environments' package is not installed."""
     try:
         import powderdsl.envs  # noqa: F401  only whether it can be imported
@@ -210,7 +210,7 @@ def _require_gymnasium() -> None:
 
 
 def _verify(folder: Path) -> int:
-    _require_gymnasium()
+    require_gymnasium()
     from powderdsl.datasets.dataset import Dataset
 
     dataset = Dataset.open(folder)

@@ -16,9 +16,14 @@ from powderdsl.cli.options import check_writable
 from powderdsl.cli.output import print_json, progress, table
 
 if TYPE_CHECKING:
+    from powderdsl.model.types import Ruleset
+    from powderdsl.worldmodel.config import Machine, TrainConfig
     from powderdsl.worldmodel.evaluation import Tested
     from powderdsl.worldmodel.networks import CustomNetwork
-    from powderdsl.worldmodel.training import Machine, TrainConfig, TrainingProgress
+    from powderdsl.worldmodel.recordings import Recording
+    from powderdsl.worldmodel.strips import Strip
+    from powderdsl.worldmodel.trained import Trained
+    from powderdsl.worldmodel.training import TrainingProgress
 
 
 KNOBS = ("kinds", "lines", "disks", "squares")
@@ -27,8 +32,16 @@ DATA = ("task", "split", "states", "capacity", "refresh", "rulesets", "first_rul
 VARIETY = ("chances", "swaps", "leave_out")
 TRAINING = ("iterations", "batch", "learning_rate", "seed")
 MACHINE = ("device", "threads", "backend", "store", "compiled")
+NOT_OF_WORLDS = (
+    *("preset", "width", "slots", "network_name", "folder", "out", "scale", "save_every", "validate_every"),
+    *("data", "ignore_actions", *TRAINING, *MACHINE),
+)
+"""Options that networks with actions have too."""
 
+_recording = opt.path("--data", "DATASET", "Transitions with actions, recorded by `powderdsl record`.")
 _data_options = opt.several(
+    _recording,
+    opt.flag("--ignore-actions", "With --data: the network does not see the actions."),
     opt.text("--task", "TASK", "A shipped task or a file.  [default: world-model]"),
     opt.text("--split", "SPLIT", "Split of the task to train on.  [default: train]"),
     opt.text("--rules", "RULES", "Rules of the worlds.  [default: the task's own]"),
@@ -120,11 +133,21 @@ def train_command(
     A run that was stopped continues when the same command is given again, as if it had not been stopped.
     """
     from powderdsl.cli.task_sheets import knob_values
+    from powderdsl.worldmodel.config import PRESETS
     from powderdsl.worldmodel.rulesets import Variety
-    from powderdsl.worldmodel.training import PRESETS
 
     if packs and held_out:
         raise BadInput("--packs says what stays, --held-out what goes: give one of them")
+    recording = None
+    ignore_actions = values.pop("ignore_actions")
+    if values["data"] is not None:
+        _refuse(
+            values
+            | {"rules": rules, "packs": packs, "held_out": held_out, "knobs": knobs, "settings": settings}
+        )
+        recording = _opened(values["data"], values["task"])
+    elif ignore_actions:
+        raise BadInput("--ignore-actions goes with --data")
     variety = _given(values, VARIETY)
     if (variety or values["first_ruleset"]) and not values["rulesets"]:
         raise BadInput(
@@ -135,6 +158,12 @@ def train_command(
     config = PRESETS[preset]
     with user_values():
         differ = Variety(**variety)
+    if recording is not None:
+        config = replace(config, recorded=replace(recording.recorded, actions=not ignore_actions))
+        config = replace(config, **_given(values, ("width", "slots", *TRAINING)))
+        name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
+        _run(config, folder or Path("runs") / name, values, recording=recording)
+        return
     data = replace(
         config.data,
         rules=_rules_without(rules, values["task"] or config.data.task, packs, held_out),
@@ -177,14 +206,17 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @command.command("eval", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN")
 @opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]")
-@opt.text("--split", "SPLIT", "Split of the task to test on.", "designed")
+@opt.text("--split", "SPLIT", "Split of the task to test on.  [default: designed]")
 @opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]")
+@_recording
 @opt.text("--only", "PACK…", "Draw elements of these packs only.  [default: the run's]", multiple=True)
 @opt.knobs("Another value for a knob of the task.  [default: the run's]")
 @opt.integer(
     "--worlds", 1, 1 << 20, "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
 )
-@opt.integer("--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.", 0)
+@opt.integer(
+    "--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.  [default: 0]"
+)
 @opt.layouts("One JSON object instead of a table.")
 @opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
 @_network
@@ -195,23 +227,29 @@ def eval_command(
     knobs: tuple[str, ...],
     layout: str,
     out: Path | None,
+    data: Path | None,
     network_name: str | None,
     **values: Any,
 ) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
     RUN is a run's folder, or its name in runs/. Losses are cross-entropies a cell, in nats. The worlds have seeds
-    that no training takes. What is found is also written to the run's evaluation.json.
+    that no training takes. A network that learned from a dataset is tested on its test worlds, or on another dataset,
+    and also with its actions hidden. What is found is also written to the run's evaluation.json.
     """
     from powderdsl.cli.task_sheets import knob_values
     from powderdsl.experiments.runs.folder import write_json
-    from powderdsl.worldmodel.evaluation import evaluate
+    from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
     from powderdsl.worldmodel.trained import load_trained
 
     machine = _machine(values)
     trained = load_trained(run, device=machine.device, network=_own_network(network_name))
     drawn = knob_values(knobs) if knobs else None
-    tested = evaluate(trained, only=only or None, knobs=drawn, machine=machine, **values)
+    recording = _recording_of(trained, data, {**values, "only": only, "knobs": knobs})
+    if recording is not None:
+        tested = evaluate_recording(trained, recording, machine=machine)
+    else:
+        tested = evaluate(trained, only=only or None, knobs=drawn, machine=machine, **_designed(values))
     plain = tested.plain()
     if out is not None:
         write_json(out, plain, follow=True)
@@ -227,10 +265,11 @@ def eval_command(
 @click.argument("run", metavar="RUN")
 @opt.path("--out", "FILE", "The .png file to write.", required=True)
 @opt.integer("--steps", 1, 4096, "Steps to predict.  [default: as trained]")
-@opt.integer("--after", 0, 10**6, "Steps that worlds run before the start.", 0)
+@opt.integer("--after", 0, 10**6, "Steps that worlds run before the start.  [default: 0]")
 @opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]")
-@opt.text("--split", "SPLIT", "Split of the task.", "designed")
+@opt.text("--split", "SPLIT", "Split of the task.  [default: designed]")
 @opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]")
+@_recording
 @opt.integer("--scale", 1, 16, "Pixels per cell.", 2)
 @_network
 @_machine_options
@@ -238,8 +277,9 @@ def show_command(
     run: str,
     out: Path,
     steps: int | None,
-    after: int,
+    after: int | None,
     scale: int,
+    data: Path | None,
     network_name: str | None,
     **values: Any,
 ) -> None:
@@ -250,23 +290,40 @@ def show_command(
     if out.suffix.lower() != ".png":
         raise BadInput(f"`{out}`: strips are a .png file")
     check_writable(out)
-    from powderdsl.simulation.media import write_png
     from powderdsl.worldmodel.evaluation import unseen_worlds
-    from powderdsl.worldmodel.strips import sheet, strips
+    from powderdsl.worldmodel.strips import recorded_strips, strips
     from powderdsl.worldmodel.trained import load_trained
 
     machine = _machine(values)
     trained = load_trained(run, device=machine.device, network=_own_network(network_name))
+    recording = _recording_of(trained, data, {**values, "steps": steps, "after": after})
+    if recording is not None:
+        _show(recorded_strips(trained.network, recording), recording.rules, out, scale)
+        return
     step = trained.config.data.steps
     if steps is not None and steps % step:
         raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
-    worlds = unseen_worlds(trained, machine=machine, **values)
-    found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after)
-    write_png(out, sheet(found, worlds.rules, factor=scale))
-    for number, strip in enumerate(found, 1):
-        click.echo(f"{number}  {strip.name}: {strip.wrong:,} of {strip.truth.size:,} cells wrong")
+    worlds = unseen_worlds(trained, machine=machine, **_designed(values))
+    found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after or 0)
+    _show(found, worlds.rules, out, scale)
     for name, lacking, _ in worlds.found.missing:
         click.echo(f"left out: {name}, which needs {', '.join(lacking)}", err=True)
+
+
+def _show(found: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
+    """Draw strips, and count what is wrong in each."""
+    from powderdsl.simulation.media import write_png
+    from powderdsl.worldmodel.strips import sheet
+
+    write_png(out, sheet(found, rules, factor=scale))
+    for number, strip in enumerate(found, 1):
+        click.echo(f"{number}  {strip.name}: {strip.wrong:,} of {strip.truth.size:,} cells wrong")
+
+
+def _designed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a test, with the usual split and rulesets."""
+    usual = {"split": "designed", "rulesets": 0}
+    return {name: usual.get(name) if value is None else value for name, value in values.items()}
 
 
 def _given(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
@@ -279,11 +336,48 @@ def _machine(values: dict[str, Any]) -> Machine:
     import torch
 
     from powderdsl.simulation.programs import find_device
-    from powderdsl.worldmodel.training import Machine
+    from powderdsl.worldmodel.config import Machine
 
     find_device(values["device"])
     torch.set_num_threads(values["threads"])
     return Machine(**{name: values.pop(name) for name in MACHINE if name in values})
+
+
+def _refuse(values: Mapping[str, Any]) -> None:
+    """Refuse options that select worlds: a dataset has its own."""
+    own = ("task", *NOT_OF_WORLDS)
+    flags = {
+        one.name: one.opts[0]
+        for one in click.get_current_context().command.params
+        if isinstance(one, click.Option) and one.name not in own
+    }
+    for name, flag in flags.items():
+        if values.get(name or "") not in (None, (), {}, False):
+            raise BadInput(f"{flag} selects worlds, and --data has its own")
+
+
+def _opened(folder: Path, task: str | None) -> Recording:
+    """The recording in a dataset's folder."""
+    from powderdsl.cli.commands.record import require_gymnasium
+
+    require_gymnasium()
+    from powderdsl.worldmodel.recordings import open_recording
+
+    return open_recording(folder, task)
+
+
+def _recording_of(trained: Trained, folder: Path | None, values: dict[str, Any]) -> Recording | None:
+    """The recording that a network is tested on; None for a network without actions."""
+    if trained.config.recorded is None:
+        if folder is not None:
+            raise BadInput("--data is for networks that learned from a dataset")
+        return None
+    _refuse(values)
+    recorded = trained.run.about.get("dataset")
+    if folder is None and not isinstance(recorded, str):
+        raise BadInput("--data: say which dataset")
+    task = trained.config.data.task
+    return _opened(folder or Path(str(recorded)), values["task"] or task)
 
 
 def _own_network(name: str | None) -> CustomNetwork | None:

@@ -1,0 +1,212 @@
+"""World models with actions: transitions recorded from a task, each a state, an action, and the state after it.
+
+An input is uint8 [B, C + 3, H, W]: the C channels of the observation, and three of what the action does to each cell, as
+`tasks.tensors.actions.Hands` does it: the element that it places (`NO_ELEMENT` for none), and the rows and columns of
+its speed plus 2 (0 where it does not blow). `ActionChannels` makes of it what networks see.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.system.writing import failure
+from powderdsl.tasks.shipped import load_task, shipped_tasks
+from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
+from powderdsl.worldmodel.config import Recorded, TrainConfig
+from powderdsl.worldmodel.networks import NO_ELEMENT
+from powderdsl.worldmodel.pairs import DataConfig, Pairs
+
+if TYPE_CHECKING:  # datasets need the extra `rl`
+    from powderdsl.datasets import Dataset, Transitions
+    from powderdsl.datasets.manifest import Recipe
+
+PARTS = (0.8, 0.1, 0.1)
+"""Shares of the worlds for training, validation and tests."""
+
+VALIDATED = 256
+"""The most transitions that a network is validated on."""
+
+
+class Recording:
+    """A dataset of a task's transitions, ready to learn from. Made by `open_recording`.
+
+    `palette` names the dataset's ids; `rules` are the task's, with these ids. `parts` are the transitions of the
+    training, validation and test worlds: the same for every recording of these worlds.
+    """
+
+    def __init__(self, dataset: Dataset, name: str, task: Task, palette: tuple[str | None, ...]):
+        from powderdsl.datasets import Transitions, split
+
+        self.dataset, self.name, self.task, self.palette = dataset, name, task, palette
+        self.rules: Ruleset = task.ruleset
+        self.size = task.size
+        """Rows and columns."""
+        self.all = Transitions(dataset)
+        try:
+            self.parts: tuple[Transitions, ...] = split(self.all, PARTS)
+        except ValueError as error:
+            helps = ("record episodes of more worlds: a hundred are enough",)
+            raise failure(
+                "PD631", f"{dataset.folder} has too few worlds", notes=(str(error),), helps=helps
+            ) from None
+
+    @cached_property
+    def recorded(self) -> Recorded:
+        """What a run keeps of it."""
+        agent, recipe = self.task.agent, self.dataset.recipe
+        rows = [row.sha256 for row in self.dataset.manifest.shards]
+        text = json.dumps([asdict(recipe), rows], sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return Recorded(digest, recipe.channels, agent.steps_per_action, agent.speed)
+
+    def configured(self, config: TrainConfig) -> TrainConfig:
+        """A configuration that trains on this dataset. Whether it ignores actions stays."""
+        recipe = self.dataset.recipe
+        data = DataConfig(
+            task=self.name,
+            split=recipe.split,
+            knobs=dict(recipe.knobs),
+            params=_changed_params(recipe, load_task(self.name)),
+            steps=self.task.agent.steps_per_action,
+        )
+        slots = (*self.palette, *[None] * (config.slots - len(self.palette)))
+        actions = config.recorded is None or config.recorded.actions
+        return replace(config, data=data, palette=slots, recorded=replace(self.recorded, actions=actions))
+
+    def eligible(self, rows: Transitions) -> Tensor:
+        """The numbers of transitions of `steps_per_action` steps, int64 [n]: a last action may have free steps."""
+        length = torch.from_numpy(rows.episodes.length)
+        last = torch.zeros(len(rows), dtype=torch.bool)
+        if self.task.agent.free_steps:
+            last[length.cumsum(0) - 1] = length == self.task.agent.actions
+        return (~last).nonzero()[:, 0]
+
+    def pairs(self, rows: Transitions, numbers: Tensor, device: str | torch.device = "cpu") -> Pairs:
+        """Inputs and next ids, uint8 [B, C + 3, H, W] and [B, H, W], of transitions by number, int64 [B]."""
+        found = rows[numbers]
+        inputs = torch.cat([found.observation, self.painted(found.action)], 1)
+        return inputs.to(device), found.next_observation[:, 0].to(device)
+
+    def painted(self, actions: Tensor) -> Tensor:
+        """What actions, integers [B, 5], do to each cell: uint8 [B, 3, H, W]."""
+        agent, actions = self.task.agent, actions.long()
+        inside = []
+        for axis, side in enumerate(self.size):
+            first = agent.first_line(axis, actions[:, 1 - axis], side)[:, None]
+            line = torch.arange(side)
+            inside.append((first <= line) & (line < first + agent.brush[axis]))
+        block = inside[0][:, :, None] & inside[1][:, None, :]
+        choice = torch.tensor(agent.choices)[actions[:, 2]][:, None, None]
+        placed = torch.where(block & (choice >= 0), choice, NO_ELEMENT)
+        blown = block & (choice == BLOW)
+        speed = [torch.where(blown, actions[:, at, None, None] + 1, 0) for at in (4, 3)]
+        return torch.stack([placed, *speed], 1).to(torch.uint8)
+
+    def spread(self, rows: Transitions, most: int, device: str | torch.device = "cpu") -> list[Pairs]:
+        """At most so many transitions, evenly spread, in batches."""
+        numbers = self.eligible(rows)
+        numbers = numbers[torch.arange(min(most, len(numbers))) * len(numbers) // min(most, len(numbers))]
+        return [self.pairs(rows, some, device) for some in numbers.split(64)]
+
+    def validation(self, device: str | torch.device = "cpu") -> list[Pairs]:
+        """Transitions of worlds that neither training nor tests use."""
+        return self.spread(self.parts[1], VALIDATED, device)
+
+    def source(self, seed: int, device: str | torch.device = "cpu") -> RecordedPairs:
+        """Endless batches of the training worlds' transitions."""
+        return RecordedPairs(self, seed, device)
+
+
+class RecordedPairs:
+    """Batches of transitions, all equally likely. A batch depends on the seed and the iteration alone."""
+
+    def __init__(self, recording: Recording, seed: int, device: str | torch.device):
+        self.recording, self.seed, self.device = recording, seed, device
+        self.rows = recording.parts[0]
+        self.numbers = recording.eligible(self.rows)
+
+    def go_to(self, iteration: int) -> None:
+        """Nothing has to be made."""
+
+    def advance(self) -> None:
+        """Nothing changes."""
+
+    def close(self) -> None:
+        """Nothing is kept."""
+
+    def batch(self, iteration: int, count: int) -> Pairs:
+        """The pairs of an iteration's batch."""
+        from powderdsl.datasets.dataset import drawn
+
+        chosen = torch.from_numpy(drawn(self.seed % (1 << 62), iteration, count, len(self.numbers)))
+        return self.recording.pairs(self.rows, self.numbers[chosen], self.device)
+
+
+def open_recording(folder: str | Path, task: str | None = None) -> Recording:
+    """The recording in a dataset's folder.
+
+    Args:
+        task: the file of the task that was played, unless it is a shipped one.
+
+    Raises:
+        CompileError: PD630 for a folder that is not a dataset, or is damaged; PD631 if it was recorded from another task,
+            or has too few worlds; what `load_task` raises.
+    """
+    from powderdsl.datasets import Dataset
+
+    dataset = Dataset.open(folder)
+    recipe = dataset.recipe
+    if task is None and recipe.task not in shipped_tasks():
+        # A name out of the manifest must not lead to a file.
+        message = f"{folder} was recorded from the task `{recipe.task}`, which is not a shipped one"
+        raise failure("PD631", message, helps=("give its file: `--task FILE`",))
+    name = task or recipe.task
+    ids = {int(number): element for number, element in recipe.palette.items()}
+    palette = tuple(ids.get(number) for number in range(max(ids) + 1))
+    params = _changed_params(recipe, load_task(name))
+    found = load_task(name, knobs=recipe.knobs, params=params, palette=palette)
+    notes = _differences(recipe, found)
+    if notes:
+        raise failure("PD631", f"{folder} does not fit the task {found.name}", notes=tuple(notes))
+    return Recording(dataset, name, found, palette)
+
+
+def _changed_params(recipe: Recipe, task: Task) -> dict[str, Any]:
+    """The parameters of a recipe that differ from the rules' own."""
+    own = {param.name: param.default for param in task.ruleset.params}
+    return {
+        name: int(value) if isinstance(own[name], int) else value
+        for name, value in recipe.params.items()
+        if name in own and float(own[name]) != value
+    }
+
+
+def _differences(recipe: Recipe, task: Task) -> list[str]:
+    """Why a recipe is not one of a task."""
+    names = {element.id: element.qualified for element in task.ruleset.elements}
+    names |= {BLOW: "blow", NO_CHANGE: "nothing"}
+    rows, columns = task.agent.bins
+    there = {
+        "size": tuple(recipe.shape[1:]),
+        "actions": tuple(recipe.action_nvec),
+        "choices": tuple(recipe.choices),
+    }
+    here = {
+        "size": tuple(task.size),
+        "actions": (columns, rows, len(task.agent.choices), 3, 3),
+        "choices": tuple(names[choice] for choice in task.agent.choices),
+    }
+    found = [f"{key}: {list(there[key])}, not {list(here[key])}" for key in there if there[key] != here[key]]
+    if not found and recipe.task_fingerprint and recipe.task_fingerprint != fingerprint(task):
+        found.append("the task, its knobs or its rules have changed since, or it had more packs")
+    return found

@@ -1,0 +1,337 @@
+"""World models with actions: what the network sees is what the simulator does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from powderdsl.datasets import Dataset, record
+from powderdsl.diagnostics import CompileError
+from powderdsl.tasks.episodes import compile_task
+from powderdsl.tasks.shipped import load_task
+from powderdsl.worldmodel import Machine, TrainConfig, load_trained, train
+from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
+from powderdsl.worldmodel.networks import NO_ELEMENT, ActionChannels, without_actions
+from powderdsl.worldmodel.recordings import Recording, open_recording
+from powderdsl.worldmodel.trained import finetuned
+from tests.cli.commands import powderdsl as run
+from tests.worldmodel.test_training import same, weights
+
+HERE = Machine(backend="torch")
+
+BUILDERS = """
+task: builders
+about: Sand and stone may be placed anywhere, and blown.
+rules: core+sand+water+stone+wind
+size: [12, 20]
+fill: empty
+generate:
+  - scatter water chance 10%
+agent: {may: [sand, stone, blow, nothing], brush: [4, 7], bins: [5, 6], speed: 3, actions: 6, steps_per_action: 2, free_steps: 9}
+reward: {final: count(sand)}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A task, and forty episodes of it as ids and as compact observations."""
+    torch.set_num_threads(1)
+    place = tmp_path_factory.mktemp("builders")
+    (place / "builders.yaml").write_text(BUILDERS, encoding="utf-8")
+    for kind in ("ids", "compact"):
+        record(
+            str(place / "builders.yaml"),
+            "random",
+            place / kind,
+            episodes=40,
+            shard=16,
+            observation=kind,
+            backend="torch",
+        )
+    return place
+
+
+@pytest.fixture(params=["ids", "compact"])
+def recording(request: pytest.FixtureRequest, folder: Path) -> Recording:
+    return opened(folder, request.param)
+
+
+def opened(folder: Path, kind: str = "ids") -> Recording:
+    return open_recording(folder / kind, str(folder / "builders.yaml"))
+
+
+def tiny(**changes: object) -> TrainConfig:
+    return replace(TrainConfig(width=4, iterations=30, batch=8, learning_rate=0.01, seed=3), **changes)  # type: ignore[arg-type]
+
+
+# What the network sees
+
+
+@pytest.mark.parametrize("task", ["builders", "path-building", "sand-pushing"])
+def test_channels_are_what_the_simulator_does(task: str, folder: Path) -> None:
+    """Every bin and choice: the elements after the action, and the speed of blown cells."""
+    loaded = load_task(str(folder / "builders.yaml") if task == "builders" else task)
+    program = compile_task(loaded, backend="torch")
+    recording = object.__new__(Recording)
+    recording.task, recording.size = loaded, loaded.size
+    columns, rows, choices, _, _ = program.action_nvec
+    xy = torch.cartesian_prod(torch.arange(columns), torch.arange(rows))
+    more = torch.arange(len(xy))
+    actions = torch.cat([xy, torch.stack([more % choices, more % 3, more // 3 % 3], 1)], 1)
+    start = program.start(torch.zeros(len(actions), dtype=torch.int64)).world
+    after, done = program._hands.act(start, actions, reuse=False)
+    placed, rows_of_speed, columns_of_speed = recording.painted(actions).unbind(1)
+    assert torch.equal(torch.where(placed != NO_ELEMENT, placed, start.ids), after.ids)
+    assert torch.equal((placed != NO_ELEMENT).flatten(1).any(1), done["placed"].bool())
+    blown = rows_of_speed != 0
+    assert torch.equal(blown, columns_of_speed != 0)
+    assert torch.equal(blown.flatten(1).any(1), done["blown"].bool())
+    if loaded.agent.speed_field is not None:
+        speed = loaded.agent.speed * (torch.stack([rows_of_speed, columns_of_speed], 1).float() - 2)
+        field = loaded.agent.speed_field
+        untouched = start.state[field].clone()
+        untouched[(placed != NO_ELEMENT)[:, None].expand_as(untouched)] = 0
+        assert torch.equal(torch.where(blown[:, None], speed, untouched), after.state[field])
+
+
+def test_the_encoder_has_elements_fields_and_actions() -> None:
+    encoder = ActionChannels(slots=4, observed=2)
+    inputs = torch.tensor([[[3, 1]], [[128, 255]], [[NO_ELEMENT, 2]], [[1, 0]], [[3, 0]]], dtype=torch.uint8)
+    cells = encoder(inputs[:, 0][None, :, None]).squeeze()
+    assert encoder.channels == 4 + 1 + 4 == len(cells)
+    assert cells[:4].T.tolist() == [[0, 0, 0, 1], [0, 0, 1, 0]]  # the second cell holds what was placed
+    assert cells[4].tolist() == [0, 255 / 128 - 1]
+    assert cells[5:].T.tolist() == [[0, 1, -1, 1], [1, 0, 0, 0]]
+    hidden = encoder(without_actions(inputs[:, 0][None, :, None])).squeeze()
+    assert hidden[:4].T.tolist() == [[0, 0, 0, 1], [0, 1, 0, 0]]
+    assert not hidden[5:].any()
+    blind = ActionChannels(slots=4, observed=2, actions=False)
+    assert torch.equal(blind(inputs[:, 0][None, :, None]).squeeze(), hidden[: blind.channels])
+
+
+def test_pairs_are_transitions_of_the_dataset(recording: Recording) -> None:
+    numbers = recording.eligible(recording.all)
+    inputs, ends = recording.pairs(recording.all, numbers)
+    observed = len(recording.dataset.recipe.channels)
+    assert inputs.shape[1] == observed + 3
+    place = 0
+    for number in range(len(recording.dataset)):
+        episode = recording.dataset.episode(number)
+        count = len(episode.action) - 1  # the last action has nine free steps besides
+        assert torch.equal(inputs[place : place + count, :observed], episode.observation[:count])
+        assert torch.equal(ends[place : place + count], episode.observation[1 : count + 1, 0])
+        assert torch.equal(
+            inputs[place : place + count, observed:], recording.painted(episode.action[:count])
+        )
+        place += count
+    assert place == len(numbers)
+
+
+def test_parts_share_no_world(recording: Recording) -> None:
+    worlds = [set(one.worlds.tolist()) for one in recording.parts]
+    assert all(worlds)
+    assert sum(map(len, worlds)) == len(set.union(*worlds)) == 40
+
+
+# Training
+
+
+def test_a_network_learns_what_the_action_does(recording: Recording, tmp_path: Path) -> None:
+    config = tiny(iterations=150)
+    found = train(config, tmp_path / "run", machine=HERE, recording=recording, validate_every=50)
+    trained = load_trained(found)
+    (scores,) = evaluate_recording(trained, recording, machine=HERE).scores.values()
+    blind = recording.configured(config).recorded
+    assert blind is not None
+    ignoring = replace(config, recorded=replace(blind, actions=False))
+    other = load_trained(train(ignoring, tmp_path / "blind", machine=HERE, recording=recording))
+    (without,) = evaluate_recording(other, recording, machine=HERE).scores.values()
+    assert list(scores) == ["model", "action hidden", "nothing changes", "most frequent outcome"]
+    assert list(without) == ["model", "nothing changes", "most frequent outcome"]
+    assert scores["model"].loss < 0.8 * without["model"].loss
+    assert scores["model"].loss < scores["action hidden"].loss
+    assert (scores["model"].change_f1 or 0) > (without["model"].change_f1 or 0)
+
+
+def test_an_interrupted_run_ends_with_the_same_weights(folder: Path, tmp_path: Path) -> None:
+    config, recording = tiny(), opened(folder)
+    whole = train(config, tmp_path / "whole", machine=HERE, recording=recording)
+
+    def stop(now: object) -> None:
+        if getattr(now, "done", 0) == 11:
+            raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        train(config, tmp_path / "parts", machine=HERE, recording=recording, save_seconds=0, tell=stop)
+    parts = train(config, tmp_path / "parts", machine=HERE, recording=opened(folder), validate_every=7)
+    assert same(weights(parts), weights(whole))
+
+
+# The command line
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of recordings, to change and to work in."""
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+QUICK = ("--width", 4, "--batch", 4, "--iterations", 3)
+
+
+def test_train_eval_and_show(copy: Path) -> None:
+    words = ("wm", "train", "--data", "compact", "--task", "builders.yaml", *QUICK)
+    trained = run(*words, "--slots", 20)
+    assert trained.exit_code == 0, trained.output
+    about = json.loads(Path("runs/builders/run.json").read_text())
+    assert about["dataset"] == "compact"
+    assert about["config"]["recorded"]["channels"][0] == "element"
+    assert len(about["config"]["palette"]) == 20
+    tested = run("wm", "eval", "builders", "--json")
+    assert tested.exit_code == 0, tested.output
+    found = json.loads(tested.stdout)
+    assert list(found["mean"]) == ["model", "action hidden", "nothing changes", "most frequent outcome"]
+    assert list(found["tests"]) == ["transitions"]
+    shown = run("wm", "show", "builders", "--out", "strips.png")
+    assert shown.exit_code == 0, shown.output
+    assert len(shown.stdout.splitlines()) == 8
+    ignoring = run(*words, "--ignore-actions")
+    assert ignoring.exit_code == 0, ignoring.output
+    assert run("wm", "eval", "builders-blind").exit_code == 0
+
+
+def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> None:
+    train(tiny(iterations=2), "run", machine=HERE, recording=opened(copy))
+    record("builders.yaml", "nothing", "still", episodes=30, seed=500, backend="torch")
+    tested = run("wm", "eval", "run", "--data", "still", "--json")
+    assert tested.exit_code == 0, tested.output
+    assert json.loads(tested.stdout)["worlds_each"] == 30 * 5  # all transitions but the last ones
+    other = run("wm", "eval", "run", "--data", "compact")
+    assert other.exit_code == 2
+    assert "PD623" in other.output
+    assert "`channels`" in other.output
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("train", "--data", "nowhere"), "PD630"),
+        (("train", "--data", "ids"), "give its file: `--task FILE`"),
+        (("train", "--data", "ids", "--task", "sand-pushing"), "does not fit the task sand-pushing"),
+        (("train", "--data", "ids", "--task", "builders.yaml", "--states", 10), "--states selects worlds"),
+        (
+            ("train", "--data", "ids", "--task", "builders.yaml", "--held-out", "sand"),
+            "--held-out selects worlds",
+        ),
+        (("train", "--ignore-actions"), "--ignore-actions goes with --data"),
+        (("eval", "run", "--split", "train"), "--split selects worlds"),
+        (("eval", "run", "--worlds", "3"), "--worlds selects worlds"),
+        (("show", "run", "--out", "a.png", "--steps", "4"), "--steps selects worlds"),
+        (("finetune", "run", "--packs", "lava"), "it learned from a dataset"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(words: tuple[object, ...], said: str, copy: Path) -> None:
+    if words[1] == "run":
+        train(tiny(iterations=1), "run", machine=HERE, recording=opened(copy))
+    result = run("wm", *words)
+    assert result.exit_code == 2, result.output
+    assert said in result.output
+    assert not Path("runs").exists()
+
+
+def test_a_run_of_worlds_takes_no_dataset(copy: Path, dunes: str) -> None:
+    assert (
+        run(
+            "wm", "train", "--task", dunes, "--run", "run", *QUICK, "--states", 4, "--backend", "torch"
+        ).exit_code
+        == 0
+    )
+    result = run("wm", "eval", "run", "--data", "ids")
+    assert result.exit_code == 2
+    assert "--data is for networks that learned from a dataset" in result.output
+    with pytest.raises(CompileError) as error:
+        evaluate_recording(load_trained("run"), opened(copy))
+    assert error.value.diagnostics[0].code == "PD623"
+    recorded = load_trained(train(tiny(iterations=1), "other", machine=HERE, recording=opened(copy)))
+    for action in (lambda: evaluate(recorded), lambda: finetuned(recorded, ["lava"])):
+        with pytest.raises(CompileError) as error:
+            action()
+        assert error.value.diagnostics[0].code == "PD623"
+
+
+def test_another_dataset_is_another_run(copy: Path) -> None:
+    train(tiny(iterations=1), "run", machine=HERE, recording=opened(copy))
+    record("builders.yaml", "nothing", "still", episodes=40, backend="torch")
+    other = open_recording("still", "builders.yaml")
+    with pytest.raises(CompileError) as error:
+        train(tiny(iterations=1), "run", machine=HERE, recording=other)
+    assert error.value.diagnostics[0].code == "PD621"
+    assert any("`recorded.digest`" in note for note in error.value.diagnostics[0].notes)
+
+
+# Strangers' files
+
+
+def test_a_manifest_does_not_choose_which_file_is_read(copy: Path) -> None:
+    path = copy / "ids" / "dataset.json"
+    about = json.loads(path.read_text())
+    for name in (str(copy / "builders.yaml"), "../builders.yaml", "builders.yaml"):
+        about["recipe"]["task"] = name
+        path.write_text(json.dumps(about))
+        with pytest.raises(CompileError) as error:
+            open_recording(copy / "ids")
+        assert error.value.diagnostics[0].code == "PD631"
+
+
+def test_a_changed_task_is_refused(copy: Path) -> None:
+    task = Path("builders.yaml")
+    task.write_text(BUILDERS.replace("brush: [4, 7]", "brush: [4, 6]"), encoding="utf-8")
+    with pytest.raises(CompileError) as error:
+        open_recording("ids", "builders.yaml")
+    assert error.value.diagnostics[0].code == "PD631"
+    assert "have changed since" in error.value.diagnostics[0].notes[0]
+
+
+def test_too_few_worlds_are_refused(copy: Path) -> None:
+    record("builders.yaml", "nothing", "few", episodes=3, worlds=1, backend="torch")
+    with pytest.raises(CompileError) as error:
+        open_recording("few", "builders.yaml")
+    assert error.value.diagnostics[0].code == "PD631"
+    assert "too few worlds" in error.value.diagnostics[0].message
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"channels": []},
+        {"channels": ["element"] * 5000},
+        {"channels": ["wind", "element"]},
+        {"channels": 3},
+        {"channels": ["element", "more"]},
+        {"actions": False},
+        {"evil": 1},
+    ],
+)
+def test_damaged_runs_are_refused(wrong: dict[str, object], copy: Path) -> None:
+    found = train(tiny(iterations=1), "run", machine=HERE, recording=opened(copy))
+    about = json.loads((found.path / "run.json").read_text())
+    about["config"]["recorded"] |= wrong
+    (found.path / "run.json").write_text(json.dumps(about))
+    with pytest.raises(CompileError) as error:
+        load_trained("run")
+    assert error.value.diagnostics[0].code in ("PD620", "PD623")
+
+
+def test_inputs_stay_bytes(recording: Recording) -> None:
+    inputs: Tensor
+    inputs, ends = recording.pairs(recording.all, torch.arange(4))
+    assert inputs.dtype == ends.dtype == torch.uint8
+    assert isinstance(recording.dataset, Dataset)
