@@ -78,6 +78,23 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert np.asarray(Image.open(out)).shape == (2 * 32 + 4, 4 * 40 + 4, 3)
 
 
+def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
+    folder, out = tmp_path / "run", tmp_path / "curve.png"
+    assert run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5)).exit_code == 0
+    shown = run("wm", "show", folder, "--curve", "--out", out)
+    assert shown.exit_code == 0, shown.output
+    assert np.asarray(Image.open(out)).shape[:2] == (600, 900)
+    lines = folder / "metrics.jsonl"
+    lines.write_text(
+        lines.read_text() + '{"step": 30, "loss/train": "x", "loss/validation": null}\n', encoding="utf-8"
+    )
+    assert run("wm", "show", folder, "--curve", "--out", out).exit_code == 0
+    lines.unlink()
+    missing = run("wm", "show", folder, "--curve", "--out", out)
+    assert missing.exit_code == 2
+    assert "has no losses yet" in missing.output
+
+
 def test_packs_take_all_words_up_to_the_next_option(dunes: str, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     result = run(*begin(dunes, folder, "--packs", "core", "sand", "--iterations", 1))
@@ -110,7 +127,7 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
         (("finetune", "nowhere", "--packs", "sand"), "PD620"),
         (("finetune", "nowhere"), "--packs names what is to be learned"),
         (("eval", "nowhere"), "PD620"),
-        (("show", "nowhere", "--out", "x.gif"), "strips are a .png file"),
+        (("show", "nowhere", "--out", "x.gif"), "pictures are .png files"),
         (("show", "nowhere", "--out", "no/where.png"), "PD613"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +13,12 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import check_writable
-from powderdsl.cli.output import print_json, progress, table
+from powderdsl.cli.output import print_json, progress
+from powderdsl.cli.wm_report import told, write_curve
 
 if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
     from powderdsl.worldmodel.config import Machine, TrainConfig
-    from powderdsl.worldmodel.evaluation import Tested
     from powderdsl.worldmodel.networks import CustomNetwork
     from powderdsl.worldmodel.recordings import Recording
     from powderdsl.worldmodel.strips import Strip
@@ -258,12 +258,13 @@ def eval_command(
     if layout == "json":
         print_json(plain)
     else:
-        click.echo("\n".join(_text(tested, plain)))
+        click.echo("\n".join(told(tested, plain)))
 
 
 @command.command("show", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN")
 @opt.path("--out", "FILE", "The .png file to write.", required=True)
+@opt.flag("--curve", "Plot the losses of the training instead.")
 @opt.integer("--steps", 1, 4096, "Steps to predict.  [default: as trained]")
 @opt.integer("--after", 0, 10**6, "Steps that worlds run before the start.  [default: 0]")
 @opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]")
@@ -276,6 +277,7 @@ def eval_command(
 def show_command(
     run: str,
     out: Path,
+    curve: bool,
     steps: int | None,
     after: int | None,
     scale: int,
@@ -285,11 +287,18 @@ def show_command(
 ) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
-    For several times the steps that the network was trained for, it is applied to what it predicted.
+    For several times the steps that the network was trained for, it is applied to what it predicted. With --curve, the
+    losses on training and on held-out worlds are plotted against the iterations, from the run's metrics.
     """
     if out.suffix.lower() != ".png":
-        raise BadInput(f"`{out}`: strips are a .png file")
+        raise BadInput(f"`{out}`: pictures are .png files")
     check_writable(out)
+    if curve:
+        from powderdsl.experiments.runs import find_run
+        from powderdsl.worldmodel.training import KIND
+
+        write_curve(find_run(run, KIND), out)
+        return
     from powderdsl.worldmodel.evaluation import unseen_worlds
     from powderdsl.worldmodel.strips import recorded_strips, strips
     from powderdsl.worldmodel.trained import load_trained
@@ -430,54 +439,3 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
     click.echo(
         f"{run.path}: {config.iterations:,} iterations, {took:.0f} s here; powderdsl wm eval {run.path}"
     )
-
-
-def _text(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
-
-    predictors = list(plain["mean"])
-    yield f"{tested.rules}, {tested.task}/{tested.split}, after {tested.step:,} iterations: loss (accuracy; of cells that change)"
-    rows = [["", *predictors]]
-    for name, found in {**plain["tests"], "mean": plain["mean"]}.items():
-        rows.append([name, *(_figures(found[who]) for who in predictors)])
-    yield from ("", *table(rows))
-    yield ""
-    rows = [["element", "cells", "recall", "precision"]]
-    for name, one in plain["elements"].items():
-        rows.append([name, f"{one['cells']:,}", _share(one["recall"]), _share(one["precision"])])
-    yield from table(rows)
-    yield ""
-    rows = [["changes, calibration", "recall", "precision", "F1", "ECE", "ECE, changed", "ECE, of change"]]
-    for who, one in plain["mean"].items():
-        shares = (_share(one[name]) for name in ("changed_accuracy", "change_precision", "change_f1"))
-        errors = (_number(one[name]) for name in ("ece", "changed_ece", "change_ece"))
-        rows.append([who, *shares, *errors])
-    yield from table(rows)
-    yield ""
-    yield from table(_reliability(plain["reliability"]))
-    for name, lacking in plain["left_out"].items():
-        yield f"left out: {name}, which needs {', '.join(lacking)}"
-
-
-def _figures(one: Mapping[str, Any]) -> str:
-    return f"{one['loss']:.4f} ({_share(one['accuracy'])}; {_share(one['changed_accuracy'])})"
-
-
-def _reliability(tables: Mapping[str, Any]) -> list[list[str]]:
-    """Rows by probability: what was predicted of all and of changed cells, and how likely a change was."""
-    rows = [["probability", "cells", "right", "changed", "right", "of change", "changed"]]
-    by_low = {name: {one["low"]: one for one in bins} for name, bins in tables.items()}
-    for low, high in sorted({(one["low"], one["high"]) for bins in tables.values() for one in bins}):
-        cells = []
-        for name in ("all", "changed", "change"):
-            one = by_low[name].get(low)
-            cells += ["", ""] if one is None else [f"{one['cells']:,}", _share(one["observed"])]
-        rows.append([f"{low:.2f} to {high:.2f}", *cells])
-    return rows
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4f}"
-
-
-def _share(value: float | None) -> str:
-    return "–" if value is None else f"{100 * value:.1f} %"

@@ -1,0 +1,102 @@
+"""What `powderdsl wm` reports: tables of a test, and the curves of a training."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.output import table
+
+if TYPE_CHECKING:
+    from powderdsl.experiments.runs import RunFolder
+    from powderdsl.worldmodel.evaluation import Tested
+
+CURVES = {"loss/train": "training worlds", "loss/validation": "held-out worlds"}
+"""Metrics that are plotted, and their labels."""
+
+
+def told(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
+    """The results of a test as tables. `plain` has them for JSON."""
+    predictors = list(plain["mean"])
+    yield f"{tested.rules}, {tested.task}/{tested.split}, after {tested.step:,} iterations: loss (accuracy; of cells that change)"
+    rows = [["", *predictors]]
+    for name, found in {**plain["tests"], "mean": plain["mean"]}.items():
+        rows.append([name, *(_figures(found[who]) for who in predictors)])
+    yield from ("", *table(rows))
+    yield ""
+    rows = [["element", "cells", "recall", "precision"]]
+    for name, one in plain["elements"].items():
+        rows.append([name, f"{one['cells']:,}", _share(one["recall"]), _share(one["precision"])])
+    yield from table(rows)
+    yield ""
+    rows = [["changes, calibration", "recall", "precision", "F1", "ECE", "ECE, changed", "ECE, of change"]]
+    for who, one in plain["mean"].items():
+        shares = (_share(one[name]) for name in ("changed_accuracy", "change_precision", "change_f1"))
+        errors = (_number(one[name]) for name in ("ece", "changed_ece", "change_ece"))
+        rows.append([who, *shares, *errors])
+    yield from table(rows)
+    yield ""
+    yield from table(_reliability(plain["reliability"]))
+    for name, lacking in plain["left_out"].items():
+        yield f"left out: {name}, which needs {', '.join(lacking)}"
+
+
+def _figures(one: Mapping[str, Any]) -> str:
+    return f"{one['loss']:.4f} ({_share(one['accuracy'])}; {_share(one['changed_accuracy'])})"
+
+
+def _reliability(tables: Mapping[str, Any]) -> list[list[str]]:
+    """Rows by probability: what was predicted of all and of changed cells, and how likely a change was."""
+    rows = [["probability", "cells", "right", "changed", "right", "of change", "changed"]]
+    by_low = {name: {one["low"]: one for one in bins} for name, bins in tables.items()}
+    for low, high in sorted({(one["low"], one["high"]) for bins in tables.values() for one in bins}):
+        cells = []
+        for name in ("all", "changed", "change"):
+            one = by_low[name].get(low)
+            cells += ["", ""] if one is None else [f"{one['cells']:,}", _share(one["observed"])]
+        rows.append([f"{low:.2f} to {high:.2f}", *cells])
+    return rows
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f} %"
+
+
+def write_curve(run: RunFolder, out: Path) -> None:
+    """Plot the losses of a run against its iterations (PNG, or what else the suffix says).
+
+    Raises:
+        BadInput: the run has no losses yet. CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
+    """
+    from powderdsl.experiments.bench.plot import require_matplotlib
+    from powderdsl.experiments.runs.metrics import read_metrics
+    from powderdsl.system.writing import replacing
+
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    lines = list(read_metrics(run.path))
+    found = {
+        name: [(one["step"], one[name]) for one in lines if isinstance(one.get(name), float)]
+        for name in CURVES
+    }
+    if not any(found.values()):
+        raise BadInput(f"{run.path} has no losses yet")
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for name, points in found.items():
+        if points:
+            axes.plot(*zip(*points, strict=True), marker="" if len(points) > 40 else ".", label=CURVES[name])
+    axes.set_yscale("log")
+    axes.set_xlabel("iterations")
+    axes.set_ylabel("cross-entropy per cell (nats)")
+    axes.grid(linewidth=0.3)
+    axes.legend(fontsize=8)
+    with replacing(out) as temporary:
+        figure.savefig(temporary, dpi=150)
