@@ -143,7 +143,7 @@ def test_parts_share_no_world(recording: Recording) -> None:
 
 
 def test_a_network_learns_what_the_action_does(folder: Path, tmp_path: Path) -> None:
-    config, recording = tiny(iterations=100), opened(folder, "compact")
+    config, recording = tiny(iterations=150), opened(folder, "compact")
     found = train(config, tmp_path / "run", machine=HERE, recording=recording, validate_every=50)
     trained = load_trained(found)
     (scores,) = evaluate_recording(trained, recording, machine=HERE).scores.values()

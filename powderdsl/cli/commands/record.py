@@ -236,7 +236,7 @@ def _exchanged(
         raise BadInput("--to-minari and --from-minari take --out and no --episodes; give one of them")
     if to_minari is not None and task is not None:
         raise BadInput("--to-minari takes no TASK: it writes what --out holds")
-    _require_gymnasium()
+    require_gymnasium()
     from powderdsl.datasets import minari
     from powderdsl.datasets.dataset import Dataset
 
