@@ -39,7 +39,8 @@ from powderdsl.worlds.scene import load_start
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+ROOT_PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md")
+PAGES = [*(ROOT / name for name in ROOT_PAGES), *sorted(DOCS.rglob("*.md"))]
 SLOW = {"docs/libraries.md"}
 MANY_STEPS = 4
 """Commands that run longer are cut to this many steps: what they print does not depend on it."""

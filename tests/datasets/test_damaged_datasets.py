@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from powderdsl.datasets import Dataset
+from powderdsl.datasets import Dataset, Transitions
 from powderdsl.datasets.shards import write_shard
 from powderdsl.diagnostics import CompileError
 
@@ -42,11 +42,13 @@ def reasons(folder: Path) -> list[str]:
 
 def said_of(folder: Path) -> set[str]:
     """The codes of what is said of a dataset that may pass; nothing else is raised."""
-    try:
-        Dataset.open(folder).check()
-    except CompileError as error:
-        return {one.code for one in error.diagnostics}
-    return set()
+    codes: set[str] = set()
+    for read in (lambda data: data.check(), lambda data: Transitions(data)[:]):
+        try:
+            read(Dataset.open(folder))
+        except CompileError as error:
+            codes |= {one.code for one in error.diagnostics}
+    return codes
 
 
 def manifest(folder: Path, change: Callable[[Any], Any]) -> None:
@@ -185,6 +187,8 @@ def test_a_flipped_bit_is_seen_before_anything_is_read(place: int, folder: Path)
         dataset.episode(8)
     with pytest.raises(CompileError, match="SHA-256"):
         next(dataset.transitions(500))
+    with pytest.raises(CompileError, match="PD630"):
+        Transitions(dataset)[:]
     # A flipped bit that the manifest vouches for is either seen or changes nothing but numbers.
     sealed(folder)
     assert said_of(folder) <= {"PD630"}
