@@ -1,13 +1,15 @@
 """World models: networks that learn to predict a world some steps on (Frans & Isola 2023, section 4).
 
-`pairs` makes the data, `replay` keeps it, `unet` is the paper's network, `training`, `evaluation` and `scores` take that one or any
-other: a callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
+`pairs` makes the data, `replay` keeps it, `recordings` are transitions with actions. `unet` is the paper's network;
+`training`, `evaluation` and `scores` take that one or any other: a callable from ids uint8 [B, H, W] to logits
+[B, slots, H, W].
 """
 
 from powderdsl.worldmodel.config import PRESETS, Machine, TrainConfig
-from powderdsl.worldmodel.evaluation import Tested, evaluate
+from powderdsl.worldmodel.evaluation import Tested, evaluate, evaluate_recording
 from powderdsl.worldmodel.networks import CustomNetwork, custom_network
 from powderdsl.worldmodel.pairs import DataConfig, TaskWorlds, Worlds, pairs_of, task_worlds, unseen_seeds
+from powderdsl.worldmodel.recordings import Recording, open_recording
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.scores import Score, frequent, outcomes, score, still
 from powderdsl.worldmodel.trained import Trained, finetuned, load_trained
@@ -19,6 +21,7 @@ __all__ = [
     "CustomNetwork",
     "DataConfig",
     "Machine",
+    "Recording",
     "Replay",
     "Score",
     "TaskWorlds",
@@ -29,10 +32,12 @@ __all__ = [
     "Worlds",
     "custom_network",
     "evaluate",
+    "evaluate_recording",
     "finetuned",
     "frequent",
     "fresh_unet",
     "load_trained",
+    "open_recording",
     "outcomes",
     "pairs_of",
     "score",
