@@ -81,13 +81,9 @@ class Nodes:
                     found[int(place.name)] = line.decode(errors="replace").strip()
         return found
 
-    def workers(self) -> list[int]:
-        """Processes that are running a task."""
-        return [
-            pid
-            for pid, line in self.processes().items()
-            if line.startswith("ray::") and not line.startswith("ray::IDLE")
-        ]
+    def workers(self, tasks: str) -> list[int]:
+        """Processes that are running a task whose name starts with a word."""
+        return [pid for pid, line in self.processes().items() if line.startswith(f"ray::{tasks}")]
 
     def kill_node(self, node: int) -> int:
         """Kill all processes of a node at once, as when a machine dies; returns how many there were."""

@@ -134,13 +134,13 @@ def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
         study = _Driver(tmp_path, nodes, stack)
         node = nodes.started
         for kill in kills:
-            assert waited(nodes.workers, 300), study.said()
-            time.sleep(chance.uniform(0.5, 12))
-            assert waited(nodes.workers, 300), study.said()
+            assert waited(lambda: nodes.workers("tiny"), 300), study.said()
+            time.sleep(chance.uniform(1, 30))
+            assert waited(lambda: nodes.workers("tiny"), 300), study.said()
             assert study.running.poll() is None, study.said()
             match kill:
                 case "worker":
-                    os.kill(chance.choice(nodes.workers()), 9)
+                    os.kill(chance.choice(nodes.workers("tiny")), 9)
                 case "node":
                     assert nodes.kill_node(node) > 1
                     node = nodes.start_node()

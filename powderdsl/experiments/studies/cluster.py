@@ -76,7 +76,7 @@ def run_on_ray(
         note: shows a sentence to the user.
 
     Raises:
-        CompileError: PD612 without Ray, PD626 if there is no such cluster.
+        CompileError: PD612 without Ray, PD626 if there is no such cluster, or the connection to it is lost.
     """
     require_ray()
     # Commands are run elsewhere, in other working directories.
@@ -100,7 +100,7 @@ def run_on_ray(
                 ended, _ = ray.wait(list(running), timeout=1.0)
                 for one in ended:
                     point = running.pop(one)
-                    done[point] = _outcome(ray, one, point)
+                    done[point] = _outcome(ray, one, point, address)
                     told(done[point])
         except BaseException:
             for one in running:
@@ -136,13 +136,21 @@ def _lacking(ray: Any, asked: Sequence[dict[str, float]]) -> list[str]:
     return list(found.values())
 
 
-def _outcome(ray: Any, task: Any, point: Point) -> Outcome:
+def _outcome(ray: Any, task: Any, point: Point, address: str) -> Outcome:
     try:
         found: Outcome = ray.get(task)
+    except ray.exceptions.LocalRayletDiedError as error:  # no task will ever end
+        helps = ("start it again with `ray start`; the same command then resumes here",)
+        raise _no_cluster(
+            address, _words(error), helps, "lost the Ray node of this machine in the cluster"
+        ) from None
     except Exception as error:  # whatever ended the task, the others continue
-        lines = str(error).strip().splitlines() or [""]
-        return Outcome(point, {}, f"{type(error).__name__}: {lines[-1].strip()[:300]}")
+        return Outcome(point, {}, f"{type(error).__name__}: {_words(error)}")
     return found
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:400] or type(error).__name__
 
 
 @contextmanager
@@ -155,7 +163,7 @@ def _connected(address: str) -> Iterator[Any]:
     try:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:
-        raise _no_cluster(address, " ".join(str(error).split())[:400] or type(error).__name__) from None
+        raise _no_cluster(address, _words(error)) from None
     try:
         yield ray
     finally:
@@ -175,9 +183,13 @@ def check_address(address: str) -> None:
         raise _no_cluster(address, getattr(error, "strerror", None) or str(error)) from None
 
 
-def _no_cluster(address: str, reason: str) -> CompileError:
-    helps = ("start one with `ray start --head`, which prints its address",)
-    return failure("PD626", f"no Ray cluster at `{address[:80]}`", notes=(reason,), helps=helps)
+def _no_cluster(
+    address: str,
+    reason: str,
+    helps: tuple[str, ...] = ("start one with `ray start --head`, which prints its address",),
+    what: str = "no Ray cluster",
+) -> CompileError:
+    return failure("PD626", f"{what} at `{address[:80]}`", notes=(reason,), helps=helps)
 
 
 def _version() -> str:
