@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -105,9 +106,24 @@ def test_where_no_cluster_is_the_user_is_told_at_once(
 @pytest.mark.slow
 @needs_ray
 @needs_proc
-def test_a_cluster_runs_a_study(tmp_path: Path) -> None:
-    written(tmp_path, 1, [12, 24])
+def test_a_cluster_runs_a_study_and_sigterm_ends_one(tmp_path: Path) -> None:
     with cluster(1) as nodes:
+        written(tmp_path, 1, [900_000_000])
+        with ExitStack() as stack:
+            endless = _Driver(tmp_path, nodes, stack, "endless")
+            place = tmp_path / "endless/runs/steps=900000000,seed=0"
+            assert waited(
+                lambda: endless.running.poll() is not None or any(place.glob("trained/checkpoints/[0-9]*"))
+            )
+            endless.running.send_signal(signal.SIGTERM)
+            endless.running.wait(timeout=120)
+            assert endless.running.returncode == 143, endless.said()
+            assert endless.said().endswith("terminated by SIGTERM\n")
+            assert "Traceback" not in endless.said()
+        assert (place / "trained.log").read_text(encoding="utf-8").endswith("terminated by SIGTERM\n")
+        assert not list(place.glob("claim-*"))
+        assert not [line for line in nodes.processes().values() if " train " in line]
+        written(tmp_path, 1, [12, 24])
         found = run_study(tmp_path, "--out", "out", "--ray", nodes.address)
     assert found.returncode == 0, found.stderr
     results = json.loads((tmp_path / "out/results.json").read_text(encoding="utf-8"))
@@ -131,7 +147,7 @@ def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
     kills = chance.sample(KILLS, len(KILLS))
     done: dict[str, tuple[int, int]] = {}
     with cluster(2) as nodes, ExitStack() as stack:
-        study = _Driver(tmp_path, nodes, stack)
+        study = _Driver(tmp_path, nodes, stack, "out")
         node = nodes.started
         for kill in kills:
             assert waited(lambda: nodes.workers("tiny"), 300), study.said()
@@ -140,7 +156,7 @@ def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
             assert study.running.poll() is None, study.said()
             match kill:
                 case "worker":
-                    os.kill(chance.choice(nodes.workers("tiny")), 9)
+                    os.kill(chance.choice(nodes.workers("tiny")), signal.SIGKILL)
                 case "node":
                     assert nodes.kill_node(node) > 1
                     node = nodes.start_node()
@@ -167,13 +183,13 @@ def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
 class _Driver:
     """The process that submits the study, which may be killed and started again."""
 
-    def __init__(self, folder: Path, nodes: Nodes, stack: ExitStack):
-        self.folder, self.nodes, self.stack = folder, nodes, stack
+    def __init__(self, folder: Path, nodes: Nodes, stack: ExitStack, out: str):
+        self.folder, self.nodes, self.stack, self.out = folder, nodes, stack, out
         self.start()
 
     def start(self) -> None:
         log = (self.folder / "driver.log").open("a", encoding="utf-8")
-        command = command_line("study", "study.yaml", "--out", "out", "--ray", self.nodes.address)
+        command = command_line("study", "study.yaml", "--out", self.out, "--ray", self.nodes.address)
         options = {"stdout": log, "stderr": log, "cwd": self.folder, "env": environment_with()}
         self.running = self.stack.enter_context(started(command, **options))
         log.close()

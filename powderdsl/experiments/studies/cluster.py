@@ -10,9 +10,12 @@ import logging
 import os
 import platform
 import re
+import signal
 import socket
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
@@ -24,7 +27,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.studies.claims import LEASE
 from powderdsl.experiments.studies.run import ABOUT_STUDY, Outcome, StudyRun
 from powderdsl.experiments.studies.study import Point, Study, filled
-from powderdsl.system.interrupts import GRACE
+from powderdsl.system.interrupts import GRACE, SIGNALS
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
 
@@ -34,7 +37,6 @@ PATIENCE = LEASE + GRACE
 """Seconds that a task waits for a process that holds its point: one of a dead driver's saves its last checkpoint."""
 QUIET = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_BACKEND_LOG_LEVEL": "error",
     "RAY_NUM_REDIS_GET_RETRIES": "2",
 }
 """Environment of the driver, where the user has not set it: fewer warnings, and fewer attempts to connect."""
@@ -88,7 +90,8 @@ def run_on_ray(
             note(f"no node of the cluster has {lacking} yet: runs wait for one")
         task = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD")(run_point)
         waiting = list(reversed(points))
-        running: dict[Any, Point] = {}
+        # Futures, because a signal that comes while Ray itself waits is no longer known when it returns.
+        running: dict[Future[Outcome], tuple[Any, Point]] = {}
         try:
             while waiting or running:
                 while waiting and len(running) < (jobs or AHEAD):
@@ -96,18 +99,17 @@ def run_on_ray(
                     asked = resources(study, point, run.size, run.threads)
                     name = f"{study.name} {point.name}"
                     arguments = (study, str(folder), run.size, run.threads, point, _version())
-                    running[task.options(name=name, **asked).remote(*arguments)] = point
-                ended, _ = ray.wait(list(running), timeout=1.0)
-                for one in ended:
-                    point = running.pop(one)
+                    started = task.options(name=name, **asked).remote(*arguments)
+                    running[started.future()] = started, point
+                for one in wait(running, return_when=FIRST_COMPLETED).done:
+                    _, point = running.pop(one)
                     done[point] = _outcome(ray, one, point, address)
                     told(done[point])
         except BaseException:
-            for one in running:
+            for started, _ in running.values():
                 with suppress(Exception):
-                    ray.cancel(one)
-            if running:
-                ray.wait(list(running), num_returns=len(running), timeout=GRACE)
+                    ray.cancel(started)
+            wait(running, timeout=GRACE)
             raise
     return [done[point] for point in points]
 
@@ -136,9 +138,9 @@ def _lacking(ray: Any, asked: Sequence[dict[str, float]]) -> list[str]:
     return list(found.values())
 
 
-def _outcome(ray: Any, task: Any, point: Point, address: str) -> Outcome:
+def _outcome(ray: Any, task: Future[Outcome], point: Point, address: str) -> Outcome:
     try:
-        found: Outcome = ray.get(task)
+        return task.result()
     except ray.exceptions.LocalRayletDiedError as error:  # no task will ever end
         helps = ("start it again with `ray start`; the same command then resumes here",)
         raise _no_cluster(
@@ -146,7 +148,6 @@ def _outcome(ray: Any, task: Any, point: Point, address: str) -> Outcome:
         ) from None
     except Exception as error:  # whatever ended the task, the others continue
         return Outcome(point, {}, f"{type(error).__name__}: {_words(error)}")
-    return found
 
 
 def _words(error: Exception) -> str:
@@ -160,10 +161,18 @@ def _connected(address: str) -> Iterator[Any]:
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     ray = import_module("ray")
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     try:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:
         raise _no_cluster(address, _words(error)) from None
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for (
+                number,
+                handler,
+            ) in handlers.items():  # it puts its own below Python's, which abort the process
+                signal.signal(number, handler)
     try:
         yield ray
     finally:
