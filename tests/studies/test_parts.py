@@ -385,6 +385,34 @@ def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None
     assert [points[0] for points in found] == list(load_study("start-states", known).points("paper"))
 
 
+@pytest.mark.skipif(claims.fcntl is None, reason="needs file locks")
+def test_a_step_waits_for_what_a_killed_study_has_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lock of the log outlives the study, in the process that writes there."""
+    monkeypatch.chdir(tmp_path)
+    Path("study.yaml").write_text(STUDY, encoding="utf-8")
+    study, point, place = prepared("out")
+    with (place / "trained.log").open("ab") as log:
+        assert claims.lock_if_free(log.fileno())
+        old = subprocess.Popen(["sleep", "600"], stdout=log)
+    began = threading.Event()
+
+    def begin(*words: object, **options: object) -> None:
+        assert old.poll() is not None
+        began.set()
+        raise OSError("that is enough")
+
+    monkeypatch.setattr(subprocess, "Popen", begin)
+    thread = threading.Thread(target=study.run, args=([point], 1))
+    thread.start()
+    assert not began.wait(0.5)
+    old.kill()
+    old.wait()
+    assert began.wait(30)
+    thread.join()
+
+
 @pytest.mark.slow
 def test_two_processes_and_collect_give_the_table_of_one(tmp_path: Path) -> None:
     (tmp_path / "dig.yaml").write_text(TASK, encoding="utf-8")

@@ -181,6 +181,21 @@ class Claims:
         return not here
 
 
+def lock_if_free(handle: int) -> bool:
+    """Lock an open file until all processes that inherit it have closed it; False if others have locked it.
+
+    Where there are no locks, every file is free.
+    """
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
 def release(path: Path) -> None:
     """Remove a claim of ours, after those before it."""
     number = int(path.name.rpartition("-")[2])

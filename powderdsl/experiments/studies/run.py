@@ -18,7 +18,7 @@ from typing import Any
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, write_json
-from powderdsl.experiments.studies.claims import Claim, Claims, Held, Lost
+from powderdsl.experiments.studies.claims import Claim, Claims, Held, Lost, lock_if_free
 from powderdsl.experiments.studies.study import (
     FLAG,
     TEXT,
@@ -278,14 +278,13 @@ class StudyRun:
 
     def _step(self, step: StudyStep, point: Point, place: Path, claim: Claim) -> str | None:
         """Run a step. Returns the problem if it failed, else None."""
-        if step.makes_run:
-            self._wait_for_last_call(place / step.name)
         log = place / f"{step.name}.log"
         threads = str(self.threads)
         environment = {**os.environ, "OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
         environment[LIFELINE] = "1"
         words = [sys.executable, "-m", "powderdsl", *self.command(step, point, place)]
         with log.open("ab") as file:
+            self._wait_for_last_call(file.fileno(), place / step.name)
             with self._starting:
                 if self._stopped.is_set():
                     raise Canceled("stopped")
@@ -311,9 +310,12 @@ class StudyRun:
         last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
         return "\n".join([f"{step.name} ended with {status}; {log} ends with:", *last])
 
-    def _wait_for_last_call(self, run: Path) -> None:
+    def _wait_for_last_call(self, log: int, run: Path) -> None:
         """Where a study was killed, what it had started may still be saving its last checkpoint."""
         end = time.monotonic() + 2 * GRACE
+        # It has inherited the log with its lock. Where there are no such locks, a run that has begun has one of its own.
+        while not lock_if_free(log) and time.monotonic() < end and not self._stopped.is_set():
+            time.sleep(0.1)
         while (run / ABOUT).exists() and time.monotonic() < end and not self._stopped.is_set():
             try:
                 with held(run, patience=0.5):
