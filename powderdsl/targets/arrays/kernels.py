@@ -264,7 +264,8 @@ class ArrayKernels:
 
     def shift_cells(self, x: Array, dy: int, dx: int, wraps: bool) -> Array:
         """The value at a neighbor, as a new array."""
-        x = self.full(x)
+        if x.shape != self.shape:
+            x = self.copy(x)  # NumPy would lay out what it makes of a broadcast array in another order
         height, _, width = self.shape
         if not wraps:
             x = rows(x, dy, False) if dy else x

@@ -43,7 +43,7 @@ def shifted(x: Array, width: int, dx: int, wraps: bool) -> Array:
         dx %= width
     if not -width < dx < width:
         return np.zeros_like(x)
-    result = np.empty(x.shape, x.dtype)  # in rows, even if x is one number seen as many
+    result = np.empty(x.shape, x.dtype)
     # All rows at once, across their ends, which are then corrected.
     flat, cells = result.reshape(-1), x.reshape(-1)
     if dx >= 0:
