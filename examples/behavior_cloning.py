@@ -113,8 +113,9 @@ def evaluate(policy: nn.Module, rows: Transitions, encode: Callable[[Tensor], Te
 
 def train(policy: nn.Module, env: PowderVectorEnv, args: argparse.Namespace) -> list[dict[str, float]]:
     """Fit the policy to the recorded actions. Returns the learning curve, one row for each evaluation."""
-    data = Dataset.open(args.data)
-    data.require(env.tensors)  # elements, sizes and actions mean what they mean in the environment
+    data = [Dataset.open(folder) for folder in args.data]
+    for one in data:
+        one.require(env.tensors)  # elements, sizes and actions mean what they mean in the environment
     training, held_out = split(Transitions(data), (0.9, 0.1), seed=args.seed)  # by world
     encode = env.tensors.action_form.encode  # from the five recorded numbers to the one of this environment
     optimizer = torch.optim.Adam(policy.parameters(), args.lr)
@@ -148,7 +149,9 @@ def main(arguments: list[str] | None = None) -> dict[str, float]:
     """Train and compare. Returns the mean return of each policy and the accuracy on held-out worlds."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--task", default="sand-pushing", help="a shipped task, or a task file")
-    parser.add_argument("--data", required=True, help="folder of `powderdsl record TASK --policy expert`")
+    parser.add_argument(
+        "--data", required=True, nargs="+", help="folders of `powderdsl record TASK --policy expert`"
+    )
     parser.add_argument("--updates", type=int, default=600)
     parser.add_argument("--batch", type=int, default=64, help="transitions of an update")
     parser.add_argument("--every", type=int, default=100, help="updates between evaluations")

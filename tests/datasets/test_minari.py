@@ -306,6 +306,26 @@ def test_damaged_ones_are_refused(
     assert any(says in note for one in caught.value.diagnostics for note in one.notes)
 
 
+def test_flipped_bytes_are_seen_or_change_numbers(recorded: Dataset, root: Path, tmp_path: Path) -> None:
+    """Whatever HDF5 makes of a damaged file, the import raises nothing but diagnostics."""
+    to_minari(recorded, ID)
+    path = root / ID / "data" / "main_data.hdf5"
+    whole = path.read_bytes()
+    generator = np.random.default_rng(5)
+    codes: list[str] = []
+    for number in range(40):
+        data = np.frombuffer(whole, np.uint8).copy()
+        places = generator.integers(0, 2000 if number % 2 else len(data), generator.choice([1, 8, 64]))
+        data[places] = generator.integers(0, 256, len(places))
+        path.write_bytes(data.tobytes())
+        try:
+            from_minari(ID, tmp_path / f"a{number}")
+        except CompileError as error:
+            codes += [one.code for one in error.diagnostics]
+    assert set(codes) == {"PD630"}
+    assert len(codes) > 5
+
+
 def test_an_interrupted_import_is_completed(recorded: Dataset, root: Path, tmp_path: Path) -> None:
     to_minari(recorded, ID)
     whole = (root / ID / "data" / "main_data.hdf5").read_bytes()
