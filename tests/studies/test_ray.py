@@ -10,18 +10,21 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.experiments.studies import cluster as on_cluster
 from powderdsl.experiments.studies.file import read_study
-from powderdsl.experiments.studies.study import TEXT, Study
+from powderdsl.experiments.studies.run import StudyRun
+from powderdsl.experiments.studies.study import TASK, TEXT, Study
 from powderdsl.system.scratch import is_scratch
 from tests.cli.commands import command_line, environment_with, powderdsl
-from tests.cli.endless import TASK
+from tests.cli.endless import TASK as DIG
 from tests.processes import started, waited
 from tests.studies.ray_nodes import Nodes, cluster
 
@@ -43,7 +46,7 @@ measures:
 
 
 def written(folder: Path, seeds: int, steps: list[int]) -> None:
-    (folder / "dig.yaml").write_text(TASK, encoding="utf-8")
+    (folder / "dig.yaml").write_text(DIG, encoding="utf-8")
     (folder / "study.yaml").write_text(STUDY.format(seeds=seeds, steps=steps), encoding="utf-8")
 
 
@@ -57,6 +60,7 @@ def read(text: str) -> Study:
     names = ("on", "run", "seed", "steps", "device", "policies", "episodes", "checkpoint-every")
     names += ("preset", "envs", "rollout", "batch", "backend")
     known = {("train",): dict.fromkeys(names, TEXT), ("evaluate",): dict.fromkeys(names[:-6], TEXT)}
+    known["train",] |= {"on": TASK}
     del known["evaluate",]["run"]
     return read_study(Source("study.yaml", text), Reporter(), known)
 
@@ -78,6 +82,27 @@ def test_a_node_without_the_folder_runs_nothing(tmp_path: Path) -> None:
     assert not folder.exists()
     found = on_cluster.run_point(study, str(folder), "small", 1, point, "0.0.1")
     assert "0.0.1 is needed" in str(found.problem)
+
+
+def test_what_a_node_refuses_is_a_problem_of_the_run(tmp_path: Path) -> None:
+    """On this node, the task that the study names is a link that leads out of its folder."""
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "beside/dig.yaml").symlink_to(tmp_path / "dig.yaml")
+    study = replace(read(STUDY.format(seeds=1, steps=[12])), folder=tmp_path / "beside")
+    (point,) = study.points("small")
+    run = StudyRun(study, tmp_path / "out", "small")
+    run.prepare()
+    found = on_cluster.run_point(study, str(tmp_path / "out"), "small", 1, point, on_cluster._version())
+    assert "the path `dig.yaml` leaves the study's folder" in str(found.problem)
+    assert not list((tmp_path / "out").rglob("claim-*"))
+
+
+def test_a_part_without_runs_needs_nothing() -> None:
+    nodes = SimpleNamespace(nodes=lambda: [{"Alive": True, "Resources": {"CPU": 1.0}}])
+    assert on_cluster._lacking(nodes, []) == []
+    asked = {"num_cpus": 1, "num_gpus": 0}
+    assert on_cluster._lacking(nodes, [asked]) == []
+    assert on_cluster._lacking(nodes, [asked, {"num_cpus": 2, "num_gpus": 1}]) == ["2 CPU cores", "1 GPU"]
 
 
 def test_without_ray_the_user_learns_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,7 +123,10 @@ def run_point(study: Study, folder: str, size: str, threads: int, point: Point, 
     found = read_json(Path(folder) / ABOUT_STUDY)
     if not isinstance(found, dict) or found.get("text") != study.text or not run.is_prepared():
         return Outcome(point, {}, f"{host} does not see {folder}: it must be on storage that all nodes share")
-    (outcome,) = run.run([point], 1, patience=PATIENCE)
+    try:
+        (outcome,) = run.run([point], 1, patience=PATIENCE)
+    except CompileError as error:
+        return Outcome(point, {}, f"{host}: {'; '.join(one.message for one in error.diagnostics)}")
     return outcome
 
 
@@ -131,8 +134,8 @@ def _lacking(ray: Any, asked: Sequence[dict[str, float]]) -> list[str]:
     """What no node of a cluster has, however idle it is."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     found = {}
-    for kind, key, thing in (("num_cpus", "CPU", "CPU cores"), ("num_gpus", "GPU", "GPUs")):
-        wanted = max(one[kind] for one in asked)
+    for kind, key, thing in (("num_cpus", "CPU", "CPU cores"), ("num_gpus", "GPU", "GPU")):
+        wanted = max((one[kind] for one in asked), default=0)
         if all(node.get(key, 0) < wanted for node in nodes):
             found[key] = f"{wanted:g} {thing}"
     return list(found.values())
@@ -146,6 +149,8 @@ def _outcome(ray: Any, task: Future[Outcome], point: Point, address: str) -> Out
         raise _no_cluster(
             address, _words(error), helps, "lost the Ray node of this machine in the cluster"
         ) from None
+    except ray.exceptions.RayTaskError as error:  # its text ends with the exception, after a traceback
+        return Outcome(point, {}, str(error).strip().splitlines()[-1][:400])
     except Exception as error:  # whatever ended the task, the others continue
         return Outcome(point, {}, f"{type(error).__name__}: {_words(error)}")
 
