@@ -21,6 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from powderdsl.cli.commands.study import commands
+from powderdsl.experiments.studies.file import load_study
+from powderdsl.experiments.studies.run import StudyRun
+
 TEXTS = (
     "\x1b]0;owned\x07",
     "\x1b[2J\x1b[31mred",
@@ -329,6 +333,8 @@ KINDS = (
     Kind("scene", 220, ("render", "scene.yaml", "--rules", "core+sand", "--out", "out.png"), (("scene.yaml", yaml_damaged),)),
     Kind("task", 220, ("check", "dig.yaml"), (("dig.yaml", yaml_damaged),)),
     Kind("study", 160, ("study", "study.yaml", "--dry-run"), (("study.yaml", yaml_damaged),)),
+    Kind("a study's results", 120, ("study", "collect", "results", "--seeds", "1"), (("results/study.json", json_damaged),)),
+    Kind("values in them", 80, ("study", "collect", "results", "--seeds", "1"), (("results/done/*=100,*.json", json_damaged),)),
     Kind("dataset", 120, ("record", "--verify", "data"), (("data/dataset.json", json_damaged),)),
     Kind("shards", 80, ("record", "--verify", "data"), (("data/shard-000000.npz", npz_damaged),), _signed),
     Kind("agent", 60, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), (("ppo/run.json", json_damaged),)),
@@ -373,6 +379,16 @@ def _no_file(path: Path, random: Random, folder: Path) -> str:
     return how
 
 
+def _results(folder: Path) -> None:
+    """The results of a study, two runs that are done."""
+    study = load_study(str(folder / "study.yaml"), commands())
+    StudyRun(study, folder / "results", "small").prepare()
+    (folder / "results" / "done").mkdir()
+    for point in study.points("small", 1):
+        done = folder / "results" / "done" / f"{point.name}.json"
+        done.write_text('{"trained/splits/test/trained/mean": 2.5}', encoding="utf-8")
+
+
 def make_valid(folder: Path, run: Callable[..., None]) -> None:
     """A folder with a valid file of each kind. `run` runs a command there, in a process of its own."""
     folder.mkdir()
@@ -382,6 +398,7 @@ def make_valid(folder: Path, run: Callable[..., None]) -> None:
     (folder / "scene.yaml").write_text(SCENE)
     (folder / "dig.yaml").write_text(TASK)
     (folder / "study.yaml").write_text(STUDY)
+    _results(folder)
     run("run", "core+sand", "--size", "8", "--steps", "1", "--backend", "reference", "--out", "world.npz")
     run("render", "scene.yaml", "--rules", "core+sand", "--scale", "1", "--out", "world.png")
     run("record", "dig.yaml", "--out", "data", "--episodes", "4", "--shard", "2", "--backend", "torch")
