@@ -30,7 +30,7 @@ from powderdsl.datasets.manifest import (
     write_manifest,
 )
 from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
-from powderdsl.envs.acting import Policy, action_keys, random_policy
+from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs.folder import held
@@ -217,6 +217,7 @@ class _Recording:
             max_episode_steps=recipe.actions,
         )
         self.episode = np.array([next(self.numbers) for _ in range(slots)], np.int64)
+        self.stack = FrameStack(getattr(self.policy, "frames", 1))
         self.playing, self.taken = np.ones(slots, bool), np.zeros(slots, np.int64)
         self.tape = {
             name: np.empty((slots, recipe.actions + 1, *row_shape(recipe, name)), dtype)
@@ -244,6 +245,7 @@ class _Recording:
             own = self.sight.kind == self.recipe.observation
             shown = observed if own else self.sight.of(env.episodes.world)
             with torch.no_grad():
+                shown = self.stack.push(shown, taken == 0)
                 actions = torch.as_tensor(self.policy(shown, action_keys(self.recipe.seed, episode, taken)))
         observed, reward, terminated, truncated, info = env.step(actions)
         given = {"action": actions, "reward": reward, "terminated": terminated, "truncated": truncated}

@@ -105,6 +105,19 @@ class Patches(MatrixPatches):
         return torch.cat(parts, 1) if len(parts) > 1 else parts[0].contiguous()
 
 
+class Frames(nn.Module):
+    """What `see` makes of each of several observations that are stacked, oldest first: [B, frames · channels, …]."""
+
+    def __init__(self, see: Any, frames: int):
+        super().__init__()
+        self.see, self.frames = see, frames
+        self.channels: int = see.channels * frames
+
+    def forward(self, observed: Tensor) -> Tensor:
+        seen: Tensor = self.see(observed.reshape(-1, observed.shape[1] // self.frames, *observed.shape[2:]))
+        return seen.view(len(observed), self.channels, *seen.shape[2:])
+
+
 class _Convolutions(BaseFeaturesExtractor):
     """Two convolutions on what `see` makes of observations, and a fully connected layer."""
 
@@ -138,9 +151,12 @@ class PaperFeatures(_Convolutions):
         stride: int = 2,
         sources: tuple[int, ...] | None = None,
         tables: Any = None,
+        frames: int = 1,
     ):
-        see = nn.Identity() if sources is None else Expand(sources, tables)
-        channels = observation_space.shape[0] if sources is None else len(sources)
+        see: nn.Module = nn.Identity() if sources is None else Expand(sources, tables)
+        channels = observation_space.shape[0] if sources is None else len(sources) * frames
+        if frames > 1 and sources is not None:
+            see = Frames(see, frames)
         first, second = nn.Conv2d(channels, 32, 3, stride), nn.Conv2d(32, 64, 3, stride)
         super().__init__(observation_space, features_dim, see, first, second)
 
@@ -159,23 +175,47 @@ class PatchFeatures(_Convolutions):
         elements: int,
         patches: tuple[int, int],
         values: Any = None,
+        frames: int = 1,
     ):
         channels, height, width = observation_space.shape
-        if values is None:
-            see = MatrixPatches(channels, (height, width), patches)
-        else:
-            see = Patches(elements, (height, width), patches, values)
+        see = _patches(elements, channels // frames, (height, width), patches, values, frames)
         first, second = nn.Conv2d(see.channels, 32, 3, 2, 1), nn.Conv2d(32, 32, 3, 1, 1)
         super().__init__(observation_space, features_dim, see, first, second)
 
 
-def paper_policy(env: TensorEnv, features_dim: int = 256, stride: int = 2) -> dict[str, Any]:
-    """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: the paper's network.
+def _patches(
+    elements: int, channels: int, size: tuple[int, int], patches: tuple[int, int], values: Any, frames: int
+) -> Any:
+    if values is None:
+        see: Any = MatrixPatches(channels, size, patches)
+    else:
+        see = Patches(elements, size, patches, values)
+    return see if frames == 1 else Frames(see, frames)
+
+
+def patches_of(env: TensorEnv, patches: tuple[int, int], frames: int = 1) -> Any:
+    """A module from stacked observations of an environment to patches [B, its `channels`, rows, columns].
 
     Raises:
         ValueError: for observations that are pictures.
     """
-    how: dict[str, Any] = {"stride": stride}
+    if env.observation.kind == "rgb":
+        raise ValueError("this network does not take pictures: use the policy's own")
+    count = len(env.observation.channels)
+    values = None if env.observation.kind == "matrix" else env.simulator.observer.compact_values[:count]
+    return _patches(env.simulator.ruleset.slots, count, env.task.size, patches, values, frames)
+
+
+def paper_policy(env: TensorEnv, features_dim: int = 256, stride: int = 2, frames: int = 1) -> dict[str, Any]:
+    """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: the paper's network.
+
+    Args:
+        frames: how many observations are stacked, as `VecFrameStack` of Stable-Baselines3 does.
+
+    Raises:
+        ValueError: for observations that are pictures.
+    """
+    how: dict[str, Any] = {"stride": stride, "frames": frames}
     if env.observation.kind in ("ids", "compact"):
         sources, tables = env.simulator.observer.matrix_tables
         every = env.observation.kind == "compact"
@@ -185,10 +225,10 @@ def paper_policy(env: TensorEnv, features_dim: int = 256, stride: int = 2) -> di
     return _policy(env, PaperFeatures, features_dim, how)
 
 
-def small_policy(env: TensorEnv, features_dim: int = 128) -> dict[str, Any]:
+def small_policy(env: TensorEnv, features_dim: int = 128, frames: int = 1) -> dict[str, Any]:
     """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: a small network for processors.
 
-    It counts what lies in each patch of cells, and runs convolutions on the counts.
+    It counts what lies in each patch of cells, and runs convolutions on the counts. `frames`: see `paper_policy`.
 
     Raises:
         ValueError: for observations that are pictures.
@@ -196,6 +236,7 @@ def small_policy(env: TensorEnv, features_dim: int = 128) -> dict[str, Any]:
     sides = zip(env.task.size, env.task.agent.bins, strict=True)
     how: dict[str, Any] = {
         "elements": env.simulator.ruleset.slots,
+        "frames": frames,
         "patches": tuple(min(side, max(FEWEST, min(MOST, count))) for side, count in sides),
     }
     if env.observation.kind != "matrix":

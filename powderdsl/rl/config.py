@@ -11,16 +11,34 @@ from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
 from powderdsl.system.settings import out_of_bounds, setting
 
-NETWORKS = ("paper", "small")
+NETWORKS = ("paper", "small", "fcn")
 OBSERVATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"paper": ("compact", "ids", "matrix"), "small": ("ids", "compact", "matrix")}
+    {
+        "paper": ("compact", "ids", "matrix"),
+        "small": ("ids", "compact", "matrix"),
+        "fcn": ("ids", "compact", "matrix"),
+    }
 )
 """The observations that each network takes; the first is the default."""
 
 KINDS = ("compact", "ids", "matrix")
 
-HOW = ("steps", "backend", "device", "threads", "checkpoint_minutes")
+HELD_OUT = ("eval_every", "eval_split", "eval_episodes")
+HOW = ("steps", "backend", "device", "threads", "checkpoint_minutes", *HELD_OUT)
 """Settings that may change when a run is resumed: how long and on which machine it trains, not what it trains."""
+
+LATER = {
+    "reward": "task",
+    "init_from": "",
+    "init_epochs": 10,
+    "frames": 1,
+    "schedule": "constant",
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+    "target_kl": 0.0,
+    "normalize": "advantage",
+}
+"""Settings that runs of earlier versions do not have, with what they trained with."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +56,37 @@ class TrainConfig:
     slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
     observation: str = setting("compact", "Observation of the network.", choices=KINDS)
-    network: str = setting("paper", "The paper's, or a small one.", choices=NETWORKS)
-    features: int = setting(256, "Width of its fully connected layers.", 1, 1 << 16)
+    network: str = setting(
+        "paper", "The paper's, a small one, or a fully convolutional one.", choices=NETWORKS
+    )
+    features: int = setting(256, "Width of its fully connected layers; of `fcn`, its channels.", 1, 1 << 16)
+    frames: int = setting(1, "Observations that it sees at once, the last ones.", 1, 16)
+    reward: str = setting("task", "The task's reward, or its `shaped` one.", choices=("task", "shaped"))
+    init_from: str = ""
+    """The folder of a dataset whose actions the network learns first (behavior cloning)."""
+    init_epochs: int = setting(10, "How often cloning goes over the dataset.", 1, 100_000)
     envs: int = setting(32, "Worlds that are played at once.", 1, 1 << 20)
     rollout: int = setting(2048, "Actions in every world between two updates.", 1, 1 << 20)
     batch: int = setting(256, "Actions that one gradient is taken of.", 2, 1 << 24)
     epochs: int = setting(10, "How often an update goes over a rollout.", 1, 1000)
     learning_rate: float = setting(3e-4, "Of Adam.", 1e-9, 10.0)
+    schedule: str = setting(
+        "constant",
+        "The learning rate's, over `steps`: constant, or linear to zero.",
+        choices=("constant", "linear"),
+    )
     gamma: float = setting(0.99, "Discount of later rewards.", 0.0, 1.0)
     gae_lambda: float = setting(0.95, "Of generalized advantages.", 0.0, 1.0)
     clip: float = setting(0.2, "How far an update may change chances.", 1e-6, 10.0)
     entropy: float = setting(0.0, "Entropy coefficient.", 0.0, 100.0)
+    vf_coef: float = setting(0.5, "Coefficient of the values' loss.", 0.0, 100.0)
+    max_grad_norm: float = setting(0.5, "Gradients are clipped to this norm.", 1e-6, 1e6)
+    target_kl: float = setting(
+        0.0, "An update ends where the policy has changed this much; 0: never.", 0.0, 1e6
+    )
+    normalize: str = setting(
+        "advantage", "What is divided by its spread.", choices=("advantage", "reward", "both", "none")
+    )
     seed: int = setting(0, "Of the run: worlds, network, and actions.", 0, 2**32 - 1)
     steps: int = setting(1_000_000, "Interactions, of all worlds together, such as 2e5.", 1, 10**12)
     """A run ends with the first whole rollout that reaches them."""
@@ -57,6 +95,11 @@ class TrainConfig:
     threads: int = setting(1, "CPU threads.  [default: 1]", 1, 1024)
     checkpoint_minutes: float = setting(2.0, low=0.0, high=1e6)
     """How much work a kill may cost; 0 saves after every rollout."""
+    eval_every: int = setting(
+        0, "Interactions between two evaluations in held-out worlds; 0: none.", 0, 10**12
+    )
+    eval_split: str = setting("test", "Split of those worlds.")
+    eval_episodes: int = setting(64, "How many of them.", 1, 1 << 20)
 
     def as_json(self) -> dict[str, Any]:
         """All settings, as JSON has them."""
@@ -64,9 +107,15 @@ class TrainConfig:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The settings that the result depends on: all but those of HOW."""
-        return {name: value for name, value in self.as_json().items() if name not in HOW}
+        """The settings that the result depends on: all but those of HOW. A falling learning rate depends on `steps`."""
+        return {
+            name: value
+            for name, value in self.as_json().items()
+            if name not in HOW and LATER.get(name, _NOTHING) != value
+        } | ({"steps": self.steps} if self.schedule != "constant" else {})
 
+
+_NOTHING = object()
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
@@ -81,9 +130,23 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "entropy": 0.01,
             "steps": 200_000,
         },
+        "fcn": {
+            "network": "fcn",
+            "observation": "ids",
+            "features": 32,
+            "rollout": 128,
+            "epochs": 4,
+            "learning_rate": 1e-3,
+            "schedule": "linear",
+            "entropy": 0.003,
+            "gamma": 0.97,
+            "target_kl": 0.03,
+            "steps": 200_000,
+        },
     }
 )
-"""``paper``: its network and settings. ``small``: a network and settings for a few minutes on one processor core."""
+"""``paper``: its network and settings. ``small``: a network and settings for a few minutes on one processor core. ``fcn``:
+a fully convolutional network, which takes about five times as long as `small` and learns more from as many interactions."""
 
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
@@ -121,16 +184,18 @@ def check_config(config: TrainConfig, known: Sequence[Diagnostic] = ()) -> Train
 
 def _mistakes(config: TrainConfig) -> list[Diagnostic]:
     found = [_wrong(message) for message in out_of_bounds(config)]
-    for name in ("task", "split", "device"):
+    for name in ("task", "split", "device", "eval_split", "init_from"):
         value = getattr(config, name)
-        if not isinstance(value, str) or not value:
+        if not isinstance(value, str) or (not value and name != "init_from"):
             found.append(_wrong(f"`{name}` is {value!r}: it takes a name"))
-    for name, choices in (("network", NETWORKS), ("backend", tuple(BACKENDS))):
-        if getattr(config, name) not in (*choices, *(RENAMED_BACKENDS if name == "backend" else ())):
-            found.append(_no_choice(name, getattr(config, name), choices))
-    takes = OBSERVATIONS.get(str(config.network), KINDS)
-    if config.observation not in takes:
-        found.append(_no_choice("observation", config.observation, takes))
+    choices = {one.name: one.metadata["choices"] for one in fields(config) if one.metadata.get("choices")}
+    for name, known in {**choices, "backend": tuple(BACKENDS)}.items():
+        takes = (*known, *RENAMED_BACKENDS) if name == "backend" else known
+        if getattr(config, name) not in takes and name != "observation":
+            found.append(_no_choice(name, getattr(config, name), known))
+    seen = OBSERVATIONS.get(str(config.network), KINDS)
+    if config.observation not in seen:
+        found.append(_no_choice("observation", config.observation, seen))
     if not all(isinstance(one, str) for one in config.packs) or "" in config.packs:
         found.append(_wrong(f"`packs` is {config.packs!r}: it takes names or files of packs"))
     for name in ("knobs", "params"):

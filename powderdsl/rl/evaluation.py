@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from powderdsl.envs.acting import Policy, action_keys, random_policy
+from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder, find_run
@@ -120,13 +120,14 @@ def play(
     succeeded = torch.zeros_like(going)
     if begun is not None:
         begun(episodes)
+    stack = FrameStack(getattr(policy, "frames", 1))
     for step in range(program.task.agent.actions):
         keys = action_keys(seed, numbers, step)
         actions = None
         if isinstance(policy, ExpertPlayer):
             actions = policy(episodes)
         elif policy is not None:
-            actions = policy(sight.of(episodes.world), keys)
+            actions = policy(stack.push(sight.of(episodes.world)), keys)
         # Episodes that are over run on, and no longer count.
         episodes, reward, success, over = program.act(episodes, actions, reuse=seen is None, seen=seen)
         returns += torch.where(going, reward.double(), 0.0)
@@ -243,7 +244,7 @@ def _play_all(
 def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task) -> Score:
     played = all_played[policy]
     above = {
-        other: _mean(played.returns - all_played[other].returns)
+        other: mean_and_interval(played.returns - all_played[other].returns)
         for other in BASELINES
         if other != policy and other in all_played
     }
@@ -254,7 +255,14 @@ def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task
     success = float(played.success.double().mean()) if task.goal.success is not None else None
     length = float(played.lengths.double().mean())
     return Score(
-        split, policy, len(played.returns), *_mean(played.returns), success, length, above, normalized
+        split,
+        policy,
+        len(played.returns),
+        *mean_and_interval(played.returns),
+        success,
+        length,
+        above,
+        normalized,
     )
 
 
@@ -264,11 +272,11 @@ def _ratio(values: Tensor, scale: Tensor) -> tuple[float, float | None] | None:
     if whole <= 0:
         return None
     ratio = float(values.mean()) / whole
-    _, half = _mean(values - ratio * scale)
+    _, half = mean_and_interval(values - ratio * scale)
     return ratio, None if half is None else half / whole
 
 
-def _mean(values: Tensor) -> tuple[float, float | None]:
+def mean_and_interval(values: Tensor) -> tuple[float, float | None]:
     """The mean, and half of its 95 % interval."""
     half = 1.96 * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else None
     return float(values.mean()), half

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import MultiDiscrete
-from stable_baselines3.common.policies import ActorCriticCnnPolicy
+from gymnasium.spaces import Box, MultiDiscrete
+from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 from torch import Tensor
 
 from powderdsl.envs.acting import uniforms
@@ -19,29 +19,33 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run
 from powderdsl.model.composition.palette import MAX_ELEMENTS
 from powderdsl.rl.config import TrainConfig, from_json
+from powderdsl.rl.fcn import BinDistribution, BinPolicy, fcn_policy
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
 
-BESIDES = ("task_fingerprint", "palette", "channels")
+BESIDES = ("task_fingerprint", "palette", "channels", "shaped_fingerprint")
 """Entries of a run's configuration that are not settings."""
 
 
-def policy_kwargs(config: TrainConfig, env: TensorEnv) -> dict[str, Any]:
-    """The network of a run, as `policy_kwargs` of ``CnnPolicy``."""
+def policy_of(config: TrainConfig, env: TensorEnv) -> tuple[type[ActorCriticPolicy], dict[str, Any]]:
+    """The policy class of a run, and its `policy_kwargs`."""
+    if config.network == "fcn":
+        return BinPolicy, fcn_policy(env, config.features, config.frames)
     build = paper_policy if config.network == "paper" else small_policy
-    return build(env, features_dim=config.features)
+    return ActorCriticCnnPolicy, build(env, features_dim=config.features, frames=config.frames)
 
 
 @dataclass(frozen=True)
 class TrainedPolicy:
     """The policy of a run: a function as `envs.acting.Policy` says.
 
-    `deterministic`: the likeliest action, instead of one drawn.
+    `deterministic`: the likeliest action, instead of one drawn. If `frames` is not 1, it takes that many observations,
+    stacked by a `FrameStack`.
     """
 
-    network: ActorCriticCnnPolicy
+    network: ActorCriticPolicy
     observation: str
     """The kind of observation it takes."""
     channels: int
@@ -49,19 +53,25 @@ class TrainedPolicy:
     step: int
     """The interactions that it has learned from."""
     deterministic: bool = False
+    frames: int = 1
 
     def __call__(self, observed: Tensor, keys: Tensor) -> Tensor:
+        frames = observed.unflatten(1, (self.frames, -1))[:, :, : self.channels].flatten(1, 2)
         with torch.no_grad():
-            # One for each number of an action.
-            choices: Any = self.network.get_distribution(observed[:, : self.channels]).distribution
+            found: Any = self.network.get_distribution(frames)
+        # One for each number of an action, or one for all of them.
+        joint = isinstance(found, BinDistribution)
+        choices = [found.distribution] if joint else found.distribution
         if self.deterministic:
-            return torch.stack([one.probs.argmax(1) for one in choices], 1)
-        drawn = uniforms(keys, len(choices))
-        picked = []
-        for column, one in enumerate(choices):
-            below = one.probs.double().cumsum(1)
-            picked.append((drawn[:, column, None] * below[:, -1:] >= below).sum(1))
-        return torch.stack(picked, 1)
+            picked = [one.probs.argmax(1) for one in choices]
+        else:
+            drawn = uniforms(keys, len(choices))
+            below = [one.probs.double().cumsum(1) for one in choices]
+            picked = [
+                (drawn[:, column, None] * one[:, -1:] >= one).sum(1) for column, one in enumerate(below)
+            ]
+        actions: Tensor = found.action(picked[0]) if joint else torch.stack(picked, 1)
+        return actions
 
 
 def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: bool = False) -> TrainedPolicy:
@@ -79,13 +89,14 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         raise does_not_fit(found.path, why)
     own = _own_env(found, config, env)
     checkpoint = found.checkpoint()
-    _check_size(found, checkpoint.state, config.features)
-    network = ActorCriticCnnPolicy(
-        own.observation.space,
-        MultiDiscrete(np.array(own.action_nvec)),
-        lambda _: config.learning_rate,
-        **policy_kwargs(config, own),
-    )
+    _check_size(found, checkpoint.state, config)
+    kind, how = policy_of(config, own)
+    space = own.observation.space
+    if config.frames > 1:
+        space = Box(
+            space.low.repeat(config.frames, 0), space.high.repeat(config.frames, 0), dtype=space.dtype.type
+        )
+    network = kind(space, MultiDiscrete(np.array(own.action_nvec)), lambda _: config.learning_rate, **how)
     try:
         network.load_state_dict(checkpoint.state["policy"])
     except (RuntimeError, TypeError, AttributeError, KeyError) as error:
@@ -93,7 +104,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         raise does_not_fit(found.path, f"its network is another: {why}") from None
     network.to(env.device).set_training_mode(False)
     channels = len(own.observation.channels)
-    return TrainedPolicy(network, config.observation, channels, checkpoint.step, deterministic)
+    return TrainedPolicy(network, config.observation, channels, checkpoint.step, deterministic, config.frames)
 
 
 def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
@@ -147,10 +158,12 @@ def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:
     )
 
 
-def _check_size(run: RunFolder, state: Any, features: int) -> None:
+def _check_size(run: RunFolder, state: Any, config: TrainConfig) -> None:
     """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError (PD623)."""
     policy = state.get("policy") if isinstance(state, dict) else None
-    weights = policy.get("mlp_extractor.policy_net.0.weight") if isinstance(policy, dict) else None
+    features = config.features
+    name = "trunk.means.0.weight" if config.network == "fcn" else "mlp_extractor.policy_net.0.weight"
+    weights = policy.get(name) if isinstance(policy, dict) else None
     if getattr(weights, "shape", None) != (features, features):
         raise does_not_fit(run.path, f"its network has no layer of {features:,} features")
 

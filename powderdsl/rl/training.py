@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from powderdsl.compiler import whole_palette
 from powderdsl.envs.observations import channels_of
@@ -28,11 +30,13 @@ from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
 from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run, read_run
 from powderdsl.model.fingerprint import fingerprint
+from powderdsl.rl.cloning import clone, open_demonstrations
 from powderdsl.rl.config import TrainConfig, check_config
-from powderdsl.rl.policies import policy_kwargs, recorded_palette
+from powderdsl.rl.evaluation import mean_and_interval, play
+from powderdsl.rl.policies import TrainedPolicy, policy_of, recorded_palette
 from powderdsl.simulation.observe import Observer
 from powderdsl.system.writing import failure
-from powderdsl.tasks.episodes import compile_task
+from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 
@@ -58,6 +62,11 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     check_config(config)
     task, palette = _task_and_palette(config, Path(folder))
     check_split(task, config.split)
+    if config.eval_every:
+        check_split(task, config.eval_split)
+    if config.reward == "shaped" and task.goal.shaped is None:
+        raise failure("PD640", f"`reward`: the task {task.name} has no `shaped` reward")
+    trained_on = task.with_shaped_reward() if config.reward == "shaped" else task
     try:
         check_cells(config.envs, task.size)
     except ValueError as error:
@@ -68,6 +77,8 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         "palette": palette,
         "channels": channels_of(config.observation, Observer(task.ruleset, torch.device("cpu"))),
     }
+    if trained_on is not task:
+        plain["shaped_fingerprint"] = fingerprint(trained_on)
     run = open_run(folder, KIND, plain)
     with run.locked(), _own_random_numbers(config.threads):
         run.write_json(ASKED, config.as_json())
@@ -76,7 +87,11 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         if step >= config.steps:
             return run
         program = compile_task(
-            task, split=config.split, backend=config.backend, device=config.device, threads=config.threads
+            trained_on,
+            split=config.split,
+            backend=config.backend,
+            device=config.device,
+            threads=config.threads,
         )
         env = PowderVecEnv(
             program, config.envs, observation=config.observation, worlds=config.worlds, actions="full"
@@ -90,13 +105,18 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
                 except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
                     why = " ".join(str(error).split())[:300]
                     raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
-            keeper = _Keeper(run, env, config.checkpoint_minutes, progress)
+            elif config.init_from:
+                _clone(model, env, config, metrics)
+            held_out = _HeldOut(task, program, model, metrics, config) if config.eval_every else None
+            keeper = _Keeper(run, env, config.checkpoint_minutes, progress, held_out)
             try:
                 model.learn(config.steps - step, callback=keeper, reset_num_timesteps=found is None)
             except KeyboardInterrupt:
                 keeper.save_kept()
                 raise
             run.save_checkpoint(model.num_timesteps, _state(model, env))
+            if held_out is not None:
+                held_out.play(model.num_timesteps)
     return run
 
 
@@ -119,10 +139,12 @@ def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
     with warnings.catch_warnings():
         # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
         warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
+        kind, how = policy_of(config, env.tensors)
+        rate = config.learning_rate
         return PPO(
-            "CnnPolicy",
-            env,
-            learning_rate=config.learning_rate,
+            kind,
+            _wrapped(config, env),
+            learning_rate=rate if config.schedule == "constant" else lambda left: rate * left,
             n_steps=config.rollout,
             batch_size=config.batch,
             n_epochs=config.epochs,
@@ -130,25 +152,88 @@ def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
             gae_lambda=config.gae_lambda,
             clip_range=config.clip,
             ent_coef=config.entropy,
-            policy_kwargs=policy_kwargs(config, env.tensors),
+            vf_coef=config.vf_coef,
+            max_grad_norm=config.max_grad_norm,
+            target_kl=config.target_kl or None,
+            normalize_advantage=config.normalize in ("advantage", "both"),
+            policy_kwargs=how,
             device=config.device,
             seed=config.seed,
         )
 
 
+def _wrapped(config: TrainConfig, env: PowderVecEnv) -> VecEnv:
+    """The environment with stacked observations and normalized rewards, as far as they are asked for."""
+    found: VecEnv = env
+    if config.frames > 1:
+        found = VecFrameStack(found, config.frames, channels_order="first")
+    if config.normalize in ("reward", "both"):
+        found = VecNormalize(found, norm_obs=False, gamma=config.gamma)
+    return found
+
+
+def _clone(model: PPO, env: PowderVecEnv, config: TrainConfig, metrics: Metrics) -> None:
+    """Behavior cloning of `config.init_from`. Its numbers are metrics of the run at step 0."""
+    if config.frames > 1:
+        raise failure("PD640", "`init_from` does not go with `frames`: datasets have single observations")
+    dataset = open_demonstrations(config.init_from, env.tensors)
+    found: dict[str, float] = {}
+    clone(model.policy, dataset, config, lambda number, of, numbers: found.update(numbers))
+    metrics.write(0, {f"clone/{name}": value for name, value in found.items()})
+
+
+class _HeldOut:
+    """Plays the policy in held-out worlds: ``held_out/return`` of the metrics. Training does not depend on it."""
+
+    def __init__(self, task: Task, program: TaskProgram, model: PPO, metrics: Metrics, config: TrainConfig):
+        self.program = TaskProgram(task, config.eval_split, program.simulator)
+        self.model, self.metrics, self.config = model, metrics, config
+        self.played_at = -1
+        """The interactions at the last evaluation."""
+
+    def play(self, step: int) -> None:
+        """Play unless that has been done at this step."""
+        if step == self.played_at:
+            return
+        config, policy = self.config, self.model.policy
+        channels = len(channels_of(config.observation, self.program.simulator.observer))
+        trained = TrainedPolicy(policy, config.observation, channels, step, frames=config.frames)
+        policy.set_training_mode(False)
+        worlds = torch.arange(config.eval_episodes)
+        returns = play(self.program, trained, worlds, observation=config.observation).returns
+        mean, half = mean_and_interval(returns)
+        found = {"held_out/return": mean} | ({} if half is None else {"held_out/interval": half})
+        self.metrics.write(step, found)
+        self.played_at = step
+
+    def due(self, step: int) -> bool:
+        """Whether it is time for the next."""
+        return self.played_at < 0 or step // self.config.eval_every > self.played_at // self.config.eval_every
+
+
 class _Keeper(BaseCallback):
     """Saves between rollouts, and keeps the latest unsaved state in memory."""
 
-    def __init__(self, run: RunFolder, env: PowderVecEnv, minutes: float, progress: Progress | None):
+    def __init__(
+        self,
+        run: RunFolder,
+        env: PowderVecEnv,
+        minutes: float,
+        progress: Progress | None,
+        held_out: _HeldOut | None,
+    ):
         super().__init__()
         self.model: PPO
         self.run, self.worlds, self.seconds, self.progress = run, env, minutes * 60, progress
+        self.held_out = held_out
         self.saved_at = time.monotonic()
         self.kept: tuple[int, dict[str, Any]] | None = None
         self.mean: float | None = None
 
     def _on_rollout_start(self) -> None:
         step, state = self.model.num_timesteps, _state(self.model, self.worlds)
+        if self.held_out is not None and self.held_out.due(step):
+            self.held_out.play(step)
         if step and time.monotonic() - self.saved_at >= self.seconds:
             self.run.save_checkpoint(step, state)
             self.saved_at, self.kept = time.monotonic(), None
@@ -204,13 +289,41 @@ def _state(model: PPO, env: PowderVecEnv) -> dict[str, Any]:
         "logged": _numbers(model.logger.name_to_value),  # of the update that is shown after the next rollout
         "steps": model.num_timesteps,
         "random": _random_state(),
+        **_wrappers(model),
     }
+
+
+def _wrappers(model: PPO) -> dict[str, Any]:
+    """The state of stacked observations and normalized rewards."""
+    found: dict[str, Any] = {}
+    env = model.get_env()
+    assert env is not None
+    if (stack := unwrap_vec_wrapper(env, VecFrameStack)) is not None:
+        found["frames"] = torch.from_numpy(stack.stacked_obs.stacked_obs.copy())
+    if (normal := unwrap_vec_wrapper(env, VecNormalize)) is not None:
+        spread = normal.ret_rms
+        found["rewards"] = [float(spread.mean), float(spread.var), float(spread.count)]
+        found["returns"] = torch.from_numpy(normal.returns.copy())
+    return found
+
+
+def _restore_wrappers(model: PPO, state: Mapping[str, Any], observed: NDArray[Any]) -> None:
+    model._last_obs = observed
+    env = model.get_env()
+    assert env is not None
+    if (stack := unwrap_vec_wrapper(env, VecFrameStack)) is not None:
+        stack.stacked_obs.stacked_obs[...] = state["frames"].numpy()
+        model._last_obs = stack.stacked_obs.stacked_obs.copy()
+    if (normal := unwrap_vec_wrapper(env, VecNormalize)) is not None:
+        spread: Any = normal.ret_rms
+        spread.mean, spread.var, spread.count = (np.float64(one) for one in state["rewards"])
+        normal.returns[...] = state["returns"].numpy()
 
 
 def _restore(model: PPO, env: PowderVecEnv, state: Mapping[str, Any]) -> None:
     model.policy.load_state_dict(state["policy"])
     model.policy.optimizer.load_state_dict(state["optimizer"])
-    model._last_obs = env.restore(state["env"])
+    _restore_wrappers(model, state, env.restore(state["env"]))
     model._last_episode_starts = state["starts"].numpy()
     size = model._stats_window_size
     model.ep_info_buffer = deque(

@@ -389,4 +389,4 @@ class _TaskReader:
                 syntax = parse_scalar(scalar, "expression", self.reporter) if scalar else None
                 if syntax is not None:
                     found[key] = checker.number(syntax) if section == "reward" else checker.condition(syntax)
-        return Goal(found.get("each"), found.get("final"), found.get("success"), found.get("failure"))
+        return Goal(*(found.get(name) for name in ("each", "final", "success", "failure", "shaped")))

@@ -29,7 +29,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
         "targets": Key("mapping", "pictures that rewards compare worlds with: lists of statements"),
         "generate": Key("any", "statements, later ones over earlier ones"),
         "agent": Key("mapping", "what an agent may do, and for how long", True),
-        "reward": Key("mapping", "what counts: `each`, `final`, or both"),
+        "reward": Key("mapping", "what counts: `each`, `final`, or both; and `shaped`, for training"),
         "end": Key("mapping", "conditions that end an episode: `success`, `failure`"),
         "expert": Key("any", "how a good player acts: a list of moves, or `search: N`"),
         "splits": Key("mapping", "other sets of worlds beside `train`"),
@@ -57,6 +57,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
     "reward": {
         "each": Key("line", "given after every action"),
         "final": Key("line", "given with the last action, after the free steps"),
+        "shaped": Key("line", "given after every action in place of both, where training asks for it"),
     },
     "end": {
         "success": Key("line", "the episode ends, and the task is done"),

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -198,12 +198,16 @@ class Goal:
     ``measure`` (value: Measure), ``action`` (value: ``taken``, ``left``, ``painted``, ``blown``, ``placed``), ``start``
     and ``before`` (the argument at the start, and after the previous action). Conditions are 0 or 1; x / 0 is 0; ``mod``
     has two arguments.
+
+    `shaped` is no part of what the task means: a reward after every action, in place of `each` and `final`, that agents
+    may be trained on. See `Task.with_shaped_reward`.
     """
 
     each: Expr | None = field(metadata=_AS_SCALAR)
     final: Expr | None = field(metadata=_AS_SCALAR)
     success: Expr | None = field(metadata=_AS_SCALAR)
     failure: Expr | None = field(metadata=_AS_SCALAR)
+    shaped: Expr | None = field(default=None, metadata=UNMEANING)
 
 
 @dataclass(frozen=True)
@@ -257,6 +261,12 @@ class Task:
     expert: Expert | None = field(default=None, metadata=UNMEANING)
     rules: tuple[str, ...] = field(default=(), compare=False, repr=False)
     """The rules that were loaded, as `compiler.load` takes them."""
+
+    def with_shaped_reward(self) -> Task:
+        """The same task with its `shaped` reward: worlds, actions and ends stay. Raises ValueError if it has none."""
+        if self.goal.shaped is None:
+            raise ValueError(f"the task {self.name} has no `shaped` reward")
+        return replace(self, goal=replace(self.goal, each=self.goal.shaped, final=None, shaped=None))
 
     def split(self, name: str) -> Split:
         """The split of a name. Raises KeyError."""

@@ -25,6 +25,7 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
     "paper",
     to="preset_name",
 )
+@opt.path("--init-from", "DATASET", "A dataset whose actions the network learns first (behavior cloning).")
 @opt.settings_of(TrainConfig)
 @opt.knobs("Another value for a knob of the task. May be repeated.")
 @opt.integer("--n-lines", 0, 10**6, "Short for --knob lines=N.", to="lines")
@@ -68,6 +69,8 @@ def command(
         if task is None:
             raise BadInput("say which TASK, or --resume DIR")
         name = str(Path(task).absolute()) if Path(task).suffix else task
+        if "init_from" in asked:
+            asked["init_from"] = str(Path(asked["init_from"]).absolute())
         chosen = knob_values(knobs) | short
         config = preset(preset_name, name, **asked, knobs=chosen, params=settings, packs=packs)
         folder = folder or Path("runs") / f"{Path(task).stem}-seed{config.seed}"
