@@ -26,6 +26,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench": ("bench", "Measure how fast rules run, on each backend, batch and size."),
     "train": ("train", "Train an agent on a task, or resume an interrupted run."),
     "evaluate": ("evaluate", "Compare an agent with a random policy and with doing nothing."),
+    "curves": ("curves", "Draw learning curves of runs, with intervals over seeds."),
     "watch": ("watch", "Record a film of an agent at its task."),
     "wm": ("wm", "World models: train, test and fine-tune networks that predict worlds."),
     "study": ("study", "Run training over many settings and seeds, and compare the results."),

@@ -15,8 +15,8 @@ from powderdsl.datasets.dataset import Dataset, drawn
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl.config import TrainConfig
 
-BATCH = 256
-"""Transitions of a gradient."""
+RATE, BATCH = 3e-3, 256
+"""Of Adam; transitions of a gradient."""
 
 
 def open_demonstrations(folder: str | Path, env: TensorEnv) -> Dataset:
@@ -44,12 +44,12 @@ def clone(
     updates = max(1, config.init_epochs * dataset.steps // BATCH)
     returns = _returns(dataset, config.gamma)
     spread = max(float(returns.var()), 1e-6)  # so that values do not outweigh actions
-    optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=RATE)
     policy.set_training_mode(True)
     sums, since = np.zeros(3), 0
     for number in range(updates):
         for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * (1 - number / updates)
+            group["lr"] = RATE * (1 - number / updates)
         numbers = drawn(config.seed, number, BATCH, dataset.steps)
         batch = dataset.take(numbers)
         observed = batch.observation.to(policy.device)
@@ -67,7 +67,7 @@ def clone(
         with torch.no_grad():
             likeliest: Any = policy.get_distribution(observed).mode()
         agree = (likeliest == actions).all(1).float().mean()
-        sums += [-float(likelihood.mean()), float(agree), float(error)]
+        sums += [-float(likelihood.detach().mean()), float(agree), float(error.detach())]
         since += 1
         if since == 100 or number + 1 == updates:
             loss_, accuracy, error_ = sums / since

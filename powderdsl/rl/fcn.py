@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Self
 
 import numpy as np
@@ -48,19 +49,16 @@ def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str,
 
 
 class Trunk(nn.Module):
-    """From patches [B, C, rows, columns] to features [B, F, rows, columns]."""
+    """From patches [B, C, rows, columns], with their places among the channels, to features [B, F, rows, columns]."""
 
-    def __init__(self, channels: int, width: int, bins: tuple[int, int]):
+    def __init__(self, channels: int, width: int):
         super().__init__()
-        places = torch.meshgrid(*(torch.linspace(-1, 1, side) for side in bins), indexing="ij")
-        self.register_buffer("places", torch.stack(places))
-        self.first = nn.Conv2d(channels + 2, width, 3, padding=1)
+        self.first = nn.Conv2d(channels, width, 3, padding=1)
         self.blocks = nn.ModuleList(nn.Conv2d(width, width, 3, padding=d, dilation=d) for d in DILATIONS)
         self.means = nn.ModuleList(nn.Linear(width, width) for _ in DILATIONS)
 
     def forward(self, patches: Tensor) -> Tensor:
-        places = self.get_buffer("places").expand(len(patches), -1, -1, -1)
-        found = self.first(torch.cat([patches, places], 1)).relu()
+        found = self.first(patches).relu()
         for block, mean in zip(self.blocks, self.means, strict=True):
             found = found + (block(found) + mean(found.mean((2, 3)))[:, :, None, None]).relu()
         return found
@@ -118,7 +116,8 @@ class BinDistribution(Distribution):
 
 
 class BinPolicy(ActorCriticPolicy):
-    """The policy: a trunk of convolutions, a score for each bin and deed, and a value of the trunk's mean and maximum.
+    """The policy: convolutions that keep the bins, and a score for each bin and deed. The value has convolutions of its
+    own: its errors, which are large at first, do not change what the scores see.
 
     Args:
         see: from observations to patches, one for each bin. channels: of each convolution. deeds: see `deeds_of`.
@@ -142,36 +141,51 @@ class BinPolicy(ActorCriticPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         see, width, deeds = self._parts
         columns, rows = (int(count) for count in self._nvec[:2])
-        self.see, self.trunk = see, Trunk(see.channels, width, (rows, columns))
+        places = torch.meshgrid(*(torch.linspace(-1, 1, side) for side in (rows, columns)), indexing="ij")
+        self.register_buffer("places", torch.stack(places))
+        self.see, self.trunk = see, Trunk(see.channels + 2, width)
         self.scores = nn.Conv2d(width, len(deeds), 1)
-        self.judge = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), nn.Linear(width, 1))
-        nn.init.orthogonal_(self.scores.weight, 0.01)
+        self.judge = nn.Sequential(
+            nn.Conv2d(see.channels + 2, width, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(width, width, 3, 2, 1),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool2d(4),
+            nn.Flatten(),
+            nn.Linear(16 * width, 4 * width),
+            nn.ReLU(),
+            nn.Linear(4 * width, 1),
+        )
+        for layer in (*self.trunk.modules(), *self.judge):
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                nn.init.orthogonal_(layer.weight, math.sqrt(2))
+        nn.init.orthogonal_(self.scores.weight, 0.01)  # all actions about equally likely
         self.bins = BinDistribution(*action_tables((rows, columns), deeds, self._nvec))
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1), eps=1e-5)
 
     def _seen(self, observed: Tensor) -> Tensor:
+        """Patches and their places, [B, C + 2, rows, columns]."""
         with torch.no_grad():
             patches = self.see(observed)
-        found: Tensor = self.trunk(patches)
-        return found
+            return torch.cat([patches, self.get_buffer("places").expand(len(patches), -1, -1, -1)], 1)
 
-    def _distribution(self, found: Tensor) -> BinDistribution:
-        return self.bins.proba_distribution(self.scores(found).flatten(1))
+    def _distribution(self, seen: Tensor) -> BinDistribution:
+        return self.bins.proba_distribution(self.scores(self.trunk(seen)).flatten(1))
 
-    def _value(self, found: Tensor) -> Tensor:
-        value: Tensor = self.judge(torch.cat([found.mean((2, 3)), found.amax((2, 3))], 1))
+    def _value(self, seen: Tensor) -> Tensor:
+        value: Tensor = self.judge(seen)
         return value
 
     def forward(self, observed: Any, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        found = self._seen(observed)
-        distribution = self._distribution(found)
+        seen = self._seen(observed)
+        distribution = self._distribution(seen)
         actions = distribution.get_actions(deterministic)
-        return actions, self._value(found), distribution.log_prob(actions)
+        return actions, self._value(seen), distribution.log_prob(actions)
 
     def evaluate_actions(self, observed: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        found = self._seen(observed)
-        distribution = self._distribution(found)
-        return self._value(found), distribution.log_prob(actions), distribution.entropy()
+        seen = self._seen(observed)
+        distribution = self._distribution(seen)
+        return self._value(seen), distribution.log_prob(actions), distribution.entropy()
 
     def get_distribution(self, observed: Any) -> BinDistribution:
         return self._distribution(self._seen(observed))

@@ -107,16 +107,18 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
                     raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
             elif config.init_from:
                 _clone(model, env, config, metrics)
-            held_out = _HeldOut(task, program, model, metrics, config) if config.eval_every else None
+            held_out = None
+            if config.eval_every:
+                held_out = _HeldOut(task, program, model, metrics, config, -1 if found is None else step)
             keeper = _Keeper(run, env, config.checkpoint_minutes, progress, held_out)
             try:
                 model.learn(config.steps - step, callback=keeper, reset_num_timesteps=found is None)
             except KeyboardInterrupt:
                 keeper.save_kept()
                 raise
-            run.save_checkpoint(model.num_timesteps, _state(model, env))
             if held_out is not None:
-                held_out.play(model.num_timesteps)
+                held_out.after(model.num_timesteps)
+            run.save_checkpoint(model.num_timesteps, _state(model, env))
     return run
 
 
@@ -183,18 +185,33 @@ def _clone(model: PPO, env: PowderVecEnv, config: TrainConfig, metrics: Metrics)
 
 
 class _HeldOut:
-    """Plays the policy in held-out worlds: ``held_out/return`` of the metrics. Training does not depend on it."""
+    """Plays the policy in held-out worlds: ``held_out/return`` of the metrics. Training does not depend on it.
 
-    def __init__(self, task: Task, program: TaskProgram, model: PPO, metrics: Metrics, config: TrainConfig):
+    Args:
+        done: the interactions up to which this has been done; -1 for a run that begins.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        program: TaskProgram,
+        model: PPO,
+        metrics: Metrics,
+        config: TrainConfig,
+        done: int,
+    ):
         self.program = TaskProgram(task, config.eval_split, program.simulator)
-        self.model, self.metrics, self.config = model, metrics, config
-        self.played_at = -1
-        """The interactions at the last evaluation."""
+        self.model, self.metrics, self.config, self.done = model, metrics, config, done
 
-    def play(self, step: int) -> None:
-        """Play unless that has been done at this step."""
-        if step == self.played_at:
-            return
+    def after(self, step: int) -> None:
+        """Play after some interactions, if a multiple of `eval_every` lies in the last rollout, and before the first."""
+        config = self.config
+        before = step - config.rollout * config.envs
+        if step > self.done and (not step or step // config.eval_every > before // config.eval_every):
+            self._play(step)
+        self.done = step
+
+    def _play(self, step: int) -> None:
         config, policy = self.config, self.model.policy
         channels = len(channels_of(config.observation, self.program.simulator.observer))
         trained = TrainedPolicy(policy, config.observation, channels, step, frames=config.frames)
@@ -204,11 +221,6 @@ class _HeldOut:
         mean, half = mean_and_interval(returns)
         found = {"held_out/return": mean} | ({} if half is None else {"held_out/interval": half})
         self.metrics.write(step, found)
-        self.played_at = step
-
-    def due(self, step: int) -> bool:
-        """Whether it is time for the next."""
-        return self.played_at < 0 or step // self.config.eval_every > self.played_at // self.config.eval_every
 
 
 class _Keeper(BaseCallback):
@@ -232,8 +244,8 @@ class _Keeper(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         step, state = self.model.num_timesteps, _state(self.model, self.worlds)
-        if self.held_out is not None and self.held_out.due(step):
-            self.held_out.play(step)
+        if self.held_out is not None:
+            self.held_out.after(step)
         if step and time.monotonic() - self.saved_at >= self.seconds:
             self.run.save_checkpoint(step, state)
             self.saved_at, self.kept = time.monotonic(), None

@@ -1,0 +1,43 @@
+"""`powderdsl curves`: learning curves of runs, over seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from powderdsl.cli import options as opt
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.options import check_writable
+
+
+@click.command("curves")
+@click.argument("runs", metavar="RUN…", nargs=-1, required=True)
+@click.option("--metric", default="held_out/return", metavar="NAME", help="A number of metrics.jsonl.")
+@opt.path("--out", "FILE", "The picture to write; without it, a table is printed.")
+def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
+    """Show what agents or world models learned, step by step.
+
+    Runs that differ only in their seed make one curve: the mean, with its 95 % interval. For agents, train with
+    --eval-every and evaluate one run: its expert, random and do-nothing policies become lines.
+    """
+    from powderdsl.experiments.runs import find_run
+    from powderdsl.experiments.runs.metrics import read_metrics
+    from powderdsl.experiments.studies.curves import as_table, baselines_of, curves_of, write_curves
+
+    if out is not None:
+        check_writable(out)
+    found = [find_run(name) for name in runs]
+    curves = curves_of(found, metric)
+    if not curves:
+        known = sorted({name for run in found for line in read_metrics(run.path) for name in line} - {"step"})
+        there = f"there are {', '.join(known)}" if known else "nothing has been written yet"
+        raise BadInput(f"no run has the metric {metric}; {there}")
+    if out is None:
+        click.echo(as_table(curves), nl=False)
+        return
+    title = str(found[0].config.get("task", ""))
+    write_curves(
+        out, curves, metric, baselines_of(found) if metric == "held_out/return" else {}, Path(title).stem
+    )
+    click.echo(str(out))

@@ -1,0 +1,190 @@
+"""What helps agents learn, and what it must not change: cloning, shaped rewards, stacked frames, held-out evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.vec_env import VecFrameStack
+
+from powderdsl.datasets import record
+from powderdsl.diagnostics import CompileError
+from powderdsl.envs.acting import FrameStack
+from powderdsl.envs.sb3 import PowderVecEnv
+from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.rl import evaluate, load_policy, train
+from powderdsl.rl.fcn import BinDistribution, action_tables, deeds_of
+from powderdsl.tasks.episodes import compile_task
+from powderdsl.tasks.shipped import load_task, shipped_tasks
+from tests.rl.tiny_tasks import DIG, PLACE, quick, write_task
+from tests.states import same
+
+AIM = """
+task: aim
+rules: core+sand
+size: [16, 16]
+fill: empty
+generate:
+  - square wall at (2..13, 2..13) half 1
+agent: {may: [sand, empty], bins: 4, brush: 4, actions: 3}
+reward: {each: change(0 - count(wall)), shaped: change(0 - count(wall)) + placed}
+expert:
+  - {choose: empty, at: most(wall)}
+"""
+"""Only one block in sixteen is right, and where it is differs from world to world."""
+
+
+def test_a_score_for_each_bin_and_deed(tmp_path: Path) -> None:
+    env = TensorEnv(str(write_task(tmp_path)), 1, backend="arrays")  # may: empty, blow
+    deeds = deeds_of(env)
+    assert deeds == ((0, 1, 1), *((1, vx, vy) for vy in range(3) for vx in range(3)))
+    actions, numbers = action_tables((4, 4), deeds, np.array(env.action_nvec))
+    assert actions.shape == (16 * 10, 5)
+    assert len(actions.unique(dim=0)) == len(actions)
+    joint = BinDistribution(actions, numbers).proba_distribution(torch.randn(1, len(actions)))
+    assert torch.equal(joint.number(actions), torch.arange(len(actions)))
+    # Directions mean nothing where the agent does not blow; all else is told apart.
+    every = torch.cartesian_prod(*map(torch.arange, env.action_nvec))
+    heard = joint.action(joint.number(every))
+    blows = every[:, 2] == 1
+    assert torch.equal(heard[blows], every[blows])
+    assert torch.equal(heard[~blows, :3], every[~blows, :3])
+    assert float(joint.log_prob(actions).exp().sum()) == pytest.approx(1, abs=1e-4)
+
+
+def test_a_policy_takes_the_expert_from_a_dataset(tmp_path: Path) -> None:
+    task = write_task(tmp_path, AIM)
+    record(load_task(task), "expert", tmp_path / "data", episodes=200, backend="arrays")
+    how = {"network": "fcn", "features": 16, "init_from": str(tmp_path / "data"), "init_epochs": 160}
+    run = train(quick(task, steps=1, learning_rate=1e-9, **how), tmp_path / "run")
+    trained, expert, at_random, nothing = evaluate(
+        run, splits=["train"], episodes=64, deterministic=True
+    ).scores
+    assert [one.policy for one in (trained, expert, nothing)] == ["trained", "expert", "nothing"]
+    assert trained.normalized is not None
+    assert trained.normalized[0] > 0.8
+    assert at_random.normalized is not None
+    assert at_random.normalized[0] < 0.4
+    (cloned,) = [
+        line for line in (run.path / "metrics.jsonl").read_text().splitlines() if "clone/loss" in line
+    ]
+    assert '"step": 0' in cloned
+    # The dataset is not needed again.
+    (tmp_path / "data").rename(tmp_path / "elsewhere")
+    assert train(quick(task, steps=40, learning_rate=1e-9, **how), tmp_path / "run").checkpoint().step == 64
+
+
+def test_a_dataset_of_another_task_is_refused(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    record(load_task(write_task(other, PLACE)), "random", tmp_path / "data", episodes=4, backend="arrays")
+    config = quick(write_task(tmp_path), init_from=str(tmp_path / "data"))
+    with pytest.raises(CompileError) as error:
+        train(config, tmp_path / "run")
+    assert error.value.diagnostics[0].code == "PD631"
+    with pytest.raises(CompileError) as error:
+        train(replace(config, init_from=str(tmp_path / "nothing")), tmp_path / "run2")
+    assert error.value.diagnostics[0].code == "PD630"
+
+
+def test_shaped_rewards_change_training_alone(tmp_path: Path) -> None:
+    task = write_task(tmp_path, AIM)
+    plain, shaped = (train(quick(task, steps=32, reward=how), tmp_path / how) for how in ("task", "shaped"))
+    assert "shaped_fingerprint" not in plain.config
+    assert plain.config["task_fingerprint"] == shaped.config["task_fingerprint"]
+    returns = [run.checkpoint().state["episodes"][0][0] for run in (plain, shaped)]
+    assert returns[0] != returns[1]
+    scores = [evaluate(run, policies=["nothing"], episodes=8).scores for run in (plain, shaped)]
+    assert scores[0] == scores[1]  # of the task's own reward
+    with pytest.raises(CompileError) as error:
+        train(quick(write_task(tmp_path, PLACE), reward="shaped"), tmp_path / "none")
+    assert error.value.diagnostics[0].code == "PD640"
+
+
+SHAPED = [name for name in shipped_tasks() if load_task(name).goal.shaped is not None]
+
+
+@pytest.mark.parametrize("name", SHAPED)
+def test_shaped_tasks_are_the_same_worlds(name: str) -> None:
+    """A task with its shaped reward has the same worlds, actions, ends and length; only rewards differ."""
+    task = load_task(name)
+    other = task.with_shaped_reward()
+    assert fingerprint(replace(task, goal=replace(task.goal, shaped=None))) == fingerprint(task)
+    assert replace(other, goal=task.goal) == task
+    programs = [compile_task(one, backend="arrays") for one in (task, other)]
+    seeds = torch.arange(4)
+    episodes = [program.start(seeds) for program in programs]
+    generator = torch.Generator().manual_seed(1)
+    total = [torch.zeros(4), torch.zeros(4)]
+    for _ in range(12):
+        actions = torch.stack(
+            [torch.randint(0, count, (4,), generator=generator) for count in programs[0].action_nvec], 1
+        )
+        for number, program in enumerate(programs):
+            episodes[number], reward, _, _ = program.act(episodes[number], actions)
+            total[number] += reward
+        assert torch.equal(*(one.world.ids for one in episodes))
+        assert torch.equal(*(one.failed for one in episodes))
+    assert not torch.equal(*total)
+
+
+def test_some_tasks_have_shaped_rewards() -> None:
+    assert "sand-pushing" in SHAPED
+
+
+def test_frames_are_those_of_stable_baselines(tmp_path: Path) -> None:
+    env = PowderVecEnv(str(write_task(tmp_path, DIG)), 3, backend="arrays")
+    stacked, own = VecFrameStack(env, 3, channels_order="first"), FrameStack(3)
+    env.seed(5)
+    expected = stacked.reset()
+    found = own.push(torch.from_numpy(expected[:, -1:].copy()))
+    generator = np.random.default_rng(0)
+    for _ in range(11):  # episodes end after four
+        assert np.array_equal(found.numpy(), expected)
+        expected, _, done, _ = stacked.step(generator.integers(0, env.action_space.nvec, (3, 5)))
+        found = own.push(torch.from_numpy(expected[:, -1:].copy()), torch.from_numpy(done))
+
+
+def test_a_policy_sees_the_frames_that_it_learned_from(tmp_path: Path) -> None:
+    run = train(quick(write_task(tmp_path), frames=2, steps=32), tmp_path / "run")
+    env = TensorEnv(str(tmp_path / "task.yaml"), 2, backend="arrays")
+    policy = load_policy(run, env, deterministic=True)
+    assert policy.frames == 2
+    observed, _ = env.reset(seed=1)
+    assert policy(FrameStack(2).push(observed), torch.zeros(2, dtype=torch.int64)).shape == (2, 5)
+    assert len(evaluate(run, policies=["trained"], episodes=4).scores) == 2
+    record(
+        load_task(tmp_path / "task.yaml"),
+        policy,
+        tmp_path / "data",
+        episodes=4,
+        policy_name="two frames",
+        backend="arrays",
+    )
+
+
+@pytest.mark.parametrize("network", ["small", "fcn"])
+def test_held_out_evaluation_changes_no_weights(tmp_path: Path, network: str) -> None:
+    task = write_task(tmp_path)
+    how = {"network": network, "steps": 64}
+    without = train(quick(task, **how), tmp_path / "without")
+    evaluated = train(quick(task, eval_every=32, eval_episodes=5, **how), tmp_path / "with")
+    states = [run.checkpoint().state for run in (without, evaluated)]
+    assert same(states[0]["policy"], states[1]["policy"])
+    assert same(states[0]["random"], states[1]["random"])
+
+
+def test_a_falling_rate_belongs_to_the_run(tmp_path: Path) -> None:
+    task = write_task(tmp_path)
+    run = train(quick(task, schedule="linear", steps=64), tmp_path / "run")
+    rates = [
+        line for line in (run.path / "metrics.jsonl").read_text().splitlines() if "learning_rate" in line
+    ]
+    assert len(rates) == 1  # of the first update; the last one's is written by the next rollout
+    with pytest.raises(CompileError) as error:
+        train(quick(task, schedule="linear", steps=128), tmp_path / "run")
+    assert "`steps`" in error.value.diagnostics[0].notes[0]
