@@ -200,10 +200,6 @@ class Dataset:
             raise ValueError(f"no episode has {length} actions; the longest has {longest}")
         return Batches(self, length, ends, batch, seed, device, start)
 
-    def take(self, numbers: Array) -> Batch:
-        """Transitions by number, integers [B] below `steps`: those of episode 0 first."""
-        return Batch(*(torch.from_numpy(value[:, 0]) for value in self._gather(numbers, self._ends, 1)))
-
     # Drawing
 
     def located(self, windows: Array, ends: Array, length: int) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from powderdsl.datasets.dataset import Dataset, drawn
+from powderdsl.datasets.transitions import Transitions
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl.config import TrainConfig
 
@@ -41,8 +42,8 @@ def clone(
         tell: called after every hundredth update with its number, the number of all, and the loss, the accuracy (the share
             of transitions whose recorded action is the policy's likeliest) and the error of values since the last call.
     """
-    updates = max(1, config.init_epochs * dataset.steps // BATCH)
-    returns = _returns(dataset, config.gamma)
+    rows, returns = Transitions(dataset), _returns(dataset, config.gamma)
+    updates = max(1, config.init_epochs * len(rows) // BATCH)
     spread = max(float(returns.var()), 1e-6)  # so that values do not outweigh actions
     optimizer = torch.optim.Adam(policy.parameters(), lr=RATE)
     policy.set_training_mode(True)
@@ -50,8 +51,8 @@ def clone(
     for number in range(updates):
         for group in optimizer.param_groups:
             group["lr"] = RATE * (1 - number / updates)
-        numbers = drawn(config.seed, number, BATCH, dataset.steps)
-        batch = dataset.take(numbers)
+        numbers = drawn(config.seed, number, BATCH, len(rows))
+        batch = rows[numbers]
         observed = batch.observation.to(policy.device)
         actions = batch.action.long().to(policy.device)
         wanted = torch.from_numpy(returns[numbers]).to(policy.device)

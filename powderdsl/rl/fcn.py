@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, Self
 
-import numpy as np
 import torch
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -13,23 +12,12 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
+from powderdsl.envs.actions import ActionForm, action_form
 from powderdsl.envs.features import patches_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.tasks.task import BLOW
 
 DILATIONS = (1, 2, 4)
 """Of the residual blocks. With the first convolution, an output sees 17 bins in each direction, and the mean of all."""
-
-
-def deeds_of(env: TensorEnv) -> tuple[tuple[int, int, int], ...]:
-    """What an agent may do at a bin: (choice, vx, vy). Only blowing has directions."""
-    found = []
-    for choice, meaning in enumerate(env.task.agent.choices):
-        if meaning == BLOW:
-            found += [(choice, vx, vy) for vy in range(3) for vx in range(3)]
-        else:
-            found.append((choice, 1, 1))
-    return tuple(found)
 
 
 def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str, Any]:
@@ -45,7 +33,8 @@ def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str,
     sides = tuple(min(count, side) for count, side in zip(bins, env.task.size, strict=True))
     if sides != bins:
         raise ValueError(f"the agent has {bins} bins in worlds of {env.task.size} cells")
-    return {"see": patches_of(env, sides, frames), "channels": channels, "deeds": deeds_of(env)}
+    form = action_form("discrete", env.task.agent, torch.device("cpu"))
+    return {"see": patches_of(env, sides, frames), "channels": channels, "bins": bins, "form": form}
 
 
 class Trunk(nn.Module):
@@ -65,18 +54,13 @@ class Trunk(nn.Module):
 
 
 class BinDistribution(Distribution):
-    """One choice among all deeds at all bins. Actions are (x, y, choice, vx, vy), int64 [B, 5].
-
-    Args:
-        actions: int64 [n, 5], the action of each score. numbers: int64 [columns, rows, choices, 3, 3], the score of each
-            action.
-    """
+    """One choice among the values of a ``discrete`` form of actions. Actions are (x, y, choice, vx, vy), int64 [B, 5]."""
 
     distribution: Categorical
 
-    def __init__(self, actions: Tensor, numbers: Tensor):
+    def __init__(self, form: ActionForm):
         super().__init__()
-        self.actions, self.numbers = actions, numbers
+        self.form = form
 
     def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
         raise NotImplementedError("BinPolicy has its own layers")
@@ -85,16 +69,12 @@ class BinDistribution(Distribution):
         self.distribution = Categorical(logits=scores)
         return self
 
-    def number(self, actions: Tensor) -> Tensor:
-        """The scores' places of actions, int64 [B]."""
-        return self.numbers.to(actions.device)[tuple(actions.long().T)]
-
-    def action(self, numbers: Tensor) -> Tensor:
-        """The actions of scores' places, int64 [B, 5]."""
-        return self.actions.to(numbers.device)[numbers]
+    def action(self, values: Tensor) -> Tensor:
+        """The five numbers of values, int64 [B, 5]."""
+        return self.form.decode(values).to(values.device)
 
     def log_prob(self, actions: Tensor) -> Tensor:
-        found: Tensor = self.distribution.log_prob(self.number(actions))
+        found: Tensor = self.distribution.log_prob(self.form.encode(actions.long()).to(actions.device))
         return found
 
     def entropy(self) -> Tensor:
@@ -120,7 +100,8 @@ class BinPolicy(ActorCriticPolicy):
     own: its errors, which are large at first, do not change what the scores see.
 
     Args:
-        see: from observations to patches, one for each bin. channels: of each convolution. deeds: see `deeds_of`.
+        see: from observations to patches, one for each bin. channels: of each convolution. bins: rows and columns.
+        form: the ``discrete`` form of actions, whose order is that of the scores: deed by deed, row by row.
     """
 
     def __init__(
@@ -131,20 +112,21 @@ class BinPolicy(ActorCriticPolicy):
         *,
         see: Any,
         channels: int,
-        deeds: tuple[tuple[int, int, int], ...],
+        bins: tuple[int, int],
+        form: ActionForm,
         use_sde: bool = False,
     ):
-        self._parts = see, channels, deeds
-        self._nvec = action_space.nvec
+        self._parts = see, channels, bins, form
         super().__init__(observation_space, action_space, lr_schedule, use_sde=use_sde)
 
     def _build(self, lr_schedule: Schedule) -> None:
-        see, width, deeds = self._parts
-        columns, rows = (int(count) for count in self._nvec[:2])
-        places = torch.meshgrid(*(torch.linspace(-1, 1, side) for side in (rows, columns)), indexing="ij")
+        see, width, bins, form = self._parts
+        places = torch.meshgrid(*(torch.linspace(-1, 1, side) for side in bins), indexing="ij")
         self.register_buffer("places", torch.stack(places))
         self.see, self.trunk = see, Trunk(see.channels + 2, width)
-        self.scores = nn.Conv2d(width, len(deeds), 1)
+        deeds, idle = divmod(form.nvec[0], bins[0] * bins[1])
+        self.scores = nn.Conv2d(width, deeds, 1)
+        self.idle = nn.Linear(width, 1) if idle else None  # doing nothing has no place
         self.judge = nn.Sequential(
             nn.Conv2d(see.channels + 2, width, 3, 2, 1),
             nn.ReLU(),
@@ -159,8 +141,10 @@ class BinPolicy(ActorCriticPolicy):
         for layer in (*self.trunk.modules(), *self.judge):
             if isinstance(layer, nn.Conv2d | nn.Linear):
                 nn.init.orthogonal_(layer.weight, math.sqrt(2))
-        nn.init.orthogonal_(self.scores.weight, 0.01)  # all actions about equally likely
-        self.bins = BinDistribution(*action_tables((rows, columns), deeds, self._nvec))
+        for last in (self.scores, self.idle):
+            if last is not None:
+                nn.init.orthogonal_(last.weight, 0.01)  # all actions about equally likely
+        self.bins = BinDistribution(form)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1), eps=1e-5)
 
     def _seen(self, observed: Tensor) -> Tensor:
@@ -170,7 +154,11 @@ class BinPolicy(ActorCriticPolicy):
             return torch.cat([patches, self.get_buffer("places").expand(len(patches), -1, -1, -1)], 1)
 
     def _distribution(self, seen: Tensor) -> BinDistribution:
-        return self.bins.proba_distribution(self.scores(self.trunk(seen)).flatten(1))
+        found = self.trunk(seen)
+        scores = self.scores(found).flatten(1)
+        if self.idle is not None:
+            scores = torch.cat([scores, self.idle(found.mean((2, 3)))], 1)
+        return self.bins.proba_distribution(scores)
 
     def _value(self, seen: Tensor) -> Tensor:
         value: Tensor = self.judge(seen)
@@ -192,21 +180,3 @@ class BinPolicy(ActorCriticPolicy):
 
     def predict_values(self, observed: Any) -> Tensor:
         return self._value(self._seen(observed))
-
-
-def action_tables(
-    bins: tuple[int, int], deeds: tuple[tuple[int, int, int], ...], nvec: np.ndarray[Any, Any]
-) -> tuple[Tensor, Tensor]:
-    """The tables of `BinDistribution`. Scores stand deed by deed, row by row."""
-    rows, columns = bins
-    deed, row, column = torch.meshgrid(*map(torch.arange, (len(deeds), rows, columns)), indexing="ij")
-    actions = torch.cat(
-        [torch.stack([column.flatten(), row.flatten()], 1), torch.tensor(deeds)[deed.flatten()]], 1
-    )
-    numbers = torch.zeros(tuple(int(count) for count in nvec), dtype=torch.int64)
-    for choice in range(numbers.shape[2]):  # directions of what does not blow: all mean the same
-        first = next(number for number, one in enumerate(deeds) if one[0] == choice)
-        numbers[:, :, choice] = (first * rows * columns + torch.arange(rows) * columns)[None, :, None, None]
-        numbers[:, :, choice] += torch.arange(columns)[:, None, None, None]
-    numbers[tuple(actions.T)] = torch.arange(len(actions))
-    return actions, numbers

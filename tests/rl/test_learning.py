@@ -17,7 +17,7 @@ from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl import evaluate, load_policy, train
-from powderdsl.rl.fcn import BinDistribution, action_tables, deeds_of
+from powderdsl.rl.fcn import BinPolicy, fcn_policy
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from tests.rl.tiny_tasks import DIG, PLACE, quick, write_task
@@ -39,21 +39,23 @@ expert:
 
 
 def test_a_score_for_each_bin_and_deed(tmp_path: Path) -> None:
-    env = TensorEnv(str(write_task(tmp_path)), 1, backend="arrays")  # may: empty, blow
-    deeds = deeds_of(env)
-    assert deeds == ((0, 1, 1), *((1, vx, vy) for vy in range(3) for vx in range(3)))
-    actions, numbers = action_tables((4, 4), deeds, np.array(env.action_nvec))
-    assert actions.shape == (16 * 10, 5)
-    assert len(actions.unique(dim=0)) == len(actions)
-    joint = BinDistribution(actions, numbers).proba_distribution(torch.randn(1, len(actions)))
-    assert torch.equal(joint.number(actions), torch.arange(len(actions)))
-    # Directions mean nothing where the agent does not blow; all else is told apart.
-    every = torch.cartesian_prod(*map(torch.arange, env.action_nvec))
-    heard = joint.action(joint.number(every))
-    blows = every[:, 2] == 1
-    assert torch.equal(heard[blows], every[blows])
-    assert torch.equal(heard[~blows, :3], every[~blows, :3])
-    assert float(joint.log_prob(actions).exp().sum()) == pytest.approx(1, abs=1e-4)
+    idle = DIG.replace("[empty, blow]", "[empty, blow, nothing]")
+    for text, count in ((DIG, 160), (idle, 161)):  # 16 bins: empty, and nine ways to blow
+        env = TensorEnv(str(write_task(tmp_path, text)), 1, observation="ids", backend="arrays")
+        how = fcn_policy(env, 8)
+        policy = BinPolicy(env.observation.space, env.single_action_space, lambda _: 1e-3, **how)
+        observed, _ = env.reset(seed=0)
+        joint = policy.get_distribution(observed)
+        every = how["form"].table
+        assert len(every) == count
+        assert torch.equal(joint.form.encode(every), torch.arange(count))
+        likely = torch.cat([policy.get_distribution(observed).log_prob(one[None]) for one in every]).exp()
+        assert float(likely.sum()) == pytest.approx(1, abs=1e-4)
+        assert float(likely.max()) < 3 / count  # none is preferred before it has learned
+        values, again, entropy = policy.evaluate_actions(observed.expand(count, -1, -1, -1), every)
+        assert values.shape == (count, 1)
+        assert torch.allclose(again.exp(), likely, atol=1e-6)
+        assert float(entropy[0]) == pytest.approx(-float((likely * likely.log()).sum()), abs=1e-4)
 
 
 def test_a_policy_takes_the_expert_from_a_dataset(tmp_path: Path) -> None:
@@ -137,7 +139,7 @@ def test_some_tasks_have_shaped_rewards() -> None:
 
 
 def test_frames_are_those_of_stable_baselines(tmp_path: Path) -> None:
-    env = PowderVecEnv(str(write_task(tmp_path, DIG)), 3, backend="arrays")
+    env = PowderVecEnv(str(write_task(tmp_path, DIG)), 3, backend="arrays", actions="full")
     stacked, own = VecFrameStack(env, 3, channels_order="first"), FrameStack(3)
     env.seed(5)
     expected = stacked.reset()
