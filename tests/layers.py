@@ -88,13 +88,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "tasks.players": (*_BACK, "worlds", "tasks", "tasks.tensors", "tasks.episodes"),
     "envs": (*_SCREEN, "tasks", "tasks.episodes"),
     "datasets": (*_SCREEN, *_LEARNING[:6]),
-<<<<<<< HEAD
-    "rl": (*_SCREEN, *_LEARNING[:6]),
-    "worldmodel": (*_SCREEN, *_LEARNING[:7]),
-=======
     "rl": (*_SCREEN, *_LEARNING[:7]),
-    "worldmodel": (*_SCREEN, *_LEARNING[:5]),
->>>>>>> 6d4812b (Training that learns: a fully convolutional policy, behavior cloning, shaped rewards, held-out evaluation, learning curves)
+    "worldmodel": (*_SCREEN, *_LEARNING[:7]),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
     "cli": (*_SCREEN, *_TESTING, "testing.mutation", *_LEARNING, "experiments.bench", "experiments.studies"),

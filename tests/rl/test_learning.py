@@ -38,6 +38,7 @@ expert:
 """Only one block in sixteen is right, and where it is differs from world to world."""
 
 
+@torch.no_grad()
 def test_a_score_for_each_bin_and_deed(tmp_path: Path) -> None:
     idle = DIG.replace("[empty, blow]", "[empty, blow, nothing]")
     for text, count in ((DIG, 160), (idle, 161)):  # 16 bins: empty, and nine ways to blow
