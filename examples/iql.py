@@ -120,12 +120,13 @@ def train(
         # Q: the reward, and V of what came of it.
         q_loss = functional.mse_loss(q.gather(1, action)[:, 0], wanted_q)
 
-        # Policy: cloning, in which actions that beat V count more. Advantages are taken relative to their mean size, so
-        # that one beta fits tasks with large and with small rewards.
-        relative = advantage.detach() / (advantage.detach().abs().mean() + 1e-8)
-        trust = (args.beta * relative).exp().clamp(max=100)
+        # Policy: cloning, in which actions that beat V count more. Advantages are standardized, as in PPO: so one beta
+        # fits large and small rewards, and an error that V makes everywhere does not matter.
+        gain = advantage.detach()
+        gain = (gain - gain.mean()) / (gain.std() + 1e-8)
+        trust = (args.beta * gain).exp().clamp(max=100)
         cross_entropy = functional.cross_entropy(policy(batch.observation)[0], action[:, 0], reduction="none")
-        policy_loss = (trust * cross_entropy).mean()
+        policy_loss = (trust * cross_entropy).sum() / trust.sum()
 
         optimizer.zero_grad()
         (value_loss + q_loss + policy_loss).backward()
@@ -153,13 +154,13 @@ def main(arguments: list[str] | None = None) -> dict[str, float]:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--task", default="sand-pushing", help="a shipped task, or a task file")
     parser.add_argument("--data", required=True, nargs="+", help="folders of `powderdsl record TASK`")
-    parser.add_argument("--updates", type=int, default=1000)
+    parser.add_argument("--updates", type=int, default=600)
     parser.add_argument("--batch", type=int, default=64, help="transitions of an update")
     parser.add_argument("--every", type=int, default=100, help="updates between rows of the learning curve")
     parser.add_argument("--lr", type=float, default=1e-3)
     parser.add_argument("--gamma", type=float, default=0.97)
     parser.add_argument("--expectile", type=float, default=0.8)
-    parser.add_argument("--beta", type=float, default=3.0, help="how much better actions count more")
+    parser.add_argument("--beta", type=float, default=2.0, help="how much better actions count more")
     parser.add_argument("--tau", type=float, default=0.01, help="how fast the target follows Q")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--worlds", type=int, default=64, help="worlds of the split `test` to play in")
