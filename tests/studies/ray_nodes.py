@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from random import Random
 from secrets import token_hex
 
 from tests.cli.commands import environment_with
@@ -81,9 +82,13 @@ class Nodes:
                     found[int(place.name)] = line.decode(errors="replace").strip()
         return found
 
-    def workers(self, tasks: str) -> list[int]:
-        """Processes that are running a task whose name starts with a word."""
-        return [pid for pid, line in self.processes().items() if line.startswith(f"ray::{tasks}")]
+    def kill_worker(self, tasks: str, chance: Random) -> bool:
+        """Kill a process that is running a task whose name starts with a word; False if there is none."""
+        found = [pid for pid, line in self.processes().items() if line.startswith(f"ray::{tasks}")]
+        with suppress(ProcessLookupError, IndexError):
+            os.kill(chance.choice(found), signal.SIGKILL)
+            return True
+        return False
 
     def kill_node(self, node: int) -> int:
         """Kill all processes of a node at once, as when a machine dies; returns how many there were."""

@@ -164,24 +164,27 @@ KILLS = ("worker", "worker", "worker", "worker", "node", "node", "node", "driver
 @needs_ray
 @needs_proc
 def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
-    """24 runs on two nodes, and ten kills at random moments: the table is that of an undisturbed study."""
+    """24 runs on two nodes, and ten kills, spread over the study: the table is that of an undisturbed one."""
     written(tmp_path, 8, [300, 600, 900])
     undisturbed = run_study(tmp_path, "--out", "undisturbed", seconds=3600)
     assert undisturbed.returncode == 0, undisturbed.stderr
     chance = random.Random(os.environ.get("POWDERDSL_KILLS", "powderdsl"))
-    kills = chance.sample(KILLS, len(KILLS))
+    kills = zip(
+        chance.sample(KILLS, len(KILLS)), sorted(chance.choices(range(16), k=len(KILLS))), strict=True
+    )
     done: dict[str, tuple[int, int]] = {}
     with cluster(2) as nodes, ExitStack() as stack:
         study = _Driver(tmp_path, nodes, stack, "out")
         node = nodes.started
-        for kill in kills:
-            assert waited(lambda: nodes.workers("tiny"), 300), study.said()
-            time.sleep(chance.uniform(1, 30))
-            assert waited(lambda: nodes.workers("tiny"), 300), study.said()
+        for kill, least in kills:
+            while len(_finished(tmp_path / "out")) < least:
+                assert study.running.poll() is None, study.said()
+                time.sleep(0.5)
+            time.sleep(chance.uniform(0.5, 8))
             assert study.running.poll() is None, study.said()
             match kill:
                 case "worker":
-                    os.kill(chance.choice(nodes.workers("tiny")), signal.SIGKILL)
+                    assert waited(lambda: nodes.kill_worker("tiny", chance), 300), study.said()
                 case "node":
                     assert nodes.kill_node(node) > 1
                     node = nodes.start_node()
