@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node
@@ -74,12 +75,13 @@ def led(schedule: Schedule) -> Schedule:
     """
     roots = [node for statement in flat(schedule.body) for node in values_of(statement)]
     comparisons = [node for node in ordered(roots) if is_comparison(node)]
+    conjoined = _conjoined(roots, comparisons)
     leaders: dict[int, Node] = {}
     leading: set[int] = set()
     for node in comparisons:
-        for leader in comparisons:
-            free = leader is not node and id(leader) not in leaders and id(node) not in leading
-            if free and leader.args != node.args and all(_covered(root, node, leader) for root in roots):
+        for number in _bits(conjoined[id(node)]):
+            leader = comparisons[number]
+            if id(leader) not in leaders and id(node) not in leading and leader.args != node.args:
                 leaders[id(node)] = leader
                 leading.add(id(leader))
                 break
@@ -104,21 +106,27 @@ def of_floats(node: Node) -> bool:
     return node.type == REAL or node.op == "led" or is_comparison(node)
 
 
-def _covered(root: Node, node: Node, leader: Node) -> bool:
-    """Whether every path from the root to the node goes through a conjunction with the leader."""
-    seen: set[int] = set()
-    stack = [root]
-    while stack:
-        top = stack.pop()
-        if id(top) in seen:
-            continue
-        seen.add(id(top))
-        if top is node:
-            return False
-        if top.op == "and":
-            parts = conjuncts(top)
-            if any(part is leader for part in parts):
-                stack.append(leader)  # the other parts matter only together with it
-                continue
-        stack.extend(top.args)
-    return True
+def _conjoined(roots: list[Node], comparisons: list[Node]) -> dict[int, int]:
+    """For each node, by id, the comparisons that every path from a root to it goes through a conjunction with, as bits.
+
+    From a conjunction, paths lead to its conjuncts at once. The path to a conjunct is not one with itself.
+    """
+    bit = {id(node): 1 << number for number, node in enumerate(comparisons)}
+    found: dict[int, int] = {id(root): 0 for root in roots}
+    for node in reversed(ordered(roots)):  # users first
+        if id(node) not in found:
+            continue  # a conjunction inside others
+        below = conjuncts(node) if node.op == "and" else node.args
+        others = sum(bit.get(id(part), 0) for part in below) if node.op == "and" else 0
+        for part in below:
+            paths = found[id(node)] | (others & ~bit.get(id(part), 0))
+            found[id(part)] = found.get(id(part), paths) & paths
+    return found
+
+
+def _bits(number: int) -> Iterator[int]:
+    """The places of the bits of a number that are set, lowest first."""
+    while number:
+        lowest = number & -number
+        yield lowest.bit_length() - 1
+        number ^= lowest
