@@ -16,6 +16,7 @@ from powderdsl.ir.ops import (
     FLAG,
     REAL,
     Node,
+    Offset,
     PassGraph,
     Program,
     SlotType,
@@ -24,6 +25,7 @@ from powderdsl.ir.ops import (
     nodes_of,
     plane_name,
 )
+from powderdsl.ir.stages.fold import FOLD
 
 MAX_TABLE_BITS = 12
 
@@ -167,7 +169,12 @@ class _PassBits:
             return Bits(tuple(self.gates.shift(p, (dy, dx), wraps) for p in value.planes), value.signed)
         if value.type == FLAG:
             return self.gates.shift(value, (dy, dx), wraps)
-        return self.build.shift(value, (dy, dx), wraps)
+        return self._shift_floats(value, (dy, dx), wraps)
+
+    def _shift_floats(self, value: Node, offset: Offset, wraps: bool = True) -> Node:
+        """Floats at a neighbor. Planes may have shown that they are the same everywhere, which has no neighbors."""
+        found = self.build.shift(value, offset, wraps)
+        return FOLD.apply(found, self.build) or found
 
     def _movement(self, node: Node) -> Node | Bits:
         """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""
@@ -179,9 +186,9 @@ class _PassBits:
             if content.type == REAL:  # cell by cell anyway: choices between what neighbors hold
                 dy, dx = offset
                 targets = self.gates.shift(movers, (-dy, -dx), True)
-                moved = self.build.select(targets, self.build.shift(content, (-dy, -dx)), rest)
+                moved = self.build.select(targets, self._shift_floats(content, (-dy, -dx)), rest)
                 if node.op == "swap":
-                    moved = self.build.select(movers, self.build.shift(content, (dy, dx)), moved)
+                    moved = self.build.select(movers, self._shift_floats(content, (dy, dx)), moved)
                 return moved
             return self.build.derive(node.op, content, movers, rest, attr=offset)
         assert isinstance(rest, Bits)
