@@ -25,7 +25,6 @@ from powderdsl.ir.ops import (
     nodes_of,
     plane_name,
 )
-from powderdsl.ir.stages.fold import FOLD
 
 MAX_TABLE_BITS = 12
 
@@ -173,8 +172,9 @@ class _PassBits:
 
     def _shift_floats(self, value: Node, offset: Offset, wraps: bool = True) -> Node:
         """Floats at a neighbor. Planes may have shown that they are the same everywhere, which has no neighbors."""
-        found = self.build.shift(value, offset, wraps)
-        return FOLD.apply(found, self.build) or found
+        if value.op in ("const", "param"):
+            return self.build.shift_uniform(value, offset, wraps)
+        return self.build.shift(value, offset, wraps)
 
     def _movement(self, node: Node) -> Node | Bits:
         """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""

@@ -128,6 +128,12 @@ class Builder:
             type = integer(min(type.lo, 0), max(type.hi, 0))
         return self.make("shift", type, a, attr=(*offset, wraps))
 
+    def shift_uniform(self, a: Node, offset: Offset, wraps: bool) -> Node:
+        """A constant or parameter at a neighbor: the same, and zero outside unless it wraps."""
+        if wraps or offset == (0, 0) or (a.op == "const" and not a.attr):
+            return a
+        return self.select(self.make("inside", FLAG, attr=offset), a, self.const(0, a.type))
+
     def select(self, condition: Node, yes: Node, no: Node) -> Node:
         return self.derive("select", condition, yes, no)
 

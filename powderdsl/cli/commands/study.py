@@ -61,8 +61,9 @@ MEANS = {
 }
 """The meaning of arguments and options, by their metavar."""
 
-NOT_FOR_STUDIES = ("--network", "--ignore-actions")
-"""Options without a use in studies. `--network` imports a module, and a study may come from a stranger."""
+NOT_FOR_STUDIES = ("MODULE:CLASS", "--ignore-actions")
+"""Options without a use in studies, by their metavar or name. Modules would be imported, and a study may come from a
+stranger."""
 
 
 def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
@@ -82,7 +83,7 @@ def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
             )
             if isinstance(one.type, click.Path) and means != FILE and "--run" not in one.opts:
                 continue
-            if {*one.opts} & {*NOT_FOR_STUDIES}:
+            if {one.metavar, *one.opts} & {*NOT_FOR_STUDIES}:
                 continue
             found[words] |= {name[2:]: means for name in one.opts if name.startswith("--")}
     return found

@@ -144,15 +144,10 @@ def _movement(node: Node, build: Builder) -> Node | None:
 @FOLD.on("shift")
 def _shift_of_constant(node: Node, build: Builder) -> Node | None:
     (a,) = node.args
-    wraps = node.attr[2]
-    if a.op in ("const", "param") and (wraps or (a.op == "const" and not a.attr)):
-        return a
+    dy, dx, wraps = node.attr
     if a.op == "coordinate" and a.attr[0] == "step" and wraps:
         return a
-    if a.op in ("const", "param"):  # nothing outside: the same inside, else zero
-        inside = build.make("inside", FLAG, attr=node.attr[:2])
-        return build.select(inside, a, build.const(0, a.type))
-    return None
+    return build.shift_uniform(a, (dy, dx), wraps) if a.op in ("const", "param") else None
 
 
 @FOLD.on("below")
