@@ -146,7 +146,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )
 """``paper``: its network and settings. ``small``: a network and settings for a few minutes on one processor core. ``fcn``:
-a fully convolutional network, which takes about five times as long as `small` and learns more from as many interactions."""
+a fully convolutional network with one score for each bin and deed."""
 
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
