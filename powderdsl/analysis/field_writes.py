@@ -48,7 +48,7 @@ def find_fields(ruleset: Ruleset, found: Iterable[Found]) -> tuple[FieldEntry, .
     params = {param.name: param.kind for param in ruleset.params}
     for prop in ruleset.properties:
         if prop.stored:
-            kinds = [params[v] if isinstance(v, str) else Kind("int", v, v) for v in prop.values]  # type: ignore[arg-type]
+            kinds = [params[v] if isinstance(v, str) else Kind("int", v, v) for v in prop.values]  # type: ignore[arg-type]  # only numbers are left
             hull = (min(kind.lo for kind in kinds), max(kind.hi for kind in kinds))
             bounds = hull if prop.kind.name == "int" else None
             entries.append((prop.name, prop.kind, "its element has it", True, bounds))

@@ -69,7 +69,7 @@ def write_shard(
                     entry = zipfile.ZipInfo(f"{name}.npy")
                     entry.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
                     # `open` takes the level from here alone, and ZipInfo has no public name for it before 3.13.
-                    entry._compresslevel = LEVEL  # type: ignore[attr-defined]
+                    entry._compresslevel = LEVEL  # type: ignore[attr-defined]  # see above
                     values = [np.ascontiguousarray(part, dtype) for part in parts[name]]
                     shape = (sum(map(len, values)), *values[0].shape[1:])
                     header = {"descr": dtype, "fortran_order": False, "shape": shape}

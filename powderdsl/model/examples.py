@@ -118,7 +118,7 @@ def _check_sides(decl: TestDecl, drawing: Scalar, given: tuple[str, ...], pack: 
 
 def _often(change: Syntax, chance: Syntax, scope: Scope, typer: Typer) -> Often:
     before, after = (typer.condition(part, scope) for part in change.children)
-    return Often(before, after, Fraction(typer.constant(chance, CHANCE, scope)), change.span)  # type: ignore[arg-type]
+    return Often(before, after, Fraction(typer.constant(chance, CHANCE, scope)), change.span)  # type: ignore[arg-type]  # a chance is a fraction
 
 
 def check_assigned(examples: Sequence[Example], symbols: Symbols, reporter: Reporter) -> None:

@@ -25,7 +25,7 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
     "paper",
     to="preset_name",
 )
-@opt.path("--init-from", "DATASET", "A dataset whose actions the network learns first (behavior cloning).")
+@opt.path("--init-from", "DATASET", "Dataset whose actions the network learns first (behavior cloning).")
 @opt.settings_of(TrainConfig)
 @opt.knobs("Another value for a knob of the task. May be repeated.")
 @opt.integer("--n-lines", 0, 10**6, "Short for --knob lines=N.", to="lines")

@@ -39,11 +39,11 @@ class Inputs:
             type = FLAG if prop.kind.name == "flag" else integer(0, 0)
             return self.by_element(
                 element,
-                [param_node(self, v) if isinstance(v, str) else build.const(v, type) for v in values],  # type: ignore[arg-type]
+                [param_node(self, v) if isinstance(v, str) else build.const(v, type) for v in values],  # type: ignore[arg-type]  # only numbers are left
             )
         if prop.kind.name == "flag":
             return build.in_set(element, frozenset(i for i, value in enumerate(values) if value))
-        return build.table(element, tuple(int(value) for value in values))  # type: ignore[arg-type]
+        return build.table(element, tuple(int(value) for value in values))  # type: ignore[arg-type]  # the names returned above
 
     def by_element(self, element: Node, values: list[Node]) -> Node:
         """The value that belongs to the element: one select a distinct value."""
@@ -95,7 +95,7 @@ def _const(expr: Expr, at: Inputs) -> Node:
 
 def _float32(value: object) -> float:
     """A constant as the float32 it is rounded to, going through float64 as the reference does."""
-    return float(np.float32(float(value)))  # type: ignore[arg-type]
+    return float(np.float32(float(value)))  # type: ignore[arg-type]  # a constant is a number
 
 
 def _property(expr: Expr, at: Inputs) -> Node:

@@ -93,7 +93,7 @@ def _sum(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
             kind = _sum_range(kernel, value.kind.lo, value.kind.hi)
             return typer.bounded(Expr("sum", kind, (value,), kernel, syntax.span), syntax.span)
         case "vec2":
-            return Expr("sum", VEC2, (value,), kernel, syntax.span)  # type: ignore[arg-type]
+            return Expr("sum", VEC2, (value,), kernel, syntax.span)  # type: ignore[arg-type]  # a vector is an Expr
     return Expr("sum", REAL, (typer.real(value, argument.span),), kernel, syntax.span)
 
 

@@ -114,7 +114,7 @@ def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: 
             if op != "eq":
                 message = f"{words} is not more or less than another"
                 raise typer.fail("PD401", message, span, "has no order", "use `==` or `!=`")
-            return Expr(op, FLAG, (left[0], right[0]), span=span)  # type: ignore[arg-type]
+            return Expr(op, FLAG, (left[0], right[0]), span=span)  # type: ignore[arg-type]  # both are Expr: see above
     fix = "compare `length(…)`, or `.row` and `.column`"
     raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", fix)
 
@@ -289,7 +289,7 @@ def _on_vectors(typer: Typer, op: str, left: Value, right: Value, span: Span) ->
         raise typer.fail("PD401", message, span, "the other way round, or two vectors")
     a = left if first else typer.real(left, span)
     b = right if second else typer.real(right, span)
-    return Expr(op, VEC2, (a, b), span=span)  # type: ignore[arg-type]
+    return Expr(op, VEC2, (a, b), span=span)  # type: ignore[arg-type]  # vectors, or made real
 
 
 def negate(typer: Typer, value: Value, span: Span) -> Value:
