@@ -43,7 +43,7 @@ class Inputs:
             )
         if prop.kind.name == "flag":
             return build.in_set(element, frozenset(i for i, value in enumerate(values) if value))
-        return build.table(element, tuple(int(value) for value in values))  # type: ignore[arg-type]  # the names returned above
+        return build.table(element, tuple(int(value) for value in values))  # type: ignore[arg-type]  # only numbers are left
 
     def by_element(self, element: Node, values: list[Node]) -> Node:
         """The value that belongs to the element: one select a distinct value."""
