@@ -142,11 +142,10 @@ def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
         # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
         warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
         kind, how = policy_of(config, env.tensors)
-        rate = config.learning_rate
         return PPO(
             kind,
             _wrapped(config, env),
-            learning_rate=rate if config.schedule == "constant" else lambda left: rate * left,
+            learning_rate=_rate(config),
             n_steps=config.rollout,
             batch_size=config.batch,
             n_epochs=config.epochs,
@@ -162,6 +161,24 @@ def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
             device=config.device,
             seed=config.seed,
         )
+
+
+def _rate(config: TrainConfig) -> float | Callable[[float], float]:
+    """The learning rate, or that of an update by the share of `steps` left after its rollout.
+
+    It falls evenly over the updates: the first has all of it, the last one part of as many as there are. The share left
+    does not do by itself, since it is negative where the last rollout goes beyond `steps`.
+    """
+    if config.schedule == "constant":
+        return config.learning_rate
+    rollout = config.envs * config.rollout
+    updates = -(-config.steps // rollout)
+
+    def rate(left: float) -> float:
+        done = round((1 - left) * config.steps / rollout) - 1
+        return config.learning_rate * (1 - max(done, 0) / updates)
+
+    return rate
 
 
 def _wrapped(config: TrainConfig, env: PowderVecEnv) -> VecEnv:

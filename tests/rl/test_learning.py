@@ -181,6 +181,15 @@ def test_held_out_evaluation_changes_no_weights(tmp_path: Path, network: str) ->
     assert same(states[0]["random"], states[1]["random"])
 
 
+@pytest.mark.parametrize(("steps", "left"), [(1, 1), (33, 1 / 2), (64, 1 / 2), (65, 1 / 3)])
+def test_a_falling_rate_is_positive_in_the_last_rollout(steps: int, left: float, tmp_path: Path) -> None:
+    config = quick(write_task(tmp_path), schedule="linear", steps=steps)
+    assert config.envs * config.rollout == 32
+    state = train(config, tmp_path / "run").checkpoint().state
+    (group,) = state["optimizer"]["param_groups"]
+    assert group["lr"] == pytest.approx(config.learning_rate * left)
+
+
 def test_a_falling_rate_belongs_to_the_run(tmp_path: Path) -> None:
     task = write_task(tmp_path)
     run = train(quick(task, schedule="linear", steps=64), tmp_path / "run")
