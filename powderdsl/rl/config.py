@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
 from powderdsl.system.settings import out_of_bounds, setting
+
+if TYPE_CHECKING:
+    from powderdsl.tasks.task import Task
 
 NETWORKS = ("paper", "small", "fcn")
 OBSERVATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -30,6 +33,7 @@ HOW = ("steps", "backend", "device", "threads", "checkpoint_minutes", *HELD_OUT)
 LATER = {
     "reward": "task",
     "init_from": "",
+    "init_expert": 0,
     "init_epochs": 10,
     "frames": 1,
     "schedule": "constant",
@@ -64,7 +68,10 @@ class TrainConfig:
     reward: str = setting("task", "The task's reward, or its `shaped` one.", choices=("task", "shaped"))
     init_from: str = ""
     """The folder of a dataset whose actions the network learns first (behavior cloning)."""
-    init_epochs: int = setting(10, "How often cloning goes over the dataset.", 1, 100_000)
+    init_expert: int = setting(
+        0, "Episodes of the task's expert, whose actions the network learns first; 0: none.", 0, 1_000_000
+    )
+    init_epochs: int = setting(10, "How often cloning goes over recorded actions.", 1, 100_000)
     envs: int = setting(32, "Worlds that are played at once.", 1, 1 << 20)
     rollout: int = setting(2048, "Actions in every world between two updates.", 1, 1 << 20)
     batch: int = setting(256, "Actions that one gradient is taken of.", 2, 1 << 24)
@@ -182,6 +189,17 @@ def check_config(config: TrainConfig, known: Sequence[Diagnostic] = ()) -> Train
     return config
 
 
+def check_task(config: TrainConfig, task: Task) -> None:
+    """Raise CompileError (PD640) if a task lacks what the settings ask for."""
+    wrong = []
+    if config.reward == "shaped" and task.goal.shaped is None:
+        wrong.append(_wrong(f"`reward`: the task {task.name} has no `shaped` reward"))
+    if config.init_expert and task.expert is None:
+        wrong.append(_wrong(f"`init_expert`: the task {task.name} has no expert"))
+    if wrong:
+        raise CompileError(wrong)
+
+
 def _mistakes(config: TrainConfig) -> list[Diagnostic]:
     found = [_wrong(message) for message in out_of_bounds(config)]
     for name in ("task", "split", "device", "eval_split", "init_from"):
@@ -202,6 +220,14 @@ def _mistakes(config: TrainConfig) -> list[Diagnostic]:
         value = getattr(config, name)
         if not isinstance(value, Mapping) or not all(isinstance(one, str) for one in value):
             found.append(_wrong(f"`{name}` is {value!r}: it takes values by name"))
+    if config.init_from and config.init_expert:
+        found.append(
+            _wrong("`init_from` and `init_expert` are both given: the network learns from one of them")
+        )
+    if config.frames != 1 and (config.init_from or config.init_expert):
+        found.append(_wrong("`frames`: recorded actions belong to single observations, so cloning takes 1"))
+    if config.observation == "matrix" and (config.init_from or config.init_expert):
+        found.append(_wrong("`observation`: episodes are recorded as `ids` or `compact`, not as `matrix`"))
     sizes = (config.rollout, config.envs)
     if all(isinstance(one, int) for one in sizes) and sizes[0] * sizes[1] < 2:
         found.append(_wrong("`rollout` × `envs` is 1: an update needs two actions or more"))

@@ -25,13 +25,14 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from powderdsl.compiler import whole_palette
+from powderdsl.datasets.recorder import record
 from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
 from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run, read_run
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.cloning import clone, open_demonstrations
-from powderdsl.rl.config import TrainConfig, check_config
+from powderdsl.rl.config import TrainConfig, check_config, check_task
 from powderdsl.rl.evaluation import mean_and_interval, play
 from powderdsl.rl.policies import TrainedPolicy, policy_of, recorded_palette
 from powderdsl.simulation.observe import Observer
@@ -43,6 +44,8 @@ from powderdsl.tasks.task import Task
 KIND = "ppo"
 ASKED = "asked.json"
 """The settings of the latest call, with those that may change."""
+DEMONSTRATIONS = "demonstrations"
+"""The dataset of `init_expert`."""
 
 Progress = Callable[[int, float | None], None]
 """Called after every action with the interactions so far, and the mean return of the last 100 episodes."""
@@ -64,8 +67,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     check_split(task, config.split)
     if config.eval_every:
         check_split(task, config.eval_split)
-    if config.reward == "shaped" and task.goal.shaped is None:
-        raise failure("PD640", f"`reward`: the task {task.name} has no `shaped` reward")
+    check_task(config, task)
     trained_on = task.with_shaped_reward() if config.reward == "shaped" else task
     try:
         check_cells(config.envs, task.size)
@@ -105,8 +107,8 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
                 except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
                     why = " ".join(str(error).split())[:300]
                     raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
-            elif config.init_from:
-                _clone(model, env, config, metrics)
+            elif config.init_from or config.init_expert:
+                _clone(model, env, run, config, metrics)
             held_out = None
             if config.eval_every:
                 held_out = _HeldOut(task, program, model, metrics, config, -1 if found is None else step)
@@ -191,11 +193,22 @@ def _wrapped(config: TrainConfig, env: PowderVecEnv) -> VecEnv:
     return found
 
 
-def _clone(model: PPO, env: PowderVecEnv, config: TrainConfig, metrics: Metrics) -> None:
-    """Behavior cloning of `config.init_from`. Its numbers are metrics of the run at step 0."""
-    if config.frames > 1:
-        raise failure("PD640", "`init_from` does not go with `frames`: datasets have single observations")
-    dataset = open_demonstrations(config.init_from, env.tensors)
+def _clone(model: PPO, env: PowderVecEnv, run: RunFolder, config: TrainConfig, metrics: Metrics) -> None:
+    """Behavior cloning of `config.init_from`, or of the task's expert. Its numbers are metrics of the run at step 0."""
+    if config.init_expert:
+        record(
+            env.tensors.program,
+            "expert",
+            run.path / DEMONSTRATIONS,
+            episodes=config.init_expert,
+            seed=config.seed * config.init_expert,
+            observation=config.observation,
+            compress=True,
+            envs=config.envs,
+            worlds=config.worlds,
+        )
+    folder = run.path / DEMONSTRATIONS if config.init_expert else config.init_from
+    dataset = open_demonstrations(folder, env.tensors)
     found: dict[str, float] = {}
     clone(model.policy, dataset, config, lambda number, of, numbers: found.update(numbers))
     metrics.write(0, {f"clone/{name}": value for name, value in found.items()})

@@ -10,7 +10,7 @@ import pytest
 import torch
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from powderdsl.datasets import record
+from powderdsl.datasets import Dataset, record
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.acting import FrameStack
 from powderdsl.envs.sb3 import PowderVecEnv
@@ -79,6 +79,34 @@ def test_a_policy_takes_the_expert_from_a_dataset(tmp_path: Path) -> None:
     # The dataset is not needed again.
     (tmp_path / "data").rename(tmp_path / "elsewhere")
     assert train(quick(task, steps=40, learning_rate=1e-9, **how), tmp_path / "run").checkpoint().step == 64
+
+
+def test_a_run_records_the_expert_that_it_imitates(tmp_path: Path) -> None:
+    task = write_task(tmp_path, AIM)
+    how = {"network": "fcn", "features": 16, "init_expert": 20, "steps": 1, "learning_rate": 1e-9, "seed": 3}
+    run = train(quick(task, **how), tmp_path / "run")
+    assert "clone/loss" in (run.path / "metrics.jsonl").read_text()
+    found = Dataset.open(run.path / "demonstrations")
+    assert [int(found.episode(number).world) for number in (0, 19)] == [60, 79]  # other seeds, other worlds
+    record(load_task(task), "expert", tmp_path / "data", episodes=20, seed=60, backend="arrays")
+    by_hand = quick(task, **how | {"init_expert": 0, "init_from": str(tmp_path / "data")})
+    assert same(
+        run.checkpoint().state["policy"], train(by_hand, tmp_path / "run2").checkpoint().state["policy"]
+    )
+
+
+def test_what_cannot_be_imitated_is_refused(tmp_path: Path) -> None:
+    def why(folder: str, **how: object) -> str:
+        with pytest.raises(CompileError) as error:
+            train(quick(write_task(tmp_path), **how), tmp_path / folder)
+        assert [one.code for one in error.value.diagnostics] == ["PD640"]
+        return error.value.diagnostics[0].message
+
+    assert "no expert" in why("a", init_expert=2)
+    assert "both" in why("b", init_expert=2, init_from="data")
+    assert "`frames`" in why("c", init_expert=2, frames=2)
+    assert "`matrix`" in why("d", init_expert=2, observation="matrix")
+    assert not list(tmp_path.glob("?"))
 
 
 def test_a_dataset_of_another_task_is_refused(tmp_path: Path) -> None:

@@ -263,7 +263,7 @@ class _StudyCheck:
     # Agents
 
     def train(self, call: Call) -> None:
-        from powderdsl.rl.config import PRESETS, TrainConfig, preset
+        from powderdsl.rl.config import PRESETS, TrainConfig, check_task, preset
 
         on = call.first("on")
         task = None if on is None else self.task(on, on.filled)
@@ -283,7 +283,9 @@ class _StudyCheck:
                 wrong |= bool(failed)
         if not wrong:
             with self.told(call.step):
-                preset(start, "task", **asked)
+                config = preset(start, "task", **asked)
+                if task is not None:
+                    check_task(config, task)
 
     def evaluate(self, call: Call) -> None:
         on, task = call.first("on"), self.task_of(call.step, call.values)
