@@ -28,6 +28,8 @@ BASELINES = ("random", "nothing")
 EVALUATION = "evaluation.json"
 BATCH = 256
 """Episodes that are played at once."""
+TRAINING_STARTS = 1024
+"""Training worlds that others are compared with."""
 
 
 class Played(NamedTuple):
@@ -60,10 +62,20 @@ class Score:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """Worlds of a split that start as one of the first TRAINING_STARTS training worlds does: how many there are, and the
+    means and intervals of policies without them."""
+
+    worlds: int
+    without: Mapping[str, tuple[float, float | None]]
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """Scores of policies on splits. `step`: the interactions that the trained one had learned from.
 
     `unchanged`: in how many worlds of each split all policies that were played got the same return, if several were.
+    `seen`: of each split but the one that is trained on.
     """
 
     task: str
@@ -72,6 +84,7 @@ class Evaluation:
     seed: int
     scores: tuple[Score, ...]
     unchanged: Mapping[str, int]
+    seen: Mapping[str, Seen]
 
     def as_json(self) -> dict[str, Any]:
         """For JSON: scores by split and policy."""
@@ -79,14 +92,20 @@ class Evaluation:
         for score in self.scores:
             numbers = asdict(score)
             del numbers["split"], numbers["policy"]
-            numbers["above"] = {
-                other: {"mean": mean, "interval": half} for other, (mean, half) in score.above.items()
-            }
+            numbers["above"] = {other: _plain(*found) for other, found in score.above.items()}
             if score.normalized is not None:
-                numbers["normalized"] = dict(zip(("mean", "interval"), score.normalized, strict=True))
+                numbers["normalized"] = _plain(*score.normalized)
             splits.setdefault(score.split, {})[score.policy] = numbers
         about = {name: value for name, value in asdict(self).items() if name != "scores"}
+        about["seen"] = {
+            split: {"worlds": one.worlds, "without": {name: _plain(*of) for name, of in one.without.items()}}
+            for split, one in self.seen.items()
+        }
         return {**about, "splits": splits}
+
+
+def _plain(mean: float, half: float | None) -> dict[str, float | None]:
+    return {"mean": mean, "interval": half}
 
 
 def play(
@@ -198,6 +217,8 @@ def evaluate(
         acts["trained"], step = trained, trained.step
     scores: list[Score] = []
     unchanged: dict[str, int] = {}
+    seen: dict[str, Seen] = {}
+    training = None
     for name in names:
         program = first if name == first.split else TaskProgram(task, name, first.simulator)
         count = config.worlds if run is not None and name == config.split else episodes
@@ -208,11 +229,18 @@ def evaluate(
         if len(chosen) > 1:
             returns = torch.stack([one.returns for one in played.values()])
             unchanged[name] = int((returns == returns[0]).all(0).sum())
+        if name != config.split:
+            if training is None:
+                own = TaskProgram(task, config.split, first.simulator)
+                training = frozenset(_starts(own, torch.arange(min(TRAINING_STARTS, config.worlds))))
+            new = torch.tensor([start not in training for start in _starts(program, worlds)])
+            without = {one: mean_and_interval(of.returns[new]) for one, of in played.items() if new.any()}
+            seen[name] = Seen(int((~new).sum()), without)
         for policy in chosen:
             scores.append(_score(name, policy, played, task))
             if said is not None:
                 said(scores[-1])
-    found = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged)
+    found = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged, seen)
     if run is not None:
         run.write_json(EVALUATION, found.as_json())
     return found
@@ -239,6 +267,13 @@ def _play_all(
         for numbers in torch.arange(len(worlds)).split(BATCH)
     ]
     return Played(*map(torch.cat, zip(*parts, strict=True)))
+
+
+def _starts(program: TaskProgram, worlds: Tensor) -> list[bytes]:
+    """The elements of start worlds."""
+    return [
+        ids.numpy().tobytes() for part in worlds.split(BATCH) for ids in program.start(part).world.ids.cpu()
+    ]
 
 
 def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task) -> Score:

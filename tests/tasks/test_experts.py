@@ -163,6 +163,19 @@ def test_scores_on_the_experts_scale() -> None:
     assert evaluate(rich, episodes=4, backend="torch").scores[0].normalized is None
 
 
+def test_test_worlds_that_are_training_worlds_are_told_apart() -> None:
+    """A sixth of these test worlds are empty, as training worlds without lines and disks are."""
+    found = evaluate(load_task("destroying"), episodes=64, policies=["nothing"], backend="torch")
+    assert list(found.seen) == ["test"]
+    seen = found.seen["test"]
+    assert 3 < seen.worlds < 25
+    everywhere = next(one for one in found.scores if one.split == "test")
+    empty = 62 * 62 / 1000
+    whole = seen.worlds * empty + (64 - seen.worlds) * seen.without["nothing"][0]
+    assert everywhere.mean == pytest.approx(whole / 64)
+    assert found.as_json()["seen"]["test"]["worlds"] == seen.worlds
+
+
 WRONG = {
     "  search: 0\n": ("PD402", "0"),
     "  search: some\n": ("PD110", "some"),

@@ -90,6 +90,12 @@ def _text(found: Evaluation) -> list[str]:
         for name, count in found.unchanged.items()
         if count
     ]
+    same += [
+        f"{name}: {one.worlds} of {worlds[name]} worlds start as a training world does; returns without them: "
+        + ", ".join(f"{policy} {_number(*of)}" for policy, of in one.without.items())
+        for name, one in found.seen.items()
+        if one.worlds
+    ]
     return [f"{found.task}{after}", *same, *table(rows)]
 
 

@@ -71,13 +71,15 @@ def check_measure(
     if not places.known(used):
         return
     for values in places.values(used):
-        tree = _evaluation(last, places.words(last, values), task_of(last, values))
+        split = next(iter(places.words(places.steps[measure.step], values).get("split", ())), None)
+        trained_on = "train" if split is None else split.filled
+        tree = _evaluation(last, places.words(last, values), task_of(last, values), trained_on)
         if tree is not None:
             _follow(places, measure, tree, [Template(key).safe_substitute(values) for key in measure.keys])
 
 
 def _evaluation(
-    step: StudyStep, words: Mapping[str, Sequence[Word]], task: Task | None
+    step: StudyStep, words: Mapping[str, Sequence[Word]], task: Task | None, trained_on: str
 ) -> Mapping[str, Any] | None:
     """What is in the evaluation.json that a step writes; None if that is not known."""
     if step.command == ("wm", "eval"):
@@ -91,6 +93,7 @@ def _evaluation(
     return values_of_agent(
         splits or [one.name for one in task.splits],
         policies or [one for one in POLICIES if one != "expert" or (task.expert and task.expert.scripted)],
+        trained_on=trained_on,
         success=task.goal.success is not None,
         interval=all(word.filled != "1" for word in words.get("episodes", ())),
     )
@@ -117,12 +120,18 @@ def _follow(places: Places, measure: Measure, tree: Mapping[str, Any], keys: Seq
 
 
 def values_of_agent(
-    splits: Sequence[str], policies: Sequence[str], *, success: bool = True, interval: bool = True
+    splits: Sequence[str],
+    policies: Sequence[str],
+    *,
+    trained_on: str = "train",
+    success: bool = True,
+    interval: bool = True,
 ) -> Mapping[str, Any]:
     """The numbers that `evaluate` writes, as nested mappings; each number is a 0. A test compares with real ones.
 
     Args:
-        success: whether the task says what success is. interval: whether more than one episode is played.
+        trained_on: the split of training. success: whether the task says what success is. interval: whether more than one
+            episode is played.
     """
     half = {"interval": 0} if interval else {}
     scores = {
@@ -141,7 +150,9 @@ def values_of_agent(
     }
     step = {"step": 0} if "trained" in policies else {}
     unchanged = {"unchanged": dict.fromkeys(splits, 0)} if len(policies) > 1 else {}
-    return {**step, "seed": 0, "splits": dict.fromkeys(splits, scores), **unchanged}
+    without = {policy: {"mean": 0, **half} for policy in policies}
+    seen = {split: {"worlds": 0, "without": without} for split in splits if split != trained_on}
+    return {**step, "seed": 0, "splits": dict.fromkeys(splits, scores), **unchanged, "seen": seen}
 
 
 def values_of_world_model() -> Mapping[str, Any]:
