@@ -175,7 +175,7 @@ class _Loop:
         return "\n".join([
             self.skipped(), " ".join([*rows, *starts]), f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
             "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {",
-            "const u32 inside = width - x >= CHUNK ? 0xffff : (1u << (width - x)) - 1; (void)inside;",
+            "const u32 inside = width - x >= CHUNK ? ALL : (1u << (width - x)) - 1; (void)inside;",
             *values.lines, *stores, "} }", " ".join(ends),
         ])  # fmt: skip
 
@@ -271,7 +271,7 @@ class _Loop:
             )
             yield (
                 "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) "
-                "{ const u32 bits = m >> (x & 63) & 0xffff;"
+                "{ const u32 bits = m >> (x & 63) & ALL;"
             )
             yield f"{' '.join([*values.lines, *stores])} }} }}"
         finish = " ".join(f"finish_row(c, row_of(c, {name}, l{name}, y));" for name in names)
@@ -331,7 +331,7 @@ class _Chunks(CellValues):
 
     def mask(self, node: Node) -> str:
         """Sixteen bits of a flag's plane."""
-        return f"(u32)({self.word(node)} >> (x & 63) & 0xffff)"
+        return f"(u32)({self.word(node)} >> (x & 63) & ALL)"
 
     def node(self, node: Node) -> str:
         attr = node.attr

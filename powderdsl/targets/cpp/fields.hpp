@@ -15,8 +15,8 @@ ALWAYS const float* real_row_or_nothing(const Context& c, const Field* f, int la
 }
 ALWAYS F inside_columns(F value, int x, int dx, int width) {
   if (__builtin_expect(x + dx >= 0 && x + dx + CHUNK <= width, 1)) return value;
-  const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-  I at = lane + (x + dx);
+  const I number = NUMBERS;
+  I at = number + (x + dx);
   return (F)((I)value & (at >= 0) & (at < width));
 }
 ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
@@ -48,6 +48,11 @@ OUTLINE void active_rows(Context& c, const Plane* p, int list) {
     for (int l = 0; l < LANES; l++) {
 #if defined(__AVX512BW__)
       out[l * many + first / 64] = _mm512_test_epi8_mask(_mm512_load_si512(worlds), _mm512_set1_epi8((char)(1 << l)));
+#elif VECTOR == 32
+      for (int half = 0; half < 2; half++) {
+        const __m256i flag = _mm256_slli_epi16(_mm256_load_si256((const __m256i*)worlds + half), 7 - l);
+        out[l * many + first / 64] |= (u64)(u32)_mm256_movemask_epi8(flag) << 32 * half;
+      }
 #else
       for (int i = 0; i < 64; i++) out[l * many + first / 64] |= (u64)(worlds[i] >> l & 1) << i;
 #endif
@@ -76,15 +81,16 @@ ALWAYS bool is_active(const Context& c, int list, int lane, int y) {
     for (int part = 0; part <= ((last_part) & strips); part++) \
       if (const int done = round - 2 * part, block = (done + part) % blocks; done >= 0 && done < blocks) \
         if (const int first = block * c.block, last = block == blocks - 1 ? height : first + c.block; true)
-// Sixteen flags of one world's word, which is kept little end first.
+// The flags of a chunk, into one world's word, which is kept little end first.
 ALWAYS void put_bits(u64* word, int x, u32 bits) {
 #if __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
-  const uint16_t half = (uint16_t)bits;
-  memcpy((char*)word + (x & 63) / 8, &half, 2);
-#else
-  const int by = x & 63;
-  *word = (*word & ~(0xffffull << by)) | (u64)bits << by;
+  if constexpr (CHUNK >= 8) {
+    memcpy((char*)word + (x & 63) / 8, &bits, CHUNK / 8);
+    return;
+  }
 #endif
+  const int by = x & 63;
+  *word = (*word & ~((u64)ALL << by)) | (u64)bits << by;
 }
 // After the chunks of a row: nothing beyond the width, then the halo.
 ALWAYS void finish_row(const Context& c, float* row) {

@@ -40,7 +40,7 @@ ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
 
 // Strips. What each lane sees `by` lanes on, around.
 ALWAYS V turned(V v, int by) {
-#if defined(__AVX512F__)
+#if VECTOR == 64
   return (V)_mm512_permutexvar_epi64((__m512i)(V{0, 1, 2, 3, 4, 5, 6, 7} + splat(by)), (__m512i)v);  // by its low bits
 #else
   V r;
@@ -90,8 +90,8 @@ static u32 key(u64 seed, u64 index, u64 step, u32 stream, u32 start) {
 ALWAYS V draw_plane(const Context& c, int stream, int y, int w, int j) {
   u32 across = (c.g.width + 31) / 32;
   u32 n = ((u32)y * across + 2 * w) * 32 + j;
-  const U half = {0, 32, 0, 32, 0, 32, 0, 32, 0, 32, 0, 32, 0, 32, 0, 32};
-  U h = (splatu(n) + half) * 0x9E3779B1u + c.k0[stream];
+  const I number = NUMBERS;
+  U h = (splatu(n) + (U)(number & 1) * 32) * 0x9E3779B1u + c.k0[stream];
   h ^= h >> 16;
   h *= 0x7FEB352Du;
   h ^= h >> 15;

@@ -12,40 +12,52 @@
 #include <mutex>
 #include <thread>
 #include <vector>
-#if defined(__AVX512F__) || defined(__AVX2__)
+#if defined(__SSE2__)
 #include <immintrin.h>
 #endif
 
 typedef uint64_t u64;
 typedef uint32_t u32;
-constexpr int LANES = 8, CHUNK = 16;
-typedef u64 V __attribute__((vector_size(64), may_alias));
-typedef u32 U __attribute__((vector_size(64), may_alias));
-typedef float F __attribute__((vector_size(64), may_alias));
-typedef float Fu __attribute__((vector_size(64), may_alias, aligned(4)));
-typedef int32_t I __attribute__((vector_size(64), may_alias));
+// A vector is a register of the processor: compilers keep wider ones in memory, which takes six times as long.
+#if defined(__AVX512F__)
+#define VECTOR 64
+#define NUMBERS {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}
+#elif defined(__AVX2__)
+#define VECTOR 32
+#define NUMBERS {0, 1, 2, 3, 4, 5, 6, 7}
+#else
+#define VECTOR 16
+#define NUMBERS {0, 1, 2, 3}
+#endif
+constexpr int LANES = VECTOR / 8, CHUNK = VECTOR / 4;
+constexpr u32 ALL = (1u << CHUNK) - 1;  // flags of a chunk
+typedef u64 V __attribute__((vector_size(VECTOR), may_alias));
+typedef u32 U __attribute__((vector_size(VECTOR), may_alias));
+typedef float F __attribute__((vector_size(VECTOR), may_alias));
+typedef float Fu __attribute__((vector_size(VECTOR), may_alias, aligned(4)));
+typedef int32_t I __attribute__((vector_size(VECTOR), may_alias));
 #define ALWAYS static inline __attribute__((always_inline))
 #define OUTLINE static __attribute__((noinline))
 
-ALWAYS V splat(u64 x) { return V{x, x, x, x, x, x, x, x}; }
-ALWAYS F splatf(float x) { return F{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
-ALWAYS U splatu(u32 x) { return U{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+ALWAYS V splat(u64 x) { return x - V{}; }
+ALWAYS F splatf(float x) { return x - F{}; }  // minus keeps -0
+ALWAYS U splatu(u32 x) { return x - U{}; }
 ALWAYS bool any(V a) {
-#if defined(__AVX512F__)
+#if VECTOR == 64
   return _mm512_test_epi64_mask((__m512i)a, (__m512i)a) != 0;
+#elif VECTOR == 32
+  return !_mm256_testz_si256((__m256i)a, (__m256i)a);
 #else
-  u64 r = 0;
-  for (int i = 0; i < LANES; i++) r |= a[i];
-  return r != 0;
+  return a[0] | a[1];
 #endif
 }
 ALWAYS uint8_t lanes_of(V a) {  // a bit for each world that has any
-#if defined(__AVX512F__)
+#if VECTOR == 64
   return _mm512_test_epi64_mask((__m512i)a, (__m512i)a);
+#elif VECTOR == 32
+  return (uint8_t)_mm256_movemask_pd((__m256d)(a != 0));
 #else
-  uint8_t r = 0;
-  for (int i = 0; i < LANES; i++) r |= (uint8_t)(a[i] != 0) << i;
-  return r;
+  return (uint8_t)((a[0] != 0) | (a[1] != 0) << 1);
 #endif
 }
 ALWAYS bool any_word(const V* row, int words) {
@@ -55,23 +67,24 @@ ALWAYS bool any_word(const V* row, int words) {
 }
 ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }
 
-// Sixteen flags as bits 0..15, and back as a choice between two vectors.
+// The flags of a chunk as bits, and back as a choice between two vectors.
 ALWAYS u32 bits_of(I m) {
 #if defined(__AVX512DQ__)
   return _mm512_movepi32_mask((__m512i)m);
-#elif defined(__AVX2__)
-  __m256i lo, hi;
-  memcpy(&lo, &m, 32);
-  memcpy(&hi, (char*)&m + 32, 32);
-  return (u32)_mm256_movemask_ps((__m256)lo) | (u32)_mm256_movemask_ps((__m256)hi) << 8;
+#elif VECTOR == 64
+  return _mm512_cmplt_epi32_mask((__m512i)m, _mm512_setzero_si512());
+#elif VECTOR == 32
+  return (u32)_mm256_movemask_ps((__m256)m);
+#elif defined(__SSE2__)
+  return (u32)_mm_movemask_ps((__m128)m);
 #else
   u32 r = 0;
   for (int i = 0; i < CHUNK; i++) r |= (u32)(m[i] & 1) << i;
   return r;
 #endif
 }
-// Comparisons of sixteen floats as bits 0..15.
-#if defined(__AVX512F__)
+// Comparisons of the floats of a chunk, as bits.
+#if VECTOR == 64
 #define COMPARE(name, kind, op) ALWAYS u32 name(F a, F b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, kind); }
 #else
 #define COMPARE(name, kind, op) ALWAYS u32 name(F a, F b) { return bits_of(a op b); }
@@ -80,18 +93,20 @@ COMPARE(bits_eq, _CMP_EQ_OQ, ==)
 COMPARE(bits_lt, _CMP_LT_OQ, <)
 COMPARE(bits_le, _CMP_LE_OQ, <=)
 ALWAYS F blend(u32 bits, F yes, F no) {
-#if defined(__AVX512F__)
+#if VECTOR == 64
   return (F)_mm512_mask_blend_ps((__mmask16)bits, (__m512)no, (__m512)yes);
 #else
-  const I one = {1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768};
-  I chosen = ((I)splatu(bits) & one) != 0;
+  const I number = NUMBERS, bit = 1 << number;
+  const I chosen = ((I)splatu(bits) & bit) != 0;
   return (F)(((I)yes & chosen) | ((I)no & ~chosen));
 #endif
 }
 ALWAYS F choose(I m, F yes, F no) { return (F)(((I)yes & m) | ((I)no & ~m)); }
 ALWAYS F root(F a) {
-#if defined(__AVX512F__)
+#if VECTOR == 64
   return (F)_mm512_sqrt_ps((__m512)a);
+#elif VECTOR == 32
+  return (F)_mm256_sqrt_ps((__m256)a);
 #else
   F r;
   for (int i = 0; i < CHUNK; i++) r[i] = __builtin_sqrtf(a[i]);
@@ -102,13 +117,19 @@ ALWAYS F magnitude(F a) { return (F)((I)a & (I)splatu(0x7fffffff)); }
 ALWAYS F divide(F a, F b) { return choose(b == 0.0f, splatf(0), a / b); }
 // x / d, rounded as a division is: a product with 1/d, and one correction, are exact where nothing over- or underflows.
 ALWAYS F divide_by(F x, float d, float inverse) {
-#if defined(__AVX512F__)
+#if VECTOR == 64 || (VECTOR == 32 && defined(__FMA__))
   const I size = (I)magnitude(x);
   const I odd = (size < (I)splatf(0x1p-60f)) & (size != 0);
   if (__builtin_expect(bits_of(odd | (size > (I)splatf(0x1p60f))), 0)) return x / splatf(d);
+#if VECTOR == 64
   const __m512 q = _mm512_mul_ps((__m512)x, _mm512_set1_ps(inverse));
   const __m512 rest = _mm512_fnmadd_ps(q, _mm512_set1_ps(d), (__m512)x);
   return (F)_mm512_fmadd_ps(rest, _mm512_set1_ps(inverse), q);
+#else
+  const __m256 q = _mm256_mul_ps((__m256)x, _mm256_set1_ps(inverse));
+  const __m256 rest = _mm256_fnmadd_ps(q, _mm256_set1_ps(d), (__m256)x);
+  return (F)_mm256_fmadd_ps(rest, _mm256_set1_ps(inverse), q);
+#endif
 #else
   (void)inverse;
   return x / splatf(d);
@@ -117,9 +138,12 @@ ALWAYS F divide_by(F x, float d, float inverse) {
 ALWAYS F smaller(F a, F b) { return choose(a < b, a, choose(a != a, a, b)); }
 ALWAYS F larger(F a, F b) { return choose(a > b, a, choose(a != a, a, b)); }
 ALWAYS F settle(F x, float lo, float hi, float snap) {
-#if defined(__AVX512F__)
+#if VECTOR == 64
   const __mmask16 some = _mm512_cmp_ps_mask((__m512)magnitude(x), _mm512_set1_ps(snap), _CMP_GE_OQ);  // not for a NaN
   return (F)_mm512_maskz_max_ps(some, _mm512_min_ps((__m512)x, _mm512_set1_ps(hi)), _mm512_set1_ps(lo));
+#elif VECTOR == 32
+  const F within = (F)_mm256_max_ps(_mm256_min_ps((__m256)x, _mm256_set1_ps(hi)), _mm256_set1_ps(lo));
+  return (F)((I)within & (magnitude(x) >= snap));  // not for a NaN
 #else
   x = choose(x == x, x, splatf(0));
   x = choose(x < lo, splatf(lo), x);

@@ -160,7 +160,7 @@ struct Channel {
 };
 ALWAYS void put_floats(float* out, u64 word, int count) {  // flags as 0 and 1
   float part[64], *to = count == 64 ? out : part;
-  for (int x = 0; x < 64; x += CHUNK) *(Fu*)(to + x) = (Fu)blend(word >> x & 0xffff, splatf(1), splatf(0));
+  for (int x = 0; x < 64; x += CHUNK) *(Fu*)(to + x) = (Fu)blend(word >> x & ALL, splatf(1), splatf(0));
   if (count < 64) memcpy(out, part, sizeof(float) * count);
 }
 static void store_channel(const Batch& b, const Channel& c, const float* tables, int number, float* out) {
@@ -207,7 +207,7 @@ API void pd_store_real(const void* batch, int slot, float* data, int64_t apart) 
     store_real(b.g, b.groups[lane / LANES].real[slot], lane % LANES, data + b.at(lane, apart, b.g.width));
 }
 
-typedef uint8_t Bytes __attribute__((vector_size(16), may_alias));
+typedef uint8_t Bytes __attribute__((vector_size(CHUNK), may_alias));
 // Reals in eight bits: 128 is 0, further from it in steps that grow with the value. `floor` is a power of two.
 API void pd_codes(const void* batch, int slot, float floor, uint8_t* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;

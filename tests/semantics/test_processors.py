@@ -1,0 +1,52 @@
+"""Native code for processors with shorter vectors: other numbers of worlds side by side, the same worlds."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+
+import pytest
+
+from powderdsl.compiler import load
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.targets.cpp.compilers import ARCHITECTURE, NoCompiler, find_compiler, flags_for, processor
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.compilers import skip_without_compiler
+from tests.fuzz.compare import assert_same
+
+LEVELS = {"x86-64-v2": "sse4_2", "x86-64-v3": "avx2", "x86-64-v4": "avx512bw"}
+"""Levels of processors, and an instruction set that a machine needs for each."""
+
+SHAPES = [(5, 8, 70), (2, 16, 64), (9, 7, 33), (1, 64, 130)]
+"""Full groups of worlds and others, strips and none, words that are not full."""
+
+
+@pytest.fixture(params=LEVELS)
+def level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    skip_without_compiler()
+    name = str(request.param)
+    if platform.machine() not in ("x86_64", "AMD64") or LEVELS[name] not in processor():
+        pytest.skip(f"this processor is not {name}")
+    monkeypatch.setenv(ARCHITECTURE, name)
+    return name
+
+
+def test_worlds_do_not_depend_on_vectors(level: str, tmp_path: Path) -> None:
+    rulesets = [load("core+sand+water+wind"), load_text(random_ruleset_text(61), "seed61.yaml")]
+    assert any(one.replace("_", "-") == f"-march={level}" for one in flags_for(find_compiler(), "-O0"))
+    for ruleset in rulesets:
+        with building(Building("-O0", tmp_path)):
+            simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("torch", "native")]
+        for seed, shape in enumerate(SHAPES):
+            start = random_start(ruleset, Choices.seeded(seed), shape)
+            assert_same(ruleset, start, steps=3, simulators=simulators)
+
+
+def test_a_processor_is_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(ARCHITECTURE, "x86-64-v3 -fplugin=evil.so")
+    skip_without_compiler()
+    with pytest.raises(NoCompiler, match="names no processor"):
+        flags_for(find_compiler(), "-O2")
