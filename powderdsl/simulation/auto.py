@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextvars import copy_context
-from dataclasses import replace
 
 from torch import Tensor
 
@@ -123,18 +122,18 @@ class AutoProgram:
             return self._arrays().run(job)
         if job.timing is not None:
             return (self._arrived() or self._arrays()).run(job)
-        seed, index, start = job.clock
-        state, done = job.state, 0
+        clock, part, done = job.clock, job, 0
         while True:
-            part = replace(job, state=state, clock=(seed, index, start + done) if done else job.clock)
             native = self._arrived()
             if native is not None:
-                self._steps["native"] += job.steps - done
-                return native.run(replace(part, steps=job.steps - done))
+                self._steps["native"] += part.steps
+                return native.run(part)
             count = self._slice(job, job.steps - done)
             began = time.perf_counter()
-            state = self._arrays().run(replace(part, steps=count))
+            state = self._arrays().run(part._replace(steps=count))
             done += count
+            later = clock._replace(since=clock.since + done)
+            part = part._replace(state=state, clock=later, steps=job.steps - done)
             self._account(job, count, job.steps - done, time.perf_counter() - began)
             if done == job.steps:
                 return state

@@ -250,9 +250,8 @@ class Observer:
 
 def shape_of(state: State) -> tuple[int, int, int]:
     """(worlds, rows, columns), without unpacking anything."""
-    batch, height, width = (
-        state.like["element"][1] if isinstance(state, PackedState) else state["element"].shape
-    )
+    like = getattr(state, "like", None)
+    batch, height, width = state["element"].shape if like is None else like["element"][1]
     return batch, height, width
 
 

@@ -28,7 +28,8 @@ class ReferenceProgram:
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. The time before a step's first pass counts for that pass."""
         device = job.state["element"].device
-        seed, index, start = (part.cpu().numpy() for part in job.clock)
+        seed, index = (part.cpu().numpy() for part in job.clock[:2])
+        start = job.clock.step.cpu().numpy()
         arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
         given_params = {name: value.cpu().numpy() for name, value in job.params.items()}
         numbers = reference.parameters(self.ruleset, len(seed), given_params)

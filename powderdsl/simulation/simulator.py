@@ -5,24 +5,31 @@ All arrays are torch tensors on the simulator's device, in the storage dtypes of
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from operator import index
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from powderdsl.compiler import BACKENDS, current_backend, load, starting_backend
-from powderdsl.diagnostics import suggest
 from powderdsl.model.state import Slot, check_sides
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.observe import Observer
+from powderdsl.simulation.observe import Observer, shape_of
+from powderdsl.simulation.parameters import Parameters
 from powderdsl.simulation.programs import find_device, make_program
-from powderdsl.simulation.state_checks import check_ids, checked_floats, checked_integers, looked_up
+from powderdsl.simulation.state_checks import (
+    check_ids,
+    checked_floats,
+    checked_integers,
+    given_mapping,
+    given_tensor,
+    looked_up,
+    unknown_name,
+)
 from powderdsl.system.writing import failure
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Clock, Job
 from powderdsl.targets.profiling import profile_of
 
 MAX_CELLS = 1 << 31
@@ -42,6 +49,15 @@ class World:
     index: Tensor
     step: Tensor
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Tensor:
+            """The step of a world that a simulator has made, counted when it is first read."""
+            clock = self.__dict__.get("_clock")
+            if name != "step" or clock is None:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            return self.__dict__.setdefault("step", clock.start + clock.since)
+
     @property
     def ids(self) -> Tensor:
         """Element ids, uint8 [B, H, W]."""
@@ -50,8 +66,7 @@ class World:
     @property
     def shape(self) -> tuple[int, int, int]:
         """(worlds, rows, columns)."""
-        batch, height, width = self.ids.shape
-        return batch, height, width
+        return shape_of(self.state)
 
     def __len__(self) -> int:
         return len(self.seed)  # without unpacking anything
@@ -109,7 +124,7 @@ class Simulator:
         self.observer = Observer(ruleset, self.device)
         self._slots: dict[str, Slot] = self.observer.slots
         self._program = make_program(ruleset, backend, self.device, threads)
-        self._defaults: tuple[int, dict[str, Tensor]] | None = None
+        self._params = Parameters(ruleset, self.device)
 
     @property
     def running(self) -> str:
@@ -190,17 +205,8 @@ class Simulator:
             for name, slot in self._slots.items()
         }
 
-    def _tensor(self, value: Any, name: str) -> Tensor:
-        flags = getattr(value, "flags", None)
-        if getattr(flags, "writeable", True) is False:
-            value = value.copy()  # torch warns of arrays that it could write to and may not
-        try:
-            return torch.as_tensor(value, device=self.device)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
-
     def _integers(self, value: Any, name: str) -> Tensor:
-        tensor = self._tensor(value, name)
+        tensor = given_tensor(value, name, self.device)
         if tensor.dtype.is_floating_point or tensor.dtype.is_complex or tensor.dtype == torch.bool:
             raise TypeError(f"{name} must be integers, found {tensor.dtype}")
         return tensor
@@ -257,7 +263,7 @@ class Simulator:
         return replace(world, state=state)
 
     def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool) -> Tensor:
-        tensor = self._tensor(value, name)
+        tensor = given_tensor(value, name, self.device)
         target = (shape[0], 2, *shape[1:]) if vector else shape
         if vector and tensor.ndim == 1 and len(tensor) == 2:
             tensor = tensor[None, :, None, None]
@@ -294,7 +300,7 @@ class Simulator:
         if element is not None:
             found = self.ruleset.element(element)
             if found is None:
-                raise _unknown("element", element, self.elements)
+                raise unknown_name("element", element, self.elements)
             element_ids = torch.full_like(world.ids, found.id)
             world = replace(world, state=self._renewed(world.state, element_ids, mask))
         for name, value in fields.items():
@@ -333,21 +339,29 @@ class Simulator:
             KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
         """
         self.check(world)
+        steps = _count(steps, "steps")
+        draws: Mapping[str, Tensor] = _NOTHING
+        chosen = None
+        clock = _clock_of(world)
+        batch = clock.seed.shape[0]
+        if params is None:
+            values = self._params.defaults(batch)
+        else:
+            values = self._params.checked(given_mapping("params", params), batch)
+        if random is not None:
+            draws = self._draws(given_mapping("random", random), world)
+        if passes is not None:
+            chosen = self._chosen(passes)
+        state = self._program.run(Job(world.state, clock, steps, values, draws, chosen, reuse))
+        return _stepped(self, state, clock, steps)
+
+    def _chosen(self, passes: Sequence[str]) -> frozenset[str]:
         if isinstance(passes, str):
             raise TypeError(f"passes takes a list of names: [{passes!r}]")
-        for name, given in (("random", random), ("params", params)):
-            if given is not None and not isinstance(given, Mapping):
-                raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
-        steps = _count(steps, "steps")
-        unknown = [name for name in passes or () if name not in self.passes]
+        unknown = [name for name in passes if name not in self.passes]
         if unknown:
-            raise _unknown("pass", unknown[0], self.passes, "passes")
-        draws = self._draws(random or {}, world)
-        chosen = None if passes is None else frozenset(passes)
-        clock = (world.seed, world.index, world.step)
-        job = Job(world.state, clock, steps, self.parameters(params or {}, len(world)), draws, chosen, reuse)
-        state = self._program.run(job)
-        return replace(world, sim=self, state=state, step=world.step + steps)
+            raise unknown_name("pass", unknown[0], self.passes, "passes")
+        return frozenset(passes)
 
     def check(self, world: Any) -> None:
         """Raises TypeError for what is not a world, ValueError for a world of other rules."""
@@ -361,8 +375,8 @@ class Simulator:
 
         Native code counts processor time on one thread, and is compiled once more for it.
         """
-        clock = (world.seed, world.index, world.step)
-        job = Job(world.state, clock, _count(steps, "steps"), self.parameters({}, len(world)), {}, None)
+        params = self._params.defaults(len(world))
+        job = Job(world.state, _clock_of(world), _count(steps, "steps"), params, {}, None)
         seconds = profile_of(self._program, job)
         return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
@@ -372,42 +386,48 @@ class Simulator:
         draws = {}
         for name, value in random.items():
             if name not in bits:
-                raise _unknown("stream", name, bits)
+                raise unknown_name("stream", name, bits)
             tensor = self._shaped(value, f"random[{name!r}]", world.shape, False).to(torch.float64)
             if not bool(((tensor >= 0) & (tensor < 1)).all()):
                 raise ValueError(f"random[{name!r}] must lie in [0, 1)")
             draws[name] = (tensor * float(1 << bits[name])).floor().to(torch.int64)
         return draws
 
-    def _default_params(self, batch: int) -> dict[str, Tensor]:
-        """The defaults as [B] tensors: the same tensors for the same batch size, as programs may rely on."""
-        if self._defaults is None or self._defaults[0] != batch:
-            full = partial(torch.full, (batch,), dtype=torch.float64, device=self.device)
-            self._defaults = (batch, {p.name: full(float(p.default)) for p in self.ruleset.params})
-        return self._defaults[1]
-
     def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Tensor]:
         """All parameters as float64 [B]: given values, and defaults. Raises KeyError, TypeError, ValueError."""
-        known = {param.name: param for param in self.ruleset.params}
-        values = dict(self._default_params(batch))
-        for name, value in params.items():
-            if name not in known:
-                raise _unknown("parameter", name, known)
-            kind = known[name].kind
-            lo, hi = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
-            tensor = self._tensor(value, name).to(torch.float64)
-            if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) != batch):
-                raise ValueError(f"{name} takes one value or {batch}, found shape {list(tensor.shape)}")
-            if not bool(((tensor >= lo) & (tensor <= hi)).all()):
-                raise ValueError(f"{name} takes {lo:g}..{hi:g}")
-            if kind.name in ("int", "flag") and not bool((tensor == tensor.round()).all()):
-                raise ValueError(f"{name} takes integers")
-            values[name] = tensor.expand(batch).clone()
-        return values
+        return {name: value.clone() for name, value in self._params.checked(params, batch).items()}
 
 
-def _unknown(kind: str, name: str, known: Iterable[str], kinds: str = "") -> KeyError:
-    return KeyError(f"no {kind} `{name}`; {'; '.join(suggest(name, known, kinds or f'{kind}s'))}")
+_NOTHING: Mapping[str, Tensor] = {}
+
+
+def _clock_of(world: World) -> Clock:
+    """What decides the random numbers of a world's next step. Raises ValueError for tensors that do not fit.
+
+    A world that a simulator has made has a clock whose `start` nobody else sees, until its `step` is read: that tensor
+    may have been written to, so it counts from then on.
+    """
+    known = world.__dict__
+    clock: Clock | None = known.get("_clock")
+    if clock is not None and "step" not in known:
+        return clock
+    batch, device = shape_of(world.state)[0], world.seed.device
+    for name in ("seed", "index", "step"):
+        tensor = getattr(world, name)
+        if tensor.shape != (batch,) or tensor.dtype != torch.int64 or tensor.device != device:
+            raise ValueError(
+                f"a world's {name} must be int64 [{batch}], found {tensor.dtype} {list(tensor.shape)}"
+            )
+    return Clock(world.seed, world.index, world.step.clone())
+
+
+def _stepped(sim: Simulator, state: Mapping[str, Tensor], clock: Clock, steps: int) -> World:
+    """The world of a state that is some steps after a clock; made without the calls that a frozen dataclass takes."""
+    world = object.__new__(World)
+    known = world.__dict__
+    known["sim"], known["state"], known["seed"], known["index"] = sim, state, clock.seed, clock.world
+    known["_clock"] = Clock(clock.seed, clock.world, clock.start, clock.since + steps)
+    return world
 
 
 def _where(slot: Slot, cells: Tensor, yes: Tensor, no: Tensor) -> Tensor:

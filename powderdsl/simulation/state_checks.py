@@ -1,18 +1,43 @@
-"""Checks of values for cells, in parts: a check takes many times the memory of what it checks."""
+"""Checks of given values. Those of cells are checked in parts: a check takes many times the memory of what it checks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from powderdsl.diagnostics import suggest
 from powderdsl.model.state import SNAP, Slot
 from powderdsl.model.types import Ruleset
 
 CHUNK = 1 << 20
 """Cells that are looked at together."""
+
+
+def given_tensor(value: Any, name: str, device: torch.device) -> Tensor:
+    """Values from outside as a tensor, which may share their memory. Raises TypeError."""
+    flags = getattr(value, "flags", None)
+    if getattr(flags, "writeable", True) is False:
+        value = value.copy()  # torch warns of arrays that it could write to and may not
+    try:
+        return torch.as_tensor(value, device=device)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
+
+
+def given_mapping(name: str, given: Any) -> Mapping[str, Any]:
+    """A mapping from outside. Raises TypeError."""
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
+    return given
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str], kinds: str = "") -> KeyError:
+    """The error for a name that is not known, with the nearest ones."""
+    return KeyError(f"no {kind} `{name}`; {'; '.join(suggest(name, known, kinds or f'{kind}s'))}")
 
 
 def check_ids(ids: Tensor, name: str, ruleset: Ruleset) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -45,6 +44,6 @@ class PassClock:
 
 def profile_of(program: Runnable, job: Job) -> Mapping[str, float]:
     """Seconds by pass over `job.steps`; empty if a program cannot report them."""
-    clock = PassClock(job.clock[0].device)
-    program.run(replace(job, timing=clock))
+    clock = PassClock(job.clock.seed.device)
+    program.run(job._replace(timing=clock))
     return clock.passes()

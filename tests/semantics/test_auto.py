@@ -28,7 +28,7 @@ from powderdsl.simulation.native_start import start_key
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.targets.cpp.compilers import NoCompiler
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Clock, Job
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import environment_with
@@ -69,13 +69,14 @@ class Counter:
     log: list[tuple[str, int, int]] = field(default_factory=list)
 
     def run(self, job: Job) -> Mapping[str, Any]:
-        self.log.append((self.name, int(job.clock[2][0]), job.steps))
+        self.log.append((self.name, int(job.clock.step[0]), job.steps))
         time.sleep(self.seconds * job.steps)
         return {"element": job.state["element"] + job.steps}
 
 
 def job(steps: int, start: int = 0, **changes: Any) -> Job:
-    clock = (torch.zeros(1, dtype=torch.int64),) * 2 + (torch.tensor([start]),)
+    zero = torch.zeros(1, dtype=torch.int64)
+    clock = Clock(zero, zero, torch.tensor([start]))
     state = {"element": torch.full((1, 2, 2), start)}
     return Job(state, clock, steps, {}, changes.get("draws", {}), changes.get("passes"))
 

@@ -61,7 +61,7 @@ class ArrayProgram:
                 some = slice(start, min(start + chunk, batch))
                 kernels = self._kernels(job, some, (height, some.stop - some.start, width))
                 state = self._unpack(job.state, some)
-                first = job.clock[2][some].numpy()
+                first = job.clock.step[some].numpy()
                 for i in range(job.steps):
                     kernels.begin(first + i)
                     self._reset(state, kernels)
@@ -77,7 +77,7 @@ class ArrayProgram:
             self._kept = (shape, {"valid": pack(np.ones(shape, bool))})
         lasting = self._kept[1]
         valid = lasting["valid"]
-        seed, index, _ = (part[some].numpy() for part in job.clock)
+        seed, index = (part[some].numpy() for part in job.clock[:2])
         given = {name: _rows_first(value[some]) for name, value in job.draws.items()}
         draws = Draws(shape, valid, self._streams, given, base_keys(seed, index), self._idents, lasting)
         return ArrayKernels(

@@ -229,7 +229,7 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
         "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
         "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
-        "pd_run": (None, [pointer, long, integer, pointer, pointer, pointer, pointer, pointer]),
+        "pd_run": (pointer, [pointer, integer, long, integer, *[pointer] * 3, long, pointer, pointer]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)

@@ -4,6 +4,7 @@
 struct Group {
   Plane* slot[SLOTS + 1];
   Field* real[REALS + 1];
+  u64 present;  // as in a context, after the last run; not known where planes have been written to since
 };
 struct Batch {
   Grid g;
@@ -132,6 +133,7 @@ static void reset_slots(Context& c) {
 }
 struct Clocks {
   const u64 *seed, *index, *step;
+  u64 since;  // steps after `step`
 };
 static int world_of(const Context& c, int number, int lane) {  // unused lanes are the last world once more
   return c.g.strips ? number : number * LANES + std::min(lane, c.lanes - 1);
@@ -155,10 +157,15 @@ static void begin_step(Context& c, const Clocks& k, int number, long done) {
 }
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
   c.lanes = std::min(LANES, b.lanes() - number * LANES);
-  for (int l = 0; l < LANES; l++) {
+  for (int l = 0; l < (c.g.strips ? 1 : LANES); l++) {
     int world = world_of(c, number, l);
-    for (int i = 0; i < PARAM_PLANES; i++) c.param_bits[i][l] = planes[(size_t)i * b.worlds + world] ? ~0ull : 0;
-    for (int i = 0; i < PARAM_REALS; i++) c.param_real[i][l] = reals[(size_t)i * b.worlds + world];
+    for (int i = 0; i < PARAM_PLANES; i++) {
+      const u64 bits = planes[(size_t)i * b.worlds + world] ? ~0ull : 0;
+      if (c.g.strips) c.param_bits[i] = splat(bits);
+      else c.param_bits[i][l] = bits;
+    }
+    for (int i = 0; i < PARAM_REALS; i++)
+      for (int to = l; to < (c.g.strips ? LANES : l + 1); to++) c.param_real[i][to] = reals[(size_t)i * b.worlds + world];
   }
   Group& group = b.groups[number];
   for (int i = 0; i < SLOTS; i++) {
@@ -169,14 +176,15 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
     }
   }
   for (int i = 0; i < REALS; i++) c.real[i] = group.real[i];
-  c.present = ~0ull;
+  c.present = group.present;
   for (long s = 0; s < steps; s++) {
-    begin_step(c, k, number, s);
+    begin_step(c, k, number, (long)k.since + s);
     reset_slots(c);
     run_passes(c);
   }
   for (int i = 0; i < SLOTS; i++) own(c, c.slot[i]), group.slot[i] = c.slot[i];
   for (int i = 0; i < REALS; i++) own(c, c.real[i]), group.real[i] = c.real[i];
+  group.present = c.present;
 }
 
 // Threads that wait for work; the caller is one of them.
@@ -232,7 +240,8 @@ static Pool& pool() {  // never destroyed: its threads may outlive main
 
 template <class T> static void load_values(Batch& b, int slot, int bits, const T* data) {
   const Grid& g = b.g;
-  for (size_t n = 0; n < b.groups.size(); n++)
+  for (size_t n = 0; n < b.groups.size(); n++) {
+    b.groups[n].present = ~0ull;
     for (int i = 0; i < bits; i++) {
       Plane* p = b.groups[n].slot[slot + i];
       memset(p->data, 0, sizeof(V) * g.cells());
@@ -253,6 +262,7 @@ template <class T> static void load_values(Batch& b, int slot, int bits, const T
       p->zero = !some;
       p->around = p->beyond = 0;
     }
+  }
 }
 
 #define API extern "C" __attribute__((visibility("default")))
@@ -260,6 +270,7 @@ static Batch* new_batch(int worlds, const Grid& g) {
   Batch* b = new Batch{g, worlds, {}};
   b->groups.resize((b->lanes() + LANES - 1) / LANES);
   for (Group& group : b->groups) {
+    group.present = ~0ull;
     for (int i = 0; i < SLOTS; i++) {
       Plane* p = group.slot[i] = new_plane(g);
       p->refs = 1;
@@ -283,6 +294,7 @@ API void* pd_copy(const void* batch) {
   const Batch* a = (const Batch*)batch;
   Batch* b = new_batch(a->worlds, a->g);
   for (size_t n = 0; n < a->groups.size(); n++) {
+    b->groups[n].present = a->groups[n].present;
     for (int i = 0; i < SLOTS; i++) {
       const Plane* from = a->groups[n].slot[i];
       Plane* to = b->groups[n].slot[i];
@@ -337,6 +349,7 @@ template <class Visit> static void in_places(Batch& b, int count, const int64_t*
 }
 template <class T> static void put_values(Batch& b, int slot, int bits, int count, const int64_t* places, const T* data) {
   in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
+    group.present = ~0ull;
     for (int i = 0; i < bits; i++) {
       Plane* p = group.slot[slot + i];
       p->around = p->beyond = 0;
@@ -391,6 +404,7 @@ template <class Visit> static void in_boxes(Batch& b, const int64_t* boxes, Visi
 API void pd_fill(void* batch, int slot, int bits, const int64_t* boxes, const int64_t* values) {
   Batch& b = *(Batch*)batch;
   in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
+    group.present = ~0ull;
     for (int i = 0; i < bits; i++) {
       Plane* p = group.slot[slot + i];
       const bool set = values[world] >> i & 1;
@@ -428,9 +442,11 @@ API void pd_fill_real(void* batch, int slot, const int64_t* boxes, const float* 
   });
   put_back(c);
 }
-API void pd_run(void* batch, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, const uint8_t* planes, const float* reals) {
+// Runs a batch, or a copy of it, and returns what has run.
+API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, int64_t since, const uint8_t* planes, const float* reals) {
+  if (copy) batch = pd_copy(batch);
   Batch& b = *(Batch*)batch;
-  Clocks k{seed, index, step};
+  Clocks k{seed, index, step, (u64)since};
   int count = std::max(1, std::min(threads, (int)b.groups.size()));
   std::atomic<int> next{0};
   auto task = [&](int) {
@@ -438,9 +454,10 @@ API void pd_run(void* batch, int64_t steps, int threads, const u64* seed, const 
     for (int n; (n = next++) < (int)b.groups.size();) run_group(*c, b, n, steps, k, planes, reals);
     put_back(c);
   };
-  if (count == 1) return task(0);
+  if (count == 1) return task(0), batch;
   std::lock_guard<std::mutex> hold(pool_use);
   pool().run(count, task);
+  return batch;
 }
 #if defined(PROFILE)
 API void pd_profile(double* seconds) {

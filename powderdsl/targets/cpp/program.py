@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import weakref
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,17 +15,43 @@ from powderdsl.targets.cpp.code import NativeCode
 from powderdsl.targets.job import Job
 from powderdsl.targets.profiling import PassClock
 
+Like = Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
+"""The dtype and shape of each tensor of a state."""
+
+BATCH_SIZES = 16
+"""How many batch sizes a program keeps the inputs of parameters for."""
+
+
+class Inputs(NamedTuple):
+    """The parameters of a batch as generated code reads them: flags uint8 [n, B], floats float32 [m, B], and where."""
+
+    params: Mapping[str, Tensor]
+    planes: Tensor
+    reals: Tensor
+    planes_at: int
+    reals_at: int
+
 
 class PackedState(Mapping[str, Tensor]):
     """A batch's state in native memory. Slots are unpacked into tensors one by one, on first access."""
 
-    def __init__(
-        self, program: NativeProgram, handle: int, like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
-    ):
-        self.program, self.like = program, like
+    __slots__ = ("_handle", "_tensors", "like", "program")
+
+    def __init__(self, program: NativeProgram, handle: int, like: Like):
         self._handle: int | None = handle
         self._tensors: dict[str, Tensor] = {}
-        self._free = weakref.finalize(self, program.library.pd_free, handle)
+        self.program, self.like = program, like
+
+    def __del__(self) -> None:
+        # Not a weakref.finalize, which takes as long as a quiet step.
+        if self._handle is not None:
+            self.program.library.pd_free(self._handle)
+
+    def __copy__(self) -> PackedState:
+        return PackedState(self.program, self.program.library.pd_copy(self.handle), self.like)
+
+    def __deepcopy__(self, memo: Any) -> PackedState:
+        return self.__copy__()
 
     @property
     def handle(self) -> int:
@@ -40,7 +65,6 @@ class PackedState(Mapping[str, Tensor]):
     def take(self) -> int:
         """The batch, for a new owner. This state must not be used afterwards."""
         handle, self._handle = self.handle, None
-        self._free.detach()
         self._tensors.clear()
         return handle
 
@@ -79,7 +103,7 @@ class PackedState(Mapping[str, Tensor]):
             reuse: write to this state itself, and return it.
         """
         program = self.program
-        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        changed = self if reuse else self.__copy__()
         boxes = boxes.contiguous()
         for name, value in values.items():
             changed._tensors.pop(name, None)
@@ -99,7 +123,7 @@ class PackedState(Mapping[str, Tensor]):
         `reuse`: write to this state itself, and return it.
         """
         program = self.program
-        changed = self if reuse else PackedState(program, program.library.pd_copy(self.handle), self.like)
+        changed = self if reuse else self.__copy__()
         changed._tensors.clear()
         places, count = places.contiguous(), len(places)
         for name, value in state.items():
@@ -138,7 +162,7 @@ class NativeProgram:
         self.pieces, self._passes = code.pieces, code.passes
         self._clocks = with_clocks
         self._with_clocks: NativeProgram | None = None
-        self._last: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
+        self._inputs: dict[int, Inputs] = {}
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
@@ -146,26 +170,23 @@ class NativeProgram:
         assert job.passes is None
         if job.timing is not None:
             return self._timed(job, job.timing)
-        seed, index, start = (part.contiguous() for part in job.clock)
-        batch = len(seed)
-        if isinstance(job.state, PackedState) and job.state.program is self:
-            handle = job.state.take() if job.reuse else self.library.pd_copy(job.state.handle)
-            like = job.state.like
+        state, (seed, index, start, since) = job.state, job.clock
+        if not (seed.is_contiguous() and index.is_contiguous() and start.is_contiguous()):
+            seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
+        inputs = self._inputs.get(start.shape[0])
+        if inputs is None or inputs.params is not job.params:
+            inputs = self._made_inputs(job.params, start.shape[0])
+        if isinstance(state, PackedState) and state.program is self:
+            like, copy = state.like, not job.reuse
+            handle = state.handle if copy else state.take()
         else:
-            handle, like = self._pack(job.state)
-        planes, reals = self._parameters(job.params, batch)
-        packed = PackedState(self, handle, like)
-        self.library.pd_run(
-            handle,
-            job.steps,
-            self.threads,
-            address(seed),
-            address(index),
-            address(start),
-            address(planes),
-            address(reals),
-        )
-        return packed
+            copy = False
+            handle, like = self._pack(state)
+        handle = self.library.pd_run(
+            handle, copy, job.steps, self.threads,
+            seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes_at, inputs.reals_at,
+        )  # fmt: skip
+        return PackedState(self, handle, like)
 
     def _timed(self, job: Job, clock: PassClock) -> Mapping[str, Tensor]:
         """Run on one thread and count processor time by pass.
@@ -177,33 +198,28 @@ class NativeProgram:
         seconds = (ctypes.c_double * len(self._passes))()
         library = self._with_clocks.library
         library.pd_profile(seconds)  # discard what earlier runs left
-        state = self._with_clocks.run(replace(job, timing=None))
+        state = self._with_clocks.run(job._replace(timing=None))
         library.pd_profile(seconds)
         for name, spent in zip(self._passes, seconds, strict=True):
             clock.add(name, spent)
         return state
 
-    def _parameters(self, params: Mapping[str, Tensor], batch: int) -> tuple[Tensor, Tensor]:
-        """Parameters as the flags and floats that generated code reads: uint8 [n, B], float32 [m, B]."""
-        key = tuple(params.values())
-        last = self._last  # another thread may write it
-        if (
-            last is not None
-            and len(key) == len(last[0])
-            and all(a is b for a, b in zip(key, last[0], strict=True))
-        ):
-            return last[1]
+    def _made_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
+        """The inputs of some parameters, kept for the next call with the same mapping."""
         layout = self.layout
-        found = parameters(params, layout.param_planes, layout.param_reals, batch, torch.device("cpu"))
-        self._last = (key, found)
+        planes, reals = parameters(
+            params, layout.param_planes, layout.param_reals, batch, torch.device("cpu")
+        )
+        found = Inputs(params, planes, reals, planes.data_ptr(), reals.data_ptr())
+        if len(self._inputs) >= BATCH_SIZES:
+            self._inputs = {}  # not cleared: another thread may be reading it
+        self._inputs[batch] = found
         return found
 
-    def _pack(
-        self, state: Mapping[str, Tensor]
-    ) -> tuple[int, dict[str, tuple[torch.dtype, tuple[int, ...]]]]:
+    def _pack(self, state: Mapping[str, Tensor]) -> tuple[int, Like]:
         batch, height, width = state["element"].shape
         handle = self.library.pd_new(batch, height, width)
-        like = {}
+        like: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {}
         for name, value in state.items():
             value = value.contiguous()
             like[name] = (value.dtype, tuple(value.shape))

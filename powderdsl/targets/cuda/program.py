@@ -179,7 +179,7 @@ class CudaProgram:
         flags, numbers = parameters(job.params, layout.param_planes, layout.param_reals, batch, device)
         blocks = -(-batch // source.group)
         scratch = torch.empty(max(1, blocks * source.scratch // 4), dtype=torch.int32, device=device)
-        seed, index, start = (part.contiguous() for part in job.clock)
+        seed, index, start = (part.contiguous() for part in (job.clock.seed, job.clock.world, job.clock.step))
         launch(
             Arguments(
                 after.planes, after.reals, scratch, (seed, index, start), flags, numbers, job.steps, blocks

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -26,11 +25,12 @@ class MixedProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
-        seed, index, start = job.clock
-        state = job.state
+        clock, state = job.clock, job.state
         for i in range(job.steps):
             for part in self.parts:
-                state = part.run(replace(job, state=state, clock=(seed, index, start + i), steps=1))
+                state = part.run(
+                    job._replace(state=state, clock=clock._replace(since=clock.since + i), steps=1)
+                )
         return state
 
 

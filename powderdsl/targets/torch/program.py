@@ -179,7 +179,7 @@ class TorchProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes; no host sync."""
-        seed, index, start = job.clock
+        seed, index, start = *job.clock[:2], job.clock.step
         batch, height, width = job.state["element"].shape
         kernels = Kernels(
             (batch, height, width), self.device, job.params, self._streams, job.draws,

@@ -1,0 +1,224 @@
+"""What is kept between calls of a simulator never shows: worlds are those of the backend `arrays`, whatever a user does."""
+
+from __future__ import annotations
+
+import copy
+import gc
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import compile as compile_rules
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.targets.cpp.program import BATCH_SIZES
+from powderdsl.testing.generators.cases import load_text
+from tests.compilers import skip_without_compiler
+
+RULES = """\
+pack: rain
+elements:
+  air: {id: 0, color: "#102030"}
+  drop: {id: 1, color: "#FEDCBA"}
+  moss: {id: 2, color: "#20A020"}
+fields:
+  heat: {type: real(-9..9), at: place}
+streams: [coin]
+params: {rate: 30%, gain: {type: real(0..2), default: 0.5}}
+passes:
+  fall:
+    do: drop swaps below if below is air and coin < rate
+  warm:
+    after: fall
+    do: heat := heat * 0.7 + gain where drop
+  grow:
+    after: warm
+    do: drop -> moss if step mod 4 == 3 and coin < 0.2
+"""
+
+
+@pytest.fixture(scope="module")
+def sims(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Simulator, Simulator]]:
+    """Native code, and the arrays that it is compared with."""
+    skip_without_compiler("native")
+    ruleset = load_text(RULES, "rain.yaml")
+    with building(Building("-O0", tmp_path_factory.mktemp("native"))):
+        yield compile_rules(ruleset, "native"), compile_rules(ruleset, "arrays")
+
+
+def start(sim: Simulator, batch: int = 1, size: tuple[int, int] = (16, 24)) -> World:
+    cells = np.random.default_rng(batch).integers(0, 3, (batch, *size)).astype(np.uint8)
+    return sim.world(cells, seed=5)
+
+
+def assert_equal(found: World, wanted: World) -> None:
+    for name in ("seed", "index", "step"):
+        assert torch.equal(getattr(found, name), getattr(wanted, name)), name
+    for name, value in wanted.state.items():
+        assert torch.equal(found.state[name], value), name
+
+
+Pair = tuple[Simulator, Simulator]
+
+
+def test_single_steps_are_those_of_one_call(sims: Pair) -> None:
+    native, arrays = sims
+    world = start(native)
+    for _ in range(9):
+        world = native.step(world)
+    assert_equal(world, arrays.step(start(arrays), 9))
+    assert_equal(native.step(world, 0), world)
+
+
+def test_old_worlds_stay(sims: Pair) -> None:
+    native, arrays = sims
+    kept = [start(native, 3)]
+    for steps in (1, 2, 1, 3):
+        kept.append(native.step(kept[-1], steps))
+    again = native.step(kept[1], 5)
+    wanted = start(arrays, 3)
+    for world, steps in zip(kept, (1, 2, 1, 3, 0), strict=True):
+        assert_equal(world, wanted)
+        wanted = arrays.step(wanted, steps)
+    assert_equal(again, arrays.step(start(arrays, 3), 6))
+
+
+@pytest.mark.parametrize("name", ["seed", "index", "step"])
+def test_numbers_written_to_count_for_the_worlds_that_have_them(sims: Pair, name: str) -> None:
+    """Those of a world that a simulator made, before and after its step was read, by torch and by NumPy."""
+    found: list[list[World]] = []
+    for sim in sims:
+        world = sim.step(sim.step(start(sim, 2)))
+        after = sim.step(world)
+        getattr(world, name)[1] = 40
+        by_torch = sim.step(world)
+        getattr(by_torch, name).numpy()[0] = 7
+        found.append([after, world, by_torch, sim.step(by_torch, 5)])
+    for one, other in zip(*found, strict=True):
+        assert_equal(one, other)
+    assert found[0][0].step.tolist() == [3, 3], "a later world has a step of its own"
+    assert int(getattr(found[0][3], name)[1]) == {"seed": 40, "index": 40, "step": 46}[name]
+
+
+def test_arguments_may_be_written_to_after_the_call(sims: Pair) -> None:
+    native, arrays = sims
+    rate, seeds = torch.tensor([0.9, 0.1], dtype=torch.float64), np.array([3, 4])
+    cells = torch.ones(2, 8, 8, dtype=torch.uint8)
+    world = native.world(cells, seeds)
+    first = native.step(world, params={"rain.rate": rate})
+    rate.fill_(0.5)
+    seeds[:] = 0
+    cells.zero_()
+    second = native.step(first, params={"rain.rate": rate})
+    wanted = arrays.world(np.ones((2, 8, 8), np.uint8), [3, 4])
+    wanted = arrays.step(wanted, params={"rain.rate": [0.9, 0.1]})
+    assert_equal(second, arrays.step(wanted, params={"rain.rate": 0.5}))
+
+
+def test_parameters_change_from_call_to_call(sims: Pair) -> None:
+    given: list[Mapping[str, Any] | None] = [
+        None, {"rain.rate": 1}, {}, {"rain.rate": 0.0, "rain.gain": 2}, None, {"rain.gain": [0.0, 1.0]}, {"rain.rate": 1}, None,
+    ]  # fmt: skip
+    found = []
+    for sim in sims:
+        world = start(sim, 2)
+        for params in given:
+            world = sim.step(world, params=params)
+        found.append(world)
+    assert_equal(*found)
+
+
+def test_defaults_cannot_be_changed_through_a_copy(sims: Pair) -> None:
+    native, arrays = sims
+    world = native.step(start(native))
+    for value in native.parameters({}, 1).values():
+        value.zero_()
+    assert_equal(native.step(world, 3), arrays.step(start(arrays), 4))
+
+
+def test_batch_sizes_alternate(sims: Pair) -> None:
+    """More of them than are kept, in strips and in lanes."""
+    native, arrays = sims
+    sizes = [1, 9, 2, 1, 9, *range(1, BATCH_SIZES + 3), 1, 9]
+    worlds = {batch: start(native, batch) for batch in set(sizes)}
+    for batch in sizes:
+        worlds[batch] = native.step(worlds[batch])
+    for batch, world in sorted(worlds.items()):
+        assert_equal(world, arrays.step(start(arrays, batch), sizes.count(batch)))
+
+
+def test_one_world_in_two_simulators(sims: Pair) -> None:
+    """A simulator of the same rules takes it on, and the first one again; neither sees what the other keeps."""
+    native, arrays = sims
+    other = compile_rules(native.ruleset, "native")
+    world = native.step(start(native, 2), 2)
+    left, right = native.step(world, 3), other.step(world, 3)
+    assert_equal(left, right)
+    for sim in (arrays, native, other, native):
+        right = sim.step(right)
+        left = native.step(left)
+        assert right.sim is sim
+    assert_equal(left, right)
+    assert_equal(world, arrays.step(start(arrays, 2), 2))
+
+
+def test_chosen_worlds_and_strided_numbers(sims: Pair) -> None:
+    found = []
+    for sim in sims:
+        world = sim.step(start(sim, 6)).select(slice(None, None, 2))
+        assert not world.seed.is_contiguous()
+        assert not world.index.is_contiguous()
+        found.append(sim.step(sim.step(world)))
+    assert_equal(*found)
+
+
+def test_edited_worlds(sims: Pair) -> None:
+    """Elements that were not present before; a run knows which are."""
+    found = []
+    for sim in sims:
+        world = sim.step(sim.world(np.zeros((1, 16, 16), np.uint8)), 2)
+        world = sim.step(sim.paint(world, where=torch.eye(16) > 0, element="drop", heat=1.0), 2)
+        world = sim.step(sim.replace(world, ids=torch.full((1, 16, 16), 2)), 1)
+        found.append(sim.step(sim.paint(world, where=torch.eye(16) > 0, element="drop"), 4))
+    assert_equal(*found)
+
+
+def test_reuse_takes_the_memory_and_nothing_else(sims: Pair) -> None:
+    native, arrays = sims
+    world = native.step(start(native, 2))
+    spent = native.step(world)
+    later = native.step(spent, 2, reuse=True)
+    assert_equal(later, arrays.step(start(arrays, 2), 4))
+    assert_equal(world, arrays.step(start(arrays, 2), 1))
+    assert spent.step.tolist() == [2, 2]
+    with pytest.raises(RuntimeError, match="reuse"):
+        native.step(spent)
+
+
+def test_copies_own_their_memory(sims: Pair) -> None:
+    native, arrays = sims
+    world = native.step(start(native))
+    shallow, deep = copy.copy(world.state), copy.deepcopy(world.state)
+    del world
+    gc.collect()
+    wanted = arrays.step(start(arrays), 1)
+    for state in (shallow, deep):
+        assert_equal(native.step(replace(wanted, sim=native, state=state), 2), arrays.step(wanted, 2))
+
+
+def test_numbers_that_do_not_fit_are_refused(sims: Pair) -> None:
+    for sim in sims:
+        world = sim.step(start(sim, 2))
+        for wrong in (
+            {"seed": world.seed[:1]},
+            {"step": world.step.int()},
+            {"index": world.index.expand(2, 2)},
+        ):
+            with pytest.raises(ValueError, match=f"a world's {next(iter(wrong))} must be int64"):
+                sim.step(replace(world, **wrong))
+        with pytest.raises(AttributeError, match="steps"):
+            _ = world.steps  # type: ignore[attr-defined]
