@@ -228,6 +228,23 @@ def test_another_compiler_source_or_level_is_another_library(
     assert len(found) == len(calls(tmp_path)) == 8
 
 
+def test_units_are_compiled_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    both = f"echo x >> {tmp_path}/there; while [ $(wc -l < {tmp_path}/there) = 1 ]; do sleep 0.1; done"
+    monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", f'{both}; cp "${{@: -1}}" "$out"')))
+    with building(Building("-O0", tmp_path)):
+        assert build("// source\n", "yard", units=2).read_text() == "// source\n"
+        found = calls(tmp_path)
+        assert sorted(word for call in found for word in call.split() if "UNIT" in word) == [
+            "-DUNIT=0",
+            "-DUNIT=1",
+        ]
+        assert " -c " not in found[2]
+        monkeypatch.setattr("os.cpu_count", lambda: 1)
+        build("// other\n", "yard", units=2)
+        assert len(calls(tmp_path)) == 4
+
+
 def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     body = "echo program.cpp:1: bad >&2; exit 3"
     monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", body)))
@@ -290,7 +307,7 @@ from pathlib import Path
 from powderdsl.targets.cpp.build import run_guarded
 scratch = Path(sys.argv[1])
 found = []
-thread = threading.Thread(target=lambda: found.append(run_guarded(["sleep", "2"], scratch)))
+thread = threading.Thread(target=lambda: found.append(run_guarded(scratch, ["sleep", "2"])))
 thread.start()
 time.sleep(0.5)
 pid = os.fork()
@@ -312,7 +329,7 @@ print(found)
 
 
 def test_what_cannot_be_run_says_so(tmp_path: Path) -> None:
-    status, said = run_guarded([str(tmp_path / "nothing")], tmp_path)
+    status, said = run_guarded(tmp_path, ["sleep", "60"], [str(tmp_path / "nothing")])
     assert status == 127
     assert "nothing" in said
 

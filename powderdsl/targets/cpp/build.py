@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import hashlib
+import json
 import os
 import shutil
 import signal
@@ -70,14 +71,15 @@ def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
-def build(source: str, ruleset: str = "") -> Path:
+def build(source: str, ruleset: str = "", units: int = 1) -> Path:
     """The path of the library for a source, compiled unless it is in the cache.
 
     Safe with other processes and threads doing the same: one of them compiles, and the library is added atomically. A
     damaged library is compiled again.
 
     Args:
-        ruleset: a name for `powderdsl cache list`.
+        ruleset: a name for `powderdsl cache list`. units: the parts of the source that are compiled side by side, if this
+            machine can: each where UNIT is its number.
 
     Raises:
         NoCompiler: none was found, or it failed.
@@ -90,24 +92,33 @@ def build(source: str, ruleset: str = "") -> Path:
         return found
     with cache.turn(folder, key):
         try:
-            return cache.find(folder, key) or _compile(source, ruleset, compiler, flags, folder, key)
+            return cache.find(folder, key) or _compile(source, units, ruleset, compiler, flags, folder, key)
         except OSError as error:
             raise NoCompiler(f"no room for compiled code: {error}") from None
 
 
 def _compile(
-    source: str, ruleset: str, compiler: Compiler, flags: tuple[str, ...], folder: Path, key: str
+    source: str, units: int, ruleset: str, compiler: Compiler, flags: tuple[str, ...], folder: Path, key: str
 ) -> Path:
     cache.tidy(folder)
     began, created = time.perf_counter(), time.time()
     with scratch_folder(folder) as scratch:
-        unit, built = scratch / "program.cpp", scratch / "built"
-        unit.write_text(source, encoding="utf-8")
+        text, built = scratch / "program.cpp", scratch / "built"
+        text.write_text(source, encoding="utf-8")
         built.mkdir()
-        command = [*compiler.command, *flags, "-o", str(built / cache.LIBRARY), str(unit)]
-        status, said = run_guarded(command, scratch)
-        if status:
-            raise NoCompiler("\n".join([f"{compiler.command[0]} failed:", *said.splitlines()[:8]]))
+        command, library = [*compiler.command, *flags], str(built / cache.LIBRARY)
+        if units == 1 or os.cpu_count() == 1 or _unguarded():
+            _call([[*command, "-o", library, str(text)]], scratch)
+        else:
+            objects = [str(scratch / f"{unit}.o") for unit in range(units)]
+            _call(
+                [
+                    [*command, "-c", f"-DUNIT={unit}", "-o", name, str(text)]
+                    for unit, name in enumerate(objects)
+                ],
+                scratch,
+            )
+            _call([[*command, "-o", library, *objects]], scratch)
         about = {
             "ruleset": ruleset,
             "backend": "native",
@@ -118,22 +129,34 @@ def _compile(
         return cache.add(folder, key, built, about)
 
 
+def _call(commands: list[list[str]], scratch: Path) -> None:
+    """Run compilers side by side. Raises NoCompiler if one fails."""
+    status, said = run_guarded(scratch, *commands)
+    if status:
+        raise NoCompiler("\n".join([f"{commands[0][0]} failed:", *said.splitlines()[:8]]))
+
+
+def _unguarded() -> bool:
+    """In a program frozen into one file, sys.executable is that program, so there is no guard."""
+    return bool(getattr(sys, "frozen", False)) or not sys.executable
+
+
 _running: dict[subprocess.Popen[bytes], Path] = {}
 _lock = threading.Lock()
 
 
-def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
-    """Exit code and messages of a command that never outlives this process.
+def run_guarded(scratch: Path, *commands: list[str]) -> tuple[int, str]:
+    """Exit code and messages of commands that run side by side and never outlive this process.
 
     Args:
-        scratch: a folder for its temporary files, removed if this process ends early.
+        scratch: a folder for their temporary files, removed if this process ends early. commands: one, if there is no
+            guard.
 
     Raises:
-        NoCompiler: it cannot be started, or takes longer than TIMEOUT.
+        NoCompiler: one cannot be started, or they take longer than TIMEOUT.
     """
-    # In a program frozen into one file, sys.executable is that program, so there is no guard.
-    frozen = getattr(sys, "frozen", False) or not sys.executable
-    guard = [] if frozen else [sys.executable, "-I", "-S", compiler_guard.__file__]
+    guarded = [sys.executable, "-I", "-S", compiler_guard.__file__, json.dumps(commands)]
+    called = commands[0] if _unguarded() else guarded
     # Nothing is written: the guard waits until the last process that holds our end is gone.
     theirs, ours = os.pipe()
     process: subprocess.Popen[bytes] | None = None
@@ -141,7 +164,7 @@ def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
         with held_back():
             try:
                 process = subprocess.Popen(
-                    [*guard, *command],
+                    called,
                     stdin=theirs,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,
@@ -149,14 +172,14 @@ def run_guarded(command: list[str], scratch: Path) -> tuple[int, str]:
                     start_new_session=True,
                 )
             except OSError as error:
-                raise NoCompiler(f"{command[0]} could not be run: {error}") from None
+                raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
             finally:
                 os.close(theirs)
             with _lock:
                 _running[process] = scratch
         said = process.communicate(timeout=TIMEOUT)[1].decode(errors="replace")
     except subprocess.TimeoutExpired:
-        raise NoCompiler(f"{command[0]} took longer than {TIMEOUT} s") from None
+        raise NoCompiler(f"{commands[0][0]} took longer than {TIMEOUT} s") from None
     finally:
         if process is not None:
             _end(process)
@@ -194,13 +217,13 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
 
 
-def open_library(source: str, ruleset: str = "") -> tuple[Path, ctypes.CDLL]:
-    """The library of a source, built if necessary. Raises NoCompiler."""
-    path = build(source, ruleset)
+def open_library(source: str, ruleset: str = "", units: int = 1) -> tuple[Path, ctypes.CDLL]:
+    """The library of a source, built if necessary: see `build`. Raises NoCompiler."""
+    path = build(source, ruleset, units)
     try:
         return path, load_library(path)
     except OSError:  # another process has just removed it, or it cannot be loaded at all
-        path = build(source, ruleset)
+        path = build(source, ruleset, units)
     try:
         return path, load_library(path)
     except OSError as error:

@@ -38,8 +38,8 @@ def compile_program(program: Program, planes: Program, *, clocks: bool = False) 
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.
     """
-    source, layout = native_source(planes)
-    library, _ = open_library(f"#define PROFILE\n{source}" if clocks else source, program.name)
+    source, layout, units = native_source(planes)
+    library, _ = open_library(f"#define PROFILE\n{source}" if clocks else source, program.name, units)
     return NativeCode(library, layout, pieces(program), tuple(p.name for p in planes.passes))
 
 

@@ -79,8 +79,8 @@ template <class T> struct Spare {
   size_t size = 0;
   std::vector<T*> waiting;
 };
-static Spare<Plane> spare_planes;
-static Spare<Field> spare_fields;
+inline Spare<Plane> spare_planes;  // of all units
+inline Spare<Field> spare_fields;
 static void release(Plane* p) { free(p->data); delete p; }
 static void release(Field* f) { free(f->data); free(f->live); delete f; }
 template <class T> static T* reuse(Spare<T>& spare, size_t size) {

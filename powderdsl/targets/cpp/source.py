@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
 from importlib.resources import files
 from operator import or_
+from typing import NamedTuple
 
 from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.presence import asked_ids
@@ -22,9 +24,21 @@ DRIVER = ("driver", "views")
 """Headers that come after them."""
 
 
+UNIT_SIZE = 40_000
+"""Letters of generated passes from which compiling two units side by side is faster."""
+
+
+class NativeSource(NamedTuple):
+    """A source file, its layout, and the number of units: with UNIT defined as its number, a unit's part is compiled."""
+
+    text: str
+    layout: Layout
+    units: int
+
+
 @collection_paused()
-def native_source(program: Program) -> tuple[str, Layout]:
-    """The source file and its layout."""
+def native_source(program: Program) -> NativeSource:
+    """The source file of a program."""
     layout = layout_of(program)
     schedules = [plan(pass_, CPP) for pass_ in program.passes]
     passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
@@ -76,10 +90,27 @@ def native_source(program: Program) -> tuple[str, Layout]:
         "\n".join((folder / f"{part}.hpp").read_text(encoding="utf-8") for part in parts)
         for parts in (LIBRARY, DRIVER)
     )
-    body = "\n\n".join(passes)
+    units = 2 if sum(map(len, passes)) >= UNIT_SIZE else 1
+    body = _in_units(passes, units, len(after))
     known = "  if (c.present == ~0ull) look(c);\n" if asked else ""
     step = f"{look(layout, asked)}\nstatic void run_passes(Context& c) {{\n  START;\n{known}{calls}\n}}"
-    return "\n".join([head, before, tables, body, step, after]), layout
+    last = f"{_only_in(0)}\n{tables}\n{step}\n{after}\n#endif\n"
+    return NativeSource("\n".join([head, before, body, last]), layout, units)
+
+
+def _only_in(unit: int) -> str:
+    return f"#if !defined(UNIT) || UNIT == {unit}"
+
+
+def _in_units(passes: Sequence[str], units: int, driver: int) -> str:
+    """The passes, each in a unit, so that all units are about as long; the first has a driver of so many letters, too."""
+    sizes = [driver, *[0] * (units - 1)]
+    chosen: dict[int, int] = {}
+    for number in sorted(range(len(passes)), key=lambda number: -len(passes[number])):
+        chosen[number] = sizes.index(min(sizes))
+        sizes[chosen[number]] += len(passes[number])
+    declared = [f"void pass_{number}(Context& c);" for number in range(len(passes))]
+    return "\n".join(declared + [f"{_only_in(chosen[i])}\n{text}\n#endif" for i, text in enumerate(passes)])
 
 
 ELEMENT = "element:"

@@ -38,7 +38,7 @@ def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
     lines += printer.block(schedule.body, frozenset())
     lines += printer.leave(schedule)
     body = "\n".join(lines)
-    return f"// pass {number}\nOUTLINE void pass_{number}(Context& c) {{\n{body}\n}}"
+    return f"// pass {number}\n__attribute__((noinline)) void pass_{number}(Context& c) {{\n{body}\n}}"
 
 
 def kind(var: Var) -> str:
