@@ -251,6 +251,10 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_ramp": (None, [pointer, *[integer] * 8, pointer, pointer, pointer, long]),
         "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
         "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
+        "pd_count": (
+            None,
+            [pointer, integer, pointer, integer, pointer, integer, integer, pointer, pointer],
+        ),
         "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
         "pd_run": (pointer, [pointer, integer, long, integer, *[pointer] * 3, long, pointer, pointer]),
     }

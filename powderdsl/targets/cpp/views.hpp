@@ -244,3 +244,67 @@ API void pd_planes(const void* batch, int count, const int* slots, u64* data, in
       for (int i = 0; i < b.g.cells(); i++) out[i] = word_of(p, lane % LANES, i);
     }
 }
+
+// Numbers of cells where masks hold. A gate is a plane of the batch, one of the given masks, or an operation on earlier gates;
+// `masks` have [rows of a world][words] each. `found` is [world][count]: how many cells, or the height of the highest one
+// above the bottom, over `divisor`.
+struct Gate {
+  int op, a, b;  // 0 plane, 1 mask, 2 not, 3 and, 4 or, 5 xor, 6 nothing
+};
+struct Count {
+  int gate, highest;
+  double divisor;
+};
+static V mask_row(const Grid& g, const u64* mask, int y, int w) {
+  if (!g.strips) return splat(mask[(size_t)y * g.words + w]);
+  V row = splat(0);
+  for (int l = 0; l < LANES; l++) row[l] = mask[((size_t)l * g.height + y) * g.words + w];
+  return row;
+}
+API void pd_count(const void* batch, int gates, const Gate* gate, int counts, const Count* count, int top, int bottom, const u64* masks, double* found) {
+  const Batch& b = *(const Batch*)batch;
+  const Grid& g = b.g;
+  const size_t mask_words = (size_t)g.world_height() * g.words;
+  const int first = g.strips ? 0 : top, last = g.strips ? g.height : bottom, rest = g.width - 64 * (g.words - 1);
+  const V whole = splat(~0ull), edge = splat(rest == 64 ? ~0ull : (1ull << rest) - 1);
+  V* value = aligned<V>(gates + 1);
+  std::vector<int64_t> total((size_t)counts * LANES);
+  std::fill(found, found + (size_t)b.worlds * counts, 0.0);
+  for (int n = 0; n < (int)b.groups.size(); n++) {
+    std::fill(total.begin(), total.end(), 0);
+    for (int i = first * g.words; i < last * g.words; i++) {
+      const int y = i / g.words, w = i % g.words;
+      for (int k = 0; k < gates; k++) {
+        const int a = gate[k].a, c = gate[k].b;
+        switch (gate[k].op) {
+          case 0: value[k] = b.groups[n].slot[a]->zero ? splat(0) : b.groups[n].slot[a]->data[i]; break;
+          case 1: value[k] = mask_row(g, masks + a * mask_words, y, w); break;
+          case 2: value[k] = ~value[a]; break;
+          case 3: value[k] = value[a] & value[c]; break;
+          case 4: value[k] = value[a] | value[c]; break;
+          case 5: value[k] = value[a] ^ value[c]; break;
+          default: value[k] = splat(0);
+        }
+      }
+      for (int k = 0; k < counts; k++) {
+        const V cells = value[count[k].gate] & (w == g.words - 1 ? edge : whole);
+        for (int l = 0; l < LANES; l++) {
+          int64_t& sum = total[(size_t)k * LANES + l];
+          if (!count[k].highest) sum += __builtin_popcountll(cells[l]);
+          else if (cells[l]) sum = std::max<int64_t>(sum, g.world_height() - (g.strips ? l * g.height + y : y));
+        }
+      }
+    }
+    for (int k = 0; k < counts; k++)
+      for (int l = 0; l < LANES; l++) {
+        const int lane = n * LANES + l;
+        if (lane >= b.lanes()) break;
+        double& sum = found[(size_t)(g.strips ? lane / LANES : lane) * counts + k];
+        const double part = (double)total[(size_t)k * LANES + l];
+        sum = count[k].highest ? std::max(sum, part) : sum + part;
+      }
+  }
+  for (int i = 0; i < b.worlds; i++)
+    for (int k = 0; k < counts; k++) found[(size_t)i * counts + k] /= count[k].divisor;
+  free(value);
+}

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from powderdsl.ir.bits import NotBits, lower_bits
 from powderdsl.ir.build import Builder
 from powderdsl.ir.lower.expressions import Inputs, lower_expression
 from powderdsl.ir.lower.rules import ir_type, slot_names
-from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, component_of
+from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, Type, component_of
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.simulation.simulator import World
+from powderdsl.targets.cpp.counts import CellCounts, Counted
+from powderdsl.targets.cpp.program import NativeProgram, PackedState
 from powderdsl.targets.torch.program import Kernels, PassFunction, compiled
 from powderdsl.targets.torch.source import pass_source
+from powderdsl.targets.words import pack
 from powderdsl.tasks.goals import REGION_LET, parts_of
 from powderdsl.tasks.task import Goal, Measure
 from powderdsl.tasks.tensors.generator import NOTHING
@@ -58,6 +63,8 @@ class Meter:
         device: torch.device,
     ):
         self.ruleset, self.measures, self.size, self.device = ruleset, measures, size, device
+        self._fixed = fixed
+        self._counts: tuple[NativeProgram, CellCounts | None] | None = None
         groups: dict[Window, list[int]] = {}
         for number, measure in enumerate(measures):
             if measure.value is not None:
@@ -75,7 +82,13 @@ class Meter:
         params: Mapping[str, Any] | None,
     ) -> Tensor:
         """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own."""
-        batch = len(world.step)
+        state, batch = world.state, len(world)
+        if isinstance(state, PackedState):
+            if self._counts is None or self._counts[0] is not state.program:
+                self._counts = state.program, self._cell_counts(state.program)
+            counts = self._counts[1]
+            if counts is not None:
+                return counts.of(state.program.library, state.handle, batch)
         every = self._params(params, batch)
         found: list[Tensor] = [torch.zeros(0)] * len(self.measures)
         for part in self._parts:
@@ -90,6 +103,35 @@ class Meter:
         if not found:
             return torch.zeros(batch, 0, dtype=torch.float64, device=self.device)
         return torch.stack([one.expand(batch) for one in found], 1)
+
+    def _cell_counts(self, program: NativeProgram) -> CellCounts | None:
+        """What counts all measures in packed worlds, if they are numbers of cells that bit planes show."""
+        values = [(i, one) for i, one in enumerate(self.measures) if one.how in ("count", "share", "highest")]
+        regions = {one.region for one in self.measures if one.region is not None}
+        if not values or len(values) < len(self.measures) or not regions <= self._fixed.keys():
+            return None
+        try:
+            (pass_,) = lower_bits(_lowered(self.ruleset, values)).passes
+            flags = dict(pass_.outputs)
+            counted = [
+                Counted(flags[f"measure {i}"], one.region, one.how == "highest", self._cells_of(one))
+                for i, one in values
+            ]
+            masks = {name: pack(cells[0]) for name, cells in self._fixed.items()}
+            masks |= {REGION_LET + name: words for name, words in masks.items()}
+            windows = [_window(one, self.size, self._fixed) for _, one in values]
+            rows = min(top for top, *_ in windows), max(bottom for _, bottom, *_ in windows)
+            return CellCounts(counted, program.layout.planes, masks, rows)
+        except (NotBits, KeyError, ValueError):
+            return None  # floats, neighbors, other regions: tensors show them
+
+    def _cells_of(self, measure: Measure) -> float:
+        """What a number of cells is divided by."""
+        if measure.how != "share":
+            return 1.0
+        region = measure.region
+        cells = self.size[0] * self.size[1] if region is None else int(self._fixed[region].sum())
+        return float(max(1, cells))
 
     def cells(self, number: int, world: World, regions: Mapping[str, Tensor]) -> Tensor:
         """The cells that a measure counts, bool [B, H, W]. The meter must have no fixed regions, so that it sees all."""
@@ -144,6 +186,37 @@ def _cut(plane: Tensor, window: Window) -> Tensor:
     return plane[..., top:bottom, left:right]
 
 
+def _types(ruleset: Ruleset) -> dict[str, Type]:
+    """The slots that cell expressions read, by name."""
+    return {name: ir_type(slot.kind, ruleset.slots) for slot in slots(ruleset) for name in slot_names(slot)}
+
+
+def _lets(measures: Sequence[Measure]) -> list[str]:
+    """The regions that cell expressions name."""
+    exprs = [measure.value for measure in measures if measure.value is not None]
+    return sorted({str(part.value) for expr in exprs for part in expr.walk() if part.op == "let"})
+
+
+def _lowered(ruleset: Ruleset, measures: Sequence[tuple[int, Measure]]) -> Program:
+    """The cell expressions of numbered measures as a program of one pass, with an output each: ``measure 3``."""
+    build = Builder()
+    types, regions = _types(ruleset), _lets([measure for _, measure in measures])
+    state = {name: build.input(name, type) for name, type in types.items()}
+    lets: dict[str, Node | tuple[Node, Node]] = {name: build.input(name, FLAG) for name in regions}
+    outputs = []
+    for number, measure in measures:
+        assert measure.value is not None
+        node = lower_expression(measure.value, Inputs(ruleset, build, state, lets))
+        assert isinstance(node, Node)
+        outputs.append((f"measure {number}", node))
+    every = {**types, **dict.fromkeys(regions, FLAG), **{name: node.type for name, node in outputs}}
+    rows = [SlotType(name, type, 0, False) for name, type in every.items()]
+    params = tuple((p.name, p.kind.name) for p in ruleset.params)
+    streams = tuple((s.name, s.ident, s.bits) for s in ruleset.streams)
+    graph = PassGraph("measures", ruleset.name, (), tuple(outputs))
+    return run_passes(Program(ruleset.name, tuple(rows), params, streams, (graph,)))
+
+
 class _Part:
     """The cell expressions of one window as one generated function."""
 
@@ -152,29 +225,11 @@ class _Part:
     ):
         self.window, self.device = window, device
         self.numbers = [number for number, _ in measures]
-        build = Builder()
-        table = {slot.name: slot for slot in slots(ruleset)}
-        types = {
-            name: ir_type(slot.kind, ruleset.slots) for slot in table.values() for name in slot_names(slot)
-        }
-        exprs = [measure.value for _, measure in measures if measure.value is not None]
-        regions = sorted({str(part.value) for expr in exprs for part in expr.walk() if part.op == "let"})
-        state = {name: build.input(name, type) for name, type in types.items()}
-        lets: dict[str, Node | tuple[Node, Node]] = {name: build.input(name, FLAG) for name in regions}
-        outputs = []
-        for number, expr in zip(self.numbers, exprs, strict=True):
-            node = lower_expression(expr, Inputs(ruleset, build, state, lets))
-            assert isinstance(node, Node)
-            outputs.append((f"measure {number}", node))
-        every = {**types, **dict.fromkeys(regions, FLAG), **{name: node.type for name, node in outputs}}
-        rows = [SlotType(name, type, 0, False) for name, type in every.items()]
-        params = tuple((p.name, p.kind.name) for p in ruleset.params)
-        streams = tuple((s.name, s.ident, s.bits) for s in ruleset.streams)
-        graph = PassGraph("measures", ruleset.name, (), tuple(outputs))
-        program = run_passes(Program(ruleset.name, tuple(rows), params, streams, (graph,)))
+        program = _lowered(ruleset, measures)
         source, name, constants = pass_source(program.passes[0], 0)
-        self.slots = [one for one in types if f"state[{one!r}]" in source]
-        self.types, self.regions = types, regions
+        self.types = _types(ruleset)
+        self.slots = [one for one in self.types if f"state[{one!r}]" in source]
+        self.regions = _lets([measure for _, measure in measures])
         self.run: PassFunction = compiled(source, name, constants, device)
 
     def cells(
@@ -183,7 +238,7 @@ class _Part:
         """The value of each cell of the window, [B, h, w], by the measure's number."""
         top, bottom, left, right = self.window
         none = torch.zeros(0, dtype=torch.int64, device=self.device)
-        shape = (len(world.step), bottom - top, right - left)
+        shape = (len(world), bottom - top, right - left)
         kernels = Kernels(shape, self.device, params, {}, {}, none, none, world.step)
         planes: dict[str, Tensor] = {}
         for name in self.slots:
@@ -212,19 +267,34 @@ class Facts:
 
 def scalar_value(scalar: Expr, facts: Facts) -> Tensor:
     """float64 [B]; conditions are 0 or 1."""
+    found = _value(scalar, facts)
+    return found if found.ndim else found.expand(len(facts.now)).clone()
+
+
+def _value(scalar: Expr, facts: Facts) -> Tensor:
+    """The same, or float64 [] where all worlds have the same."""
     match scalar.op:
         case "const":
-            return torch.full_like(facts.now[:, :1].sum(1), float(scalar.value))
+            return _constant(float(scalar.value), facts.now.device)
         case "measure":
             return facts.now[:, facts.measures[scalar.value]]
         case "action":
             return facts.action[scalar.value].double()
         case "start" | "before":
             then = facts.start if scalar.op == "start" else facts.before
-            return scalar_value(scalar.args[0], replace(facts, now=then))
-    args = [scalar_value(arg, facts) for arg in scalar.args]
+            return _value(scalar.args[0], replace(facts, now=then))
+    args = [_value(arg, facts) for arg in scalar.args]
     found = _VALUES[scalar.op](*args)
-    return found.masked_fill(args[1] == 0, 0) if scalar.op in ("div", "quotient", "mod") else found
+    if scalar.op in ("div", "quotient", "mod") and not (
+        scalar.args[1].op == "const" and scalar.args[1].value
+    ):
+        return found.masked_fill(args[1] == 0, 0)
+    return found
+
+
+@lru_cache(1024)
+def _constant(value: float, device: torch.device) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64, device=device)
 
 
 _VALUES: Mapping[str, Callable[..., Tensor]] = {
