@@ -75,6 +75,12 @@ class World:
         """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""
         return self.read(name)
 
+    def with_state(self, state: Mapping[str, Tensor]) -> World:
+        """These worlds in another state, at the same step with the same random futures."""
+        world = object.__new__(World)
+        world.__dict__.update(self.__dict__, state=state)
+        return world
+
     def select(self, worlds: int | slice | Sequence[int] | Tensor) -> World:
         """Some worlds of the batch, with their random futures unchanged."""
         keys = [worlds] if isinstance(worlds, int) else worlds

@@ -435,7 +435,7 @@ API void pd_fill_real(void* batch, int slot, const int64_t* boxes, const float* 
       if (!f->live[r] && values[world] == 0) continue;
       if (!f->live[r]) std::fill_n(row, b.g.width, 0.f);
       std::fill(row + box[2], row + box[3], values[world]);
-      f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
+      f->live[r] = values[world] != 0 || std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
       if (f->live[r]) f->still = false;
       finish_row(*c, row);
     }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,8 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.task import BLOW, Agent
 from powderdsl.worlds.raster import Size
+
+Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class Hands:
@@ -38,6 +41,7 @@ class Hands:
                 table = value[:1].repeat(256, *[1] * (value.ndim - 1))
                 table[known[0]] = value
                 self._fresh[slot.name] = table
+        self._tables = {name: table.cpu().numpy() for name, table in self._fresh.items()}
         self._by_element = [name for name, table in self._fresh.items() if (table != table[0]).any()]
 
     def _brush(self, axis: int) -> tuple[Tensor, Tensor]:
@@ -73,6 +77,8 @@ class Hands:
             the worlds; int64 [B] each: the number of cells ``painted``, and 1 if an element was ``placed``, or cells
             were ``blown``.
         """
+        if isinstance(world.state, PackedState) and not self.counts:
+            return self._act_packed(world, world.state, actions, reuse)
         choice = self.choices[actions[:, 2]]
         blown, placed = choice == BLOW, choice >= 0
         state, painted = world.state, torch.zeros_like(choice)
@@ -87,7 +93,29 @@ class Hands:
             speed = self.agent.speed * (actions[:, [4, 3]] - 1).float()
             state = self._filled(world, state, actions, blown, {self.agent.speed_field: speed}, reuse)
         done = {"painted": painted, "placed": placed.long(), "blown": blown.long()}
-        return replace(world, state=state), done
+        return world.with_state(state), done
+
+    def _act_packed(
+        self, world: World, state: PackedState, actions: Tensor, reuse: bool
+    ) -> tuple[World, dict[str, Tensor]]:
+        """The same in native memory. NumPy starts an operation on a few numbers in a fraction of torch's time."""
+        numbers = actions.numpy()
+        choice = self.choices.numpy()[numbers[:, 2]]
+        blown, placed = choice == BLOW, choice >= 0
+        rows, columns = (edges.numpy() for edges in self.edges)
+        boxes = np.concatenate([rows[numbers[:, 1]], columns[numbers[:, 0]]], 1)
+        if self.places_elements:
+            ids = choice.clip(0)
+            values = {name: table[ids] for name, table in self._tables.items()}
+            state = _filled_packed(state, boxes, placed, values, reuse)
+        if self.agent.speed_field is not None:
+            speed = (np.float32(self.agent.speed) * (numbers[:, [4, 3]] - 1)).astype(np.float32)
+            reuse = reuse or state is not world.state
+            state = _filled_packed(state, boxes, blown, {self.agent.speed_field: speed}, reuse)
+        done = {"painted": np.zeros(len(choice), np.int64), "placed": placed, "blown": blown}
+        return world.with_state(state), {
+            name: torch.from_numpy(value.astype(np.int64)) for name, value in done.items()
+        }
 
     def _filled(
         self,
@@ -101,9 +129,9 @@ class Hands:
         """A state of `world`'s with the block of each action filled: a value a world, [B] or [B, 2], in those of `where`."""
         if isinstance(state, PackedState):  # only the blocks are written, nothing is unpacked
             boxes = torch.cat([edges[actions[:, 1 - axis]] for axis, edges in enumerate(self.edges)], 1)
-            numbers = {name: one if one.is_floating_point() else one.long() for name, one in values.items()}
-            return state.fill(
-                torch.where(where[:, None], boxes, 0), numbers, reuse=reuse or state is not world.state
+            arrays = {name: value.numpy() for name, value in values.items()}
+            return _filled_packed(
+                state, boxes.numpy(), where.numpy(), arrays, reuse or state is not world.state
             )
         rows, columns = (lines[actions[:, 1 - axis]] for axis, lines in enumerate(self._lines))
         cells = (rows[:, :, None] * self.size[1] + columns[:, None]).flatten(1)
@@ -117,3 +145,14 @@ class Hands:
             flat.scatter_(-1, index, torch.where(filled, value.to(slot.dtype)[..., None], kept))
             found[name] = flat.view(slot.shape)
         return found
+
+
+def _filled_packed(
+    state: PackedState, boxes: Array, where: Array, values: Mapping[str, Array], reuse: bool
+) -> PackedState:
+    """A state with boxes int64 [B, 4] filled where `where`, bool [B], is set: only they are written, nothing is unpacked."""
+    numbers = {
+        name: torch.from_numpy(one if one.dtype == np.float32 else one.astype(np.int64))
+        for name, one in values.items()
+    }
+    return state.fill(torch.from_numpy(boxes * where[:, None]), numbers, reuse=reuse)
