@@ -34,7 +34,7 @@ class Observation:
 
     def of(self, world: World) -> Tensor:
         """The observations of a batch, in memory of their own: [B, *space.shape]."""
-        shape, dtype = (len(world.seed), *self.space.shape), getattr(torch, self.space.dtype.name)
+        shape, dtype = (len(world), *self.space.shape), getattr(torch, self.space.dtype.name)
         out = torch.empty(shape, dtype=dtype, device=world.seed.device)
         if self.kind == "ids":
             world.read("element", out[:, 0])

@@ -313,7 +313,7 @@ class TensorEnv:
         if self.episodes is None:
             raise ResetNeeded("reset the environment before its first step")
         checked = self.action_form.decode(actions)
-        if len(checked) != self.num_envs:
+        if checked.shape[0] != self.num_envs:
             raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
         waiting = self._ended
         if self.autoreset_mode is AutoresetMode.DISABLED and bool(waiting.any()):
@@ -327,7 +327,9 @@ class TensorEnv:
         self.episodes = after
         failed, last = after.failed, after.acted >= self.task.agent.actions
         terminated = (success | failed | last) if self.last_action_terminates else success | failed
-        truncated = (last | (after.acted >= self.max_episode_steps)) & ~terminated
+        if self.max_episode_steps != self.task.agent.actions:
+            last = last | (after.acted >= self.max_episode_steps)
+        truncated = last & ~terminated
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             reward = reward.masked_fill(waiting, 0)
             terminated, truncated, success = (one & ~waiting for one in (terminated, truncated, success))
@@ -358,7 +360,9 @@ class TensorEnv:
             last |= {name: info[name] for name in ("success", "episode_return", "episode_length")}
             masked = info["_episode_return"]
             info["final_info"] = last | {f"_{name}": masked for name in last}
-            info["final_obs"] = observed[places]
+            info["final_obs"] = (
+                observed[places] if len(places) else observed.new_empty(0, *observed.shape[1:])
+            )
             info["_final_obs"] = info["_final_info"] = masked
         if not len(places):
             return

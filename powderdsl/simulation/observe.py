@@ -63,14 +63,16 @@ class Observer:
         Raises:
             KeyError: the ruleset has no such name. ValueError, TypeError: the buffer does not fit.
         """
-        name = slot_name(self.ruleset, name)
-        slot, prop = self.slots.get(name), self.ruleset.property(name)
+        if name not in self.slots:
+            name = slot_name(self.ruleset, name)
+        slot = self.slots.get(name)
         batch, height, width = shape_of(state)
         if slot is not None:
             if out is None:
                 return state[name]
             shape = (batch, 2, height, width) if slot.planes == 2 else (batch, height, width)
             return _write_slot(state, name, self._buffer(out, shape, getattr(torch, slot.dtype)))
+        prop = self.ruleset.property(name)
         if prop is None:
             known = [*self.slots, *(p.name for p in self.ruleset.properties)]
             raise KeyError(

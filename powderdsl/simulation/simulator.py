@@ -69,7 +69,7 @@ class World:
         return shape_of(self.state)
 
     def __len__(self) -> int:
-        return len(self.seed)  # without unpacking anything
+        return int(self.seed.shape[0])  # without unpacking anything, nor torch's Python
 
     def __getitem__(self, name: str) -> Tensor:
         """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""

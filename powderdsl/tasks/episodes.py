@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,7 +58,7 @@ class Episodes:
     before: Tensor
 
     def __len__(self) -> int:
-        return len(self.seed)
+        return int(self.seed.shape[0])
 
 
 class TaskProgram:
@@ -82,8 +83,9 @@ class TaskProgram:
             part.op == "before" for part in scalars_of(goal)
         )
         """Whether measures are needed after every action, and not only after the last."""
-        counts = any(part.op == "action" and part.value == "painted" for part in scalars_of(goal))
-        self._hands = Hands(simulator, task.agent, task.size, counts=counts)
+        self._asked = {part.value for part in scalars_of(goal) if part.op == "action"}
+        """The numbers of actions that the goal reads."""
+        self._hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
         self.action_nvec = task.agent.action_nvec
         """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
 
@@ -209,9 +211,11 @@ class TaskProgram:
             success, failure, or no action left. With the last action the free steps have run.
         """
         agent, goal = self.task.agent, self.task.goal
-        world, done = episodes.world, dict.fromkeys(DONE, torch.zeros_like(episodes.acted))
+        world = episodes.world
         if actions is not None:
             world, done = self._hands.act(world, actions, reuse=reuse)
+        else:
+            done = dict.fromkeys(DONE, torch.zeros_like(episodes.acted))
         if seen is not None:
             seen(world)
         world = self._run(world, agent.steps_per_action, params, reuse, seen)
@@ -222,18 +226,34 @@ class TaskProgram:
         now = episodes.before
         if self._counts_always or bool(last.any()):
             now = self._meter.take(world, episodes.regions, episodes.targets, params)
-        action = {"taken": acted, "left": agent.actions - acted, **done}
+        action = {"taken": acted, **done}
+        if "left" in self._asked:
+            action["left"] = agent.actions - acted
         facts = Facts(self._places, now, episodes.start, episodes.before, action)
-        nothing = torch.zeros(len(acted), dtype=torch.float64, device=acted.device)
         success, failed = (
-            nothing.bool() if one is None else scalar_value(one, facts) != 0
+            torch.zeros_like(last) if one is None else scalar_value(one, facts) != 0
             for one in (goal.success, goal.failure)
         )
-        over = last | success | failed
-        reward = nothing if goal.each is None else scalar_value(goal.each, facts)
+        over = last
+        for one, holds in ((goal.success, success), (goal.failure, failed)):
+            over = over if one is None else over | holds
+        if goal.each is None:
+            reward = torch.zeros_like(acted, dtype=torch.float64)
+        else:
+            reward = scalar_value(goal.each, facts)
         if goal.final is not None:
-            reward = reward + torch.where(over, scalar_value(goal.final, facts), nothing)
-        after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
+            final = scalar_value(goal.final, facts)
+            reward = reward + torch.where(over, final, torch.zeros_like(final))
+        after = Episodes(
+            world,
+            episodes.seed,
+            acted,
+            failed,
+            episodes.regions,
+            episodes.targets,
+            episodes.start,
+            now,
+        )
         return after, reward.float(), success, over
 
     @property
@@ -322,9 +342,17 @@ def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -
     tensor = integer_tensor("actions", actions)
     if tensor.ndim != 2 or tensor.shape[1] != len(nvec):
         raise ValueError(f"actions must have the shape [episodes, {len(nvec)}], found {list(tensor.shape)}")
-    bounds = _bounds(nvec).to(tensor.device)
-    bad = (tensor < 0) | (tensor >= bounds)
-    if bool(bad.any()):
+    bounds = _bounds(nvec)
+    bad: Any
+    if (
+        tensor.device.type == "cpu"
+    ):  # NumPy starts an operation on a few numbers in a fraction of torch's time
+        numbers = tensor.numpy()
+        bad = (numbers < 0) | (numbers >= bounds)
+    else:
+        bad = (tensor < 0) | (tensor >= torch.from_numpy(bounds).to(tensor.device))
+    if bad.any():
+        bad = torch.as_tensor(bad)
         row, column = bad.nonzero()[0].tolist()
         value, most = int(tensor[row, column]), nvec[column] - 1
         raise ValueError(f"actions[{row}, {column}] ({names[column]}) is {value}: it must lie in 0..{most}")
@@ -332,5 +360,5 @@ def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -
 
 
 @lru_cache(256)
-def _bounds(nvec: tuple[int, ...]) -> Tensor:
-    return torch.tensor(nvec)
+def _bounds(nvec: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.int64]]:
+    return np.array(nvec, np.int64)

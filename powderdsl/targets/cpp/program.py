@@ -163,6 +163,11 @@ class NativeProgram:
         self._clocks = with_clocks
         self._with_clocks: NativeProgram | None = None
         self._inputs: dict[int, Inputs] = {}
+        self._planes = {
+            name: (self.layout.planes[parts[0].planes[0]], len(parts[0].planes), parts[0].signed)
+            for name, parts in self.pieces.items()
+            if not parts[0].is_real
+        }
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
@@ -234,8 +239,7 @@ class NativeProgram:
 
     def planes_of(self, name: str) -> tuple[int, int, bool]:
         """The first plane of a state tensor, the number of planes, and whether the last one is a sign."""
-        (piece,) = self.pieces[name]
-        return self.layout.planes[piece.planes[0]], len(piece.planes), piece.signed
+        return self._planes[name]
 
 
 def address(tensor: Tensor) -> ctypes.c_void_p:

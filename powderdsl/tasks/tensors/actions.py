@@ -41,7 +41,9 @@ class Hands:
                 table = value[:1].repeat(256, *[1] * (value.ndim - 1))
                 table[known[0]] = value
                 self._fresh[slot.name] = table
+        # For packed worlds.
         self._tables = {name: table.cpu().numpy() for name, table in self._fresh.items()}
+        self._choices, *self._edges = (one.cpu().numpy() for one in (self.choices, *self.edges))
         self._by_element = [name for name, table in self._fresh.items() if (table != table[0]).any()]
 
     def _brush(self, axis: int) -> tuple[Tensor, Tensor]:
@@ -100,10 +102,9 @@ class Hands:
     ) -> tuple[World, dict[str, Tensor]]:
         """The same in native memory. NumPy starts an operation on a few numbers in a fraction of torch's time."""
         numbers = actions.numpy()
-        choice = self.choices.numpy()[numbers[:, 2]]
+        choice = self._choices[numbers[:, 2]]
         blown, placed = choice == BLOW, choice >= 0
-        rows, columns = (edges.numpy() for edges in self.edges)
-        boxes = np.concatenate([rows[numbers[:, 1]], columns[numbers[:, 0]]], 1)
+        boxes = np.concatenate([edges[numbers[:, 1 - axis]] for axis, edges in enumerate(self._edges)], 1)
         if self.places_elements:
             ids = choice.clip(0)
             values = {name: table[ids] for name, table in self._tables.items()}
@@ -112,10 +113,9 @@ class Hands:
             speed = (np.float32(self.agent.speed) * (numbers[:, [4, 3]] - 1)).astype(np.float32)
             reuse = reuse or state is not world.state
             state = _filled_packed(state, boxes, blown, {self.agent.speed_field: speed}, reuse)
-        done = {"painted": np.zeros(len(choice), np.int64), "placed": placed, "blown": blown}
-        return world.with_state(state), {
-            name: torch.from_numpy(value.astype(np.int64)) for name, value in done.items()
-        }
+        done = {"painted": np.zeros(len(choice)), "placed": placed, "blown": blown}
+        numbered = {name: torch.from_numpy(value.astype(np.int64)) for name, value in done.items()}
+        return world.with_state(state), numbered
 
     def _filled(
         self,
