@@ -19,12 +19,20 @@ reward: {each: painted + count(sand) + 100 * placed}
 """
 
 
-@pytest.mark.parametrize("size", ["[64, 64]", "[20, 70]"])
-def test_packed_worlds_are_acted_on_alike(torch, size):
+@pytest.mark.parametrize(
+    ("size", "each"),
+    [
+        ("[64, 64]", "painted + count(sand) + 100 * placed"),
+        ("[20, 70]", "painted + count(sand)"),
+        ("[24, 70]", "count(sand) + 100 * placed + 10 * blown + left"),
+    ],
+)
+def test_packed_worlds_are_acted_on_alike(torch, size, each):
     """Few worlds are cut into strips in native code, many are not; 70 columns are more than one word."""
     from powderdsl.tasks.episodes import compile_task
 
-    task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
+    text = TASK.replace("SIZE", size).replace("painted + count(sand) + 100 * placed", each)
+    task = read_task(Source("packed.yaml", text), Reporter())
     native, plain = (compile_task(task, backend=backend) for backend in ("native", "arrays"))
     for batch, reuse in ((1, True), (3, False), (20, True), (20, False)):
         one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
@@ -70,6 +78,61 @@ def test_packed_worlds_restart_alike(torch, size):
             for name, value in other.world.state.items():
                 assert torch.equal(one.world.state[name], value), name
             assert one.world.step.tolist() == other.world.step.tolist()
+
+
+MEASURES = """task: measured
+rules: powderworld
+size: SIZE
+fill: empty
+regions:
+  west: box columns :21
+  pit: box rows 9:17 columns 3:69
+  blob: disk at (10, 40) radius 7
+  drawn: box rows 4..6:9 columns :33
+generate:
+  - repeat 9:
+      - disk any at (0..19, 0..69) radius 2..6
+agent: {may: [blow], actions: 3, speed: 9}
+reward: {each: EACH}
+"""
+
+
+@pytest.mark.parametrize("size", ["[24, 70]", "[17, 70]"])
+@pytest.mark.parametrize(
+    ("each", "on_planes"),
+    [
+        ("count(sand) + 2 * count(not empty in west) - share(density > 1 or gas in pit)", True),
+        (
+            "highest(sand) + highest(water or fire in pit) / share(empty) + count(wall in blob and not (west))",
+            True,
+        ),
+        ("count(not empty in drawn)", False),
+        ("count(sand in west) + count(water in drawn)", False),
+        ("count(count(sand) > 2)", False),
+        ("sum(velocity.column)", False),
+        ("sum(row mod 32 if sand else 0) + count(sand)", False),
+    ],
+)
+def test_packed_worlds_are_measured_alike(torch, size, each, on_planes):
+    """In strips (few worlds of 24 rows) and side by side, in words that are not full."""
+    from dataclasses import replace
+
+    from powderdsl.tasks.episodes import compile_task
+
+    text = MEASURES.replace("SIZE", size).replace("EACH", each)
+    program = compile_task(read_task(Source("measured.yaml", text), Reporter()), backend="native")
+    for batch in (1, 20):
+        episodes = program.start(torch.arange(batch))
+        for steps in (0, 3):
+            world = program.simulator.step(episodes.world, steps)
+            found = program.measured(replace(episodes, world=world))
+            plain = replace(world, state={name: value.clone() for name, value in world.state.items()})
+            wanted = program.measured(replace(episodes, world=plain))
+            assert torch.equal(found, wanted)
+            assert batch < 20 or found.any()
+            unpacked = program.simulator.step(episodes.world, steps).state
+            program.measured(replace(episodes, world=replace(world, state=unpacked)))
+            assert any(unpacked.has(name) for name in unpacked) is not on_planes
 
 
 def test_filling_boxes_of_a_packed_state(torch):

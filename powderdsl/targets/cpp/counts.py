@@ -77,6 +77,10 @@ class CellCounts:
             elif node.op == "const":
                 nothing = gate(_NOTHING)
                 places[node] = gate(_OPS["not"], nothing) if node.attr else nothing
+            elif node.op == "select":
+                condition, yes, no = (places[arg] for arg in node.args)
+                kept = gate(_OPS["and"], condition, yes), gate(_OPS["and"], gate(_OPS["not"], condition), no)
+                places[node] = gate(_OPS["or"], *kept)
             else:
                 places[node] = gate(_OPS[node.op], *(places[arg] for arg in node.args))
         ends = []
