@@ -109,7 +109,7 @@ reward: {each: EACH}
         ("count(not empty in drawn)", False),
         ("count(sand in west) + count(water in drawn)", False),
         ("count(count(sand) > 2)", False),
-        ("sum(velocity.column)", False),
+        ("sum(velocity.column) + count(sand)", False),
         ("sum(row mod 32 if sand else 0) + count(sand)", False),
     ],
 )
