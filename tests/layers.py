@@ -123,6 +123,7 @@ _TORCH = (
     "targets.words",
     "targets.torch.mixed",
     "targets.*.program",
+    "targets.cpp.counts",
     "simulation.native_start",
     "simulation.auto",
     "simulation.programs",
