@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
@@ -43,6 +44,20 @@ ELSEWHERE = {
 """Commands that have left the package."""
 
 
+_usual = warnings.formatwarning
+
+
+def plain_warning(message: Warning | str, category: type[Warning], *rest: Any, **options: Any) -> str:
+    """The text of a warning: our own in a sentence, others with the line that they come from."""
+    from powderdsl.targets.cpp.compilers import NoCompilerWarning
+
+    return (
+        f"note: {message}\n"
+        if issubclass(category, NoCompilerWarning)
+        else _usual(message, category, *rest, **options)
+    )
+
+
 class GuardedCommand(click.Command):
     """Turns every failure into an exit code."""
 
@@ -55,6 +70,7 @@ class GuardedCommand(click.Command):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")
         options["standalone_mode"] = False
+        warnings.formatwarning = plain_warning
         if os.environ.pop(LIFELINE, None):
             end_with_stdin()
         # Without arguments of a caller's, the command is all that this process does.

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from contextvars import copy_context
+from functools import cache
 
 from torch import Tensor
 
-from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
+from powderdsl.targets.cpp.compilers import INSTALL, MISSING, NoCompiler, NoCompilerWarning
 from powderdsl.targets.job import Job, Runnable
 
 WORTH = 2.0
@@ -163,7 +165,10 @@ class AutoProgram:
 
     def _begin(self) -> None:
         """Start to compile, unless a build has started. Concurrent callers do not wait."""
-        if self._problem or not self._beginning.acquire(blocking=False):
+        if self._problem:
+            _tell_of_compilers(self._problem)
+            return
+        if not self._beginning.acquire(blocking=False):
             return
         try:
             if self._native is None and (self._build is None or self._build.lost):
@@ -177,3 +182,12 @@ class AutoProgram:
         if self._native is None and build is not None:
             self._native, self._problem = build.program, build.problem or self._problem
         return self._native
+
+
+@cache
+def _tell_of_compilers(problem: str) -> None:
+    """Warn once in a process if work that is worth compiling meets no compiler. Other problems stand in `notes`."""
+    if problem.startswith(MISSING):
+        warnings.warn(
+            f"{problem}; native code is many times faster: {INSTALL}", NoCompilerWarning, stacklevel=2
+        )

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -18,6 +19,7 @@ import pytest
 import torch
 
 import powderdsl
+from powderdsl.cli.dispatch import plain_warning
 from powderdsl.compiler import lower
 from powderdsl.ir.text import print_program
 from powderdsl.model.fingerprint import fingerprint
@@ -27,7 +29,7 @@ from powderdsl.simulation.auto import AutoProgram
 from powderdsl.simulation.native_start import start_key
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.targets.cpp.compilers import NoCompiler
+from powderdsl.targets.cpp.compilers import NoCompiler, NoCompilerWarning
 from powderdsl.targets.job import Clock, Job
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
@@ -169,11 +171,17 @@ def test_without_native_code_arrays_go_on(problem: Exception, monkeypatch: pytes
         raise problem
 
     program = AutoProgram(lambda: Counter("arrays", 0.001, log), lambda: None, fails)
-    for start in range(50):
-        program.run(job(1, start))
+    auto._tell_of_compilers.cache_clear()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for start in range(50):
+            program.run(job(1, start))
+    wanted = "no C++ compiler: tried g++; native code is many times faster: install g++ or clang++, or "
+    sentences = [wanted + "`pip install powderdsl[native]`"] if isinstance(problem, NoCompiler) else []
+    assert [str(one.message) for one in told] == sentences, "once"
     assert len(asked) == 1
     assert str(problem) in program.notes[0]
-    assert "pip install ziglang" in program.notes[1]
+    assert "pip install powderdsl[native]" in program.notes[1]
 
 
 def test_threads_share_one_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -426,4 +434,10 @@ def test_run_says_what_ran_and_why(tmp_path: Path) -> None:
     native = command("run", "life", "--size", "8x8", "--backend", "native", CXX="no-such")
     assert native.exit_code == 2
     assert "PD701" in native.stderr
-    assert "pip install ziglang" in native.stderr
+    assert "pip install powderdsl[native]" in native.stderr
+
+
+def test_commands_tell_of_compilers_in_a_sentence() -> None:
+    ours = plain_warning(NoCompilerWarning("no C++ compiler"), NoCompilerWarning, "auto.py", 1)
+    assert ours == "note: no C++ compiler\n"
+    assert "auto.py:1: UserWarning: other" in plain_warning(UserWarning("other"), UserWarning, "auto.py", 1)

@@ -13,8 +13,16 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
-INSTALL = "install g++ or clang++, or `pip install ziglang`"
+INSTALL = "install g++ or clang++, or `pip install powderdsl[native]`"
 """What to do where there is no compiler."""
+
+
+MISSING = "no C++ compiler"
+"""How the messages of `NoCompiler` begin where none was found."""
+
+
+class NoCompilerWarning(UserWarning):
+    """The backend `auto` has work that is worth compiling, and no compiler."""
 
 
 class NoCompiler(Exception):
@@ -46,7 +54,7 @@ def _find(cxx: str, path: str) -> Compiler:
     try:
         candidates = [tuple(shlex.split(cxx))] if cxx.strip() else _usual()
     except ValueError as error:
-        raise NoCompiler(f"no C++ compiler: $CXX is `{cxx}`: {error}") from None
+        raise NoCompiler(f"{MISSING}: $CXX is `{cxx}`: {error}") from None
     tried = []
     for command in candidates:
         version = _version(command)
@@ -54,9 +62,9 @@ def _find(cxx: str, path: str) -> Compiler:
             return Compiler(command, _family(command, version), version)
         tried.append(" ".join(command))
     if cxx.strip():
-        raise NoCompiler(f"no C++ compiler: $CXX is `{cxx}`, which cannot be run")
+        raise NoCompiler(f"{MISSING}: $CXX is `{cxx}`, which cannot be run")
     missing = [] if len(candidates) > 3 else ["the package ziglang"]
-    raise NoCompiler("no C++ compiler: tried " + ", ".join(tried + missing))
+    raise NoCompiler(f"{MISSING}: tried " + ", ".join(tried + missing))
 
 
 def _usual() -> list[tuple[str, ...]]:
