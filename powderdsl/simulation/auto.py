@@ -16,6 +16,7 @@ from functools import cache
 
 from torch import Tensor
 
+from powderdsl.simulation.widths import ByWidth
 from powderdsl.targets.cpp.compilers import INSTALL, MISSING, NoCompiler, NoCompilerWarning
 from powderdsl.targets.job import Job, Runnable
 
@@ -191,3 +192,30 @@ def _tell_of_compilers(problem: str) -> None:
         warnings.warn(
             f"{problem}; native code is many times faster: {INSTALL}", NoCompilerWarning, stacklevel=2
         )
+
+
+class AutoByWidth(ByWidth[AutoProgram]):
+    """Chooses for each width of grids. What it tells is about the width stepped last.
+
+    Args:
+        words: what it tells about before the first step, see `known_words`.
+    """
+
+    def __init__(self, make: Callable[[int], AutoProgram], words: int):
+        super().__init__(make)
+        self._latest = self.of(words)
+
+    @property
+    def running(self) -> str:
+        """What the next step runs on: ``arrays`` or ``native``."""
+        return self._latest.running
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about which backend ran, and why."""
+        return self._latest.notes
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        self._latest = self.for_job(job)
+        return self._latest.run(job)

@@ -1,7 +1,10 @@
 """From a checked model to native code: cached code if the same model has been compiled before, else by lowering it.
 
-The cache's key depends on the model, on every source file that turns models into C++, on the compiler and the
-processor. Values of parameters are inputs of a step, so they take no part.
+Each width of grids has a library of its own, or shares one with others (`known_words`). A library is compiled when the
+first grid of its width is stepped, so that nobody waits for code that is not needed.
+
+The cache's key depends on the model, on every source file that turns models into C++, on the compiler, the processor
+and the width. Values of parameters are inputs of a step, so they take no part.
 """
 
 from __future__ import annotations
@@ -32,12 +35,15 @@ Lowered = Callable[[], Program]
 SOURCES = ("compiler.py", "simulation/native_start.py", "model", "analysis", "ir", "schedule", "targets")
 
 
-def start_key(ruleset: Ruleset) -> str:
-    """The cache's key for the native code of a ruleset. Raises NoCompiler if there is no compiler."""
+def start_key(ruleset: Ruleset, words: int | None = None) -> str:
+    """The cache's key for the native code of a ruleset; without `words`, for the code compiled last.
+
+    Raises NoCompiler if there is no compiler.
+    """
     compiler = find_compiler()
     params = tuple(replace(param, default=0, about="") for param in ruleset.params)
     said = fingerprint(replace(ruleset, params=params))
-    return cache_key(said + generator(), compiler, flags_for(compiler, current().level))
+    return cache_key(f"{said}{generator()} {words}", compiler, flags_for(compiler, current().level))
 
 
 @lru_cache(maxsize=1)
@@ -52,19 +58,25 @@ def generator() -> str:
     return found.hexdigest()
 
 
-def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable | None:
-    """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
+def latest_words(ruleset: Ruleset) -> int | None:
+    """What the code compiled last is for; None if there is none. Raises NoCompiler if there is no compiler."""
     code = recall(start_key(ruleset))
-    return None if code is None else _recalled(code, lowered, threads)
+    return None if code is None else code.words
 
 
-def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable:
+def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int, words: int) -> Runnable | None:
+    """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
+    code = recall(start_key(ruleset, words))
+    return None if code is None else _recalled(code, lowered, threads, words)
+
+
+def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, words: int) -> Runnable:
     """A program, from the cache or compiled now; passes that do not fit bit planes run on cells.
 
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.
     """
-    key = start_key(ruleset)
+    key = start_key(ruleset, words)
     code = recall(key)
     if code is None:
         with turn(current().place(), key):
@@ -73,24 +85,27 @@ def native_program(ruleset: Ruleset, lowered: Lowered, threads: int) -> Runnable
                 found = segments(lowered())
                 if len(found) > 1 or found[0].planes is None:
                     return mixed_program(
-                        found, torch.device("cpu"), lambda cells, planes: _compiled(cells, planes, threads)
+                        found,
+                        torch.device("cpu"),
+                        lambda cells, planes: _compiled(cells, planes, threads, words),
                     )
-                code = compile_program(found[0].program, found[0].planes)
+                code = compile_program(found[0].program, found[0].planes, words)
                 remember(key, code)
-    return _recalled(code, lowered, threads)
+                remember(start_key(ruleset), code)
+    return _recalled(code, lowered, threads, words)
 
 
-def _recalled(code: NativeCode, lowered: Lowered, threads: int) -> Runnable:
+def _recalled(code: NativeCode, lowered: Lowered, threads: int, words: int) -> Runnable:
     """The program of code for a whole ruleset, which is only lowered if its passes are timed."""
 
     def with_clocks() -> NativeCode:
         (segment,) = segments(lowered())
         assert segment.planes is not None
-        return compile_program(segment.program, segment.planes, clocks=True)
+        return compile_program(segment.program, segment.planes, words, clocks=True)
 
     return NativeProgram(code, threads, with_clocks)
 
 
-def _compiled(cells: Program, planes: Program, threads: int) -> Runnable:
-    code = compile_program(cells, planes)
-    return NativeProgram(code, threads, lambda: compile_program(cells, planes, clocks=True))
+def _compiled(cells: Program, planes: Program, threads: int, words: int) -> Runnable:
+    code = compile_program(cells, planes, words)
+    return NativeProgram(code, threads, lambda: compile_program(cells, planes, words, clocks=True))

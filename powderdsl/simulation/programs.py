@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 
 import torch
@@ -15,6 +15,7 @@ from powderdsl.ir.ops import Program
 from powderdsl.model import reference
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
+from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
 from powderdsl.targets.job import Job, Runnable
 
 
@@ -94,17 +95,22 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         with suppress(CompileError) if backend == "auto" else nullcontext():
             return CompiledProgram(cuda_program(lowered(), device), starting, "cuda")
     if backend == "auto" and device.type == "cpu":
-        from powderdsl.simulation.auto import AutoProgram
-        from powderdsl.simulation.native_start import native_program, ready_program
+        from powderdsl.simulation.auto import AutoByWidth, AutoProgram
+        from powderdsl.simulation.native_start import latest_words, native_program, ready_program
 
-        program = AutoProgram(
-            starting,
-            lambda: ready_program(ruleset, lowered, threads),
-            lambda: native_program(ruleset, lowered, threads),
-        )
-        if program.running == "arrays":
+        latest = None
+        with suppress(NoCompiler):
+            latest = latest_words(ruleset)
+        if latest is None:
             lowered()  # what cannot be lowered is reported before the first step
-        return program
+        return AutoByWidth(
+            lambda words: AutoProgram(
+                starting,
+                lambda: ready_program(ruleset, lowered, threads, words),
+                lambda: native_program(ruleset, lowered, threads, words),
+            ),
+            latest or 0,
+        )
     return starting()
 
 
@@ -126,18 +132,30 @@ def _array_program(program: Program, device: torch.device) -> Runnable:
 
 
 def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
-    from powderdsl.simulation.native_start import native_program
-    from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
+    """Native code for the width of each grid. Without a compiler, there is an error at once."""
+    from powderdsl.simulation.native_start import latest_words, native_program
+    from powderdsl.simulation.widths import ByWidth
 
-    if device.type == "cpu":
-        try:
-            return native_program(ruleset, lowered, threads)
-        except NoCompiler as error:
-            problem = str(error)
-            help = f"run on the backend `arrays`, or {INSTALL}"
-    else:
-        problem, help = "native code runs on the CPU", _ELSEWHERE.format(device)
-    raise _refusal("native", problem, help)
+    if device.type != "cpu":
+        raise _refusal("native", "native code runs on the CPU", _ELSEWHERE.format(device))
+    with _compiler_needed():
+        if latest_words(ruleset) is None:
+            lowered()  # what cannot be lowered is reported before the first step
+
+    def make(words: int) -> Runnable:
+        with _compiler_needed():
+            return native_program(ruleset, lowered, threads, words)
+
+    return ByWidth(make)
+
+
+@contextmanager
+def _compiler_needed() -> Iterator[None]:
+    try:
+        yield
+    except NoCompiler as error:
+        help = f"run on the backend `arrays`, or {INSTALL}"
+        raise _refusal("native", str(error), help) from None
 
 
 _ELSEWHERE = "run on the device `cpu`, or on the backend `torch` or `auto` on `{}`"

@@ -34,8 +34,8 @@ State = Mapping[str, Any]
 
 ORACLE = "reference"
 
-WIDTHS = (7, 31, 32, 33, 63, 64, 65, 97, 130)
-"""Columns of wide worlds: the borders of words of 32 and 64 columns, and more words than one."""
+WIDTHS = (7, 31, 32, 33, 63, 64, 64, 64, 65, 97, 128, 130)
+"""Columns of wide worlds: the borders of words of 32 and 64 columns, more words than one, and the width of most worlds."""
 
 MANY = 9
 """More worlds than native code runs side by side; one seed in eight has so many."""
@@ -117,6 +117,7 @@ def run_seed(seed: int, plan: Plan, tell: Callable[[tuple[str, int]], None] = la
             if problem is not None:
                 findings.append(Finding(seed, Case(text, start, plan.steps, backend), kind, problem))
                 break
+        _forget(plan.building.folder)
         if len(expected) < len(starts):
             break
     worlds = sum(len(start.ids) for start in starts)
@@ -138,6 +139,8 @@ def check_case(case: Case, how: Building) -> tuple[str, str] | None:
         problem = _problem(_simulator(case.text, case.backend, how), start, expected)
     except Exception as error:  # as above
         return type(error).__name__, _told(error)
+    finally:
+        _forget(how.folder)
     return None if problem is None else ("differs", problem)
 
 
@@ -168,10 +171,7 @@ def _compiled(ruleset: Ruleset, backend: str, how: Building, threads: int) -> Si
     if backend == EMULATED:
         return _emulated(ruleset, how.folder, order=threads % 2)
     with building(how):
-        simulator = compile_ruleset(ruleset, backend=backend, threads=threads if backend == "native" else 1)
-    if how.folder is not None:
-        _forget(how.folder)
-    return simulator
+        return compile_ruleset(ruleset, backend=backend, threads=threads if backend == "native" else 1)
 
 
 def _emulated(ruleset: Ruleset, folder: Path | None, order: int) -> Simulator:
@@ -182,9 +182,11 @@ def _emulated(ruleset: Ruleset, folder: Path | None, order: int) -> Simulator:
     return simulator
 
 
-def _forget(folder: Path) -> None:
-    """Remove the libraries that this process has just loaded: no other ruleset has the same, and they pile up."""
-    for entry in sorted(folder.iterdir()):
+def _forget(folder: Path | None) -> None:
+    """Remove the libraries that this process has loaded: no other ruleset has the same, and they pile up."""
+    for entry in sorted(folder.iterdir()) if folder is not None else ():
+        if entry.name.startswith("powderdsl-kernels-"):
+            continue  # still in use
         if entry.is_dir():
             shutil.rmtree(entry, ignore_errors=True)
         else:

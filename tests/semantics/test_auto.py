@@ -273,18 +273,25 @@ def test_auto_changes_over_to_the_same_worlds_and_remembers(
         assert other.running == "arrays"
 
 
+def compiled_natively(rules: Ruleset) -> None:
+    sim = powderdsl.compile(rules, backend="native")
+    sim.step(start_of(sim))
+
+
 @needs_compiler
 def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
     with building(Building("-O0", tmp_path)):
-        powderdsl.compile(rules, backend="native")
+        compiled_natively(rules)
         (library,) = tmp_path.glob("*/program")
-        (start,) = tmp_path.glob("*.json")
-        whole = start.read_bytes()
+        starts = sorted(tmp_path.glob("*.json"))  # of the width, and of the width compiled last
+        assert len(starts) == 2
+        whole = starts[0].read_bytes()
         for damage in (whole[:40], b"[]", b'{"library": 3}', whole.replace(b'"layout"', b'"lay"'), b"\xff"):
-            start.write_bytes(damage)
+            for start in starts:
+                start.write_bytes(damage)
             assert powderdsl.compile(rules).running == "arrays"
-            powderdsl.compile(rules, backend="native")
-            assert start.read_bytes() == whole
+            compiled_natively(rules)
+            assert [start.read_bytes() for start in starts] == [whole, whole]
             assert powderdsl.compile(rules).running == "native"
         # Another file, tried in a process of its own: this one has the library in memory.
         part = library.read_bytes()[:1000]
@@ -297,7 +304,9 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
             "from powderdsl.simulation.simulator import compile\n"
             "with building(Building('-O0', Path(sys.argv[1]))):\n"
             "    rules = load_text(sys.argv[2], 'kettle.yaml')\n"
-            "    print(compile(rules).running, compile(rules, backend='native').running, compile(rules).running)"
+            "    first, native = compile(rules).running, compile(rules, backend='native')\n"
+            "    native.step(native.world([[0] * 9]))\n"
+            "    print(first, native.running, compile(rules).running)"
         )
         run = subprocess.run(
             [sys.executable, "-c", program, str(tmp_path), RULES],

@@ -161,9 +161,7 @@ class _Loop:
                     f"{name}->live[l{name} * height + y] = some; some{name} |= some; }}"
                 )
             else:
-                starts.append(
-                    f"if (width & 63) ((u64*){name}->data)[(y * words + words - 1) * LANES + l] = 0;"
-                )
+                starts.append(f"if (!WORDS) ((u64*){name}->data)[(y * words + words - 1) * LANES + l] = 0;")
                 stores.append(
                     f"{{ const u32 o = {value}; put_bits((u64*){name}->data + (y * words + w) * LANES + l, x, o); }}"
                 )
@@ -174,8 +172,7 @@ class _Loop:
         ]
         return "\n".join([
             self.skipped(), " ".join([*rows, *starts]), f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
-            "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) {",
-            "const u32 inside = width - x >= CHUNK ? ALL : (1u << (width - x)) - 1; (void)inside;",
+            "EACH_CHUNK { const u32 inside = inside_of(x, width); (void)inside;",
             *values.lines, *stores, "} }", " ".join(ends),
         ])  # fmt: skip
 
@@ -269,10 +266,7 @@ class _Loop:
                 f"for (int w = 0; w < words; w++) if (const u64 m = ((const u64*){masks[level]}->data)"
                 "[(y * words + w) * LANES + l])"
             )
-            yield (
-                "for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK) "
-                "{ const u32 bits = m >> (x & 63) & ALL;"
-            )
+            yield "EACH_CHUNK { const u32 bits = m >> (x & 63) & ALL;"
             yield f"{' '.join([*values.lines, *stores])} }} }}"
         finish = " ".join(f"finish_row(c, row_of(c, {name}, l{name}, y));" for name in names)
         yield f"EACH_ACTIVE({first + count}) {{ {finish} }}\n}}"

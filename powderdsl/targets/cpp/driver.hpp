@@ -20,11 +20,16 @@ struct Batch {
 constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES worlds is too large to be kept near
 // Strips waste no lanes where there are few worlds, and keep less at hand where worlds are large.
 static Grid make_grid(int worlds, int height, int width) {
-  const int words = (width + 63) / 64, stride = (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO);
+  const int words = (width + 63) / 64;
   const bool large = sizeof(V) * height * words >= LARGE_PLANE;
   const bool reachable = height / LANES >= std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
   const bool strips = height % LANES == 0 && reachable && (worlds <= LANES / 2 || large);
-  return Grid{strips ? height / LANES : height, width, words, stride, strips};
+  Grid g;
+  g.height = strips ? height / LANES : height, g.strips = strips;
+#if !WORDS
+  g.width = width, g.words = words, g.stride = stride_of(width);
+#endif
+  return g;
 }
 static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int x) {
   if (g.strips) y += lane * g.height;
@@ -37,18 +42,20 @@ static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int 
 static Context* new_context(const Grid& g) {
   Context* c = new (std::align_val_t(64)) Context();
   c->g = g;
-  c->rest = g.width - 64 * (g.words - 1);
   c->near_rows = g.stride > 512 ? 8 : 16;
   c->near_bits = (1u << c->near_rows) - 1;
   c->block = g.strips && REAL_ROWS <= c->near_rows ? c->near_rows : g.height;
+#if !WORDS
+  c->rest = g.width - 64 * (g.words - 1);
   c->valid_last = splat(c->rest == 64 ? ~0ull : (1ull << c->rest) - 1);
+  for (int dx = -HALO; dx <= HALO; dx++) c->turns[dx + HALO] = ((dx % g.width) + g.width) % g.width;
+#endif
   const int whole = g.world_height();
   for (int y = -HALO; y < whole + HALO; y++) c->lines.push_back(((y % whole) + whole) % whole);
   for (int y = -HALO; y < g.height + HALO; y++) {
     if (!g.strips) c->wrapped.push_back(c->lines[y + HALO] * g.words);
     else c->wrapped.push_back(y < 0 ? g.above(y) : y < g.height ? y * g.words : g.below(y));
   }
-  for (int dx = -HALO; dx <= HALO; dx++) c->turn[dx + HALO] = ((dx % g.width) + g.width) % g.width;
   c->nothing = new Plane{aligned<V>(g.cells() + g.halos()), 1, true, 0, 0};
   c->everything = new Plane{aligned<V>(g.cells() + g.halos()), 1, false, 0, 0};
   for (int i = 0; i < g.cells(); i++) c->everything->data[i] = c->valid(i % g.words);
@@ -293,7 +300,9 @@ static Batch* new_batch(int worlds, const Grid& g) {
   }
   return b;
 }
-API void* pd_new(int worlds, int height, int width) { return new_batch(worlds, make_grid(worlds, height, width)); }
+API void* pd_new(int worlds, int height, int width) {  // of a width that the library is for
+  return new_batch(worlds, make_grid(worlds, height, width));
+}
 API void pd_free(void* batch) {
   Batch* b = (Batch*)batch;
   for (Group& group : b->groups) {

@@ -81,6 +81,9 @@ ALWAYS bool is_active(const Context& c, int list, int lane, int y) {
     for (int part = 0; part <= ((last_part) & strips); part++) \
       if (const int done = round - 2 * part, block = (done + part) % blocks; done >= 0 && done < blocks) \
         if (const int first = block * c.block, last = block == blocks - 1 ? height : first + c.block; true)
+// Chunks of the columns in word w, and which of a chunk's columns lie in the grid.
+#define EACH_CHUNK for (int x = 64 * w; x < 64 * w + 64 && (WORDS || x < width); x += CHUNK)
+ALWAYS u32 inside_of(int x, int width) { return WORDS || width - x >= CHUNK ? ALL : (1u << (width - x)) - 1; }
 // The flags of a chunk, into one world's word, which is kept little end first.
 ALWAYS void put_bits(u64* word, int x, u32 bits) {
 #if __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__

@@ -22,9 +22,9 @@ ALWAYS V columns(const Context& c, const V* row, int w, int dx) {
     if (dx > 0) return ((row[w] >> dx) | (row[next] << (columns_in(c, w) - dx))) & c.valid(w);
     return ((row[w] << -dx) | (row[next] >> (columns_in(c, next) + dx))) & c.valid(w);
   }
-  int by = c.turn[dx + HALO];
+  const int by = c.turn(dx);
   V x = row[0];
-  return by ? ((x >> by) | (x << (c.g.width - by))) & c.valid_last : x;
+  return by ? ((x >> by) | (x << (c.g.width - by))) & c.valid(0) : x;
 }
 ALWAYS V columns_zero(const Context& c, const V* row, int w, int dx) {
   V x = dx > 0 ? row[w] >> dx : row[w] << -dx;
@@ -249,7 +249,7 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
     own(c, p);
     data[n++] = p->data;
   }
-  const int words = c.g.words, by = c.turn[dx + HALO], back = c.g.width - by;
+  const int words = c.g.words, by = c.turn(dx), back = c.g.width - by;
   for (int y = 0; y < c.g.height; y++) {
     const V* m = movers->data + y * words;
     if (c.g.strips && (u32)(y + dy) >= (u32)c.g.height) {
@@ -278,7 +278,7 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
         const V a = data[k][here], b = data[k][there];
         const V d = (a ^ (by ? (b >> by) | (b << back) : b)) & m[w];
         data[k][here] = a ^ d;
-        data[k][there] ^= by ? ((d << by) | (d >> back)) & c.valid_last : d;  // read again: it may be the same row
+        data[k][there] ^= by ? ((d << by) | (d >> back)) & c.valid(0) : d;  // read again: it may be the same row
       }
     }
   }
@@ -287,9 +287,9 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
 // anything arrives there, and what goes around the edge arrives last.
 template <Leaves LEAVES, bool AROUND>
 ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, int there, const V* m, const V* targets, int dx) {
-  const int words = c.g.words, by = c.turn[-dx + HALO], back = c.g.width - by;
+  const int words = c.g.words, by = c.turn(-dx), back = c.g.width - by;
   if (__builtin_expect(words == 1, 1)) {
-    const V gone = m[0], keeps = ~targets[0], valid = c.valid_last;
+    const V gone = m[0], keeps = ~targets[0], valid = c.valid(0);
     for (int k = 0; k < count; k++) {
       const V a = data[k][here], moving = a & gone;
       const V arriving = by ? ((moving >> by) | (moving << back)) & valid : moving;

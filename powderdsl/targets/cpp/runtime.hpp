@@ -13,8 +13,16 @@ struct Field {
   bool still;  // known to have no such row
 };
 
+constexpr int stride_of(int width) { return (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO); }
+// WORDS is the number of words in a row if the library is for rows of that many whole words alone, else 0. Most work is
+// loops over the words of a row and over columns: where their number is known, they cost a quarter less and compile faster.
 struct Grid {
-  int height, width, words, stride;  // height of a lane
+  int height;  // of a lane
+#if WORDS
+  static constexpr int width = 64 * WORDS, words = WORDS, stride = stride_of(width);
+#else
+  int width, words, stride;
+#endif
   bool strips;
   int cells() const { return height * words; }
   // Strips have halos: behind the rows of a plane lie those above and below on the torus, then the bare ones.
@@ -28,14 +36,11 @@ struct Grid {
 // Everything one thread needs to run groups: buffers, row tables, keys.
 struct Context {
   Grid g;
-  int rest;       // columns in the last word of a row
   int near_rows;  // of reals, that a near cache holds while several loops pass over them
   u32 near_bits;  // as many ones
   int block;      // rows that one sweep takes before the next
-  V valid_last;
   std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
   std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus
-  int turn[2 * HALO + 1];    // dx mod width, for rotations
   std::vector<Plane*> planes, all_planes;
   std::vector<Field*> fields, all_fields;
   Plane *nothing, *everything;
@@ -54,7 +59,17 @@ struct Context {
   int lanes;
   u64 present;  // the ids that are there, of those that passes ask for; all bits: not known
 
+#if WORDS
+  static constexpr int rest = 64;
+  V valid(int) const { return splat(~0ull); }
+  int turn(int dx) const { return ((dx % g.width) + g.width) % g.width; }
+#else
+  int rest;  // columns in the last word of a row
+  V valid_last;
   V valid(int w) const { return w == g.words - 1 ? valid_last : splat(~0ull); }
+  int turns[2 * HALO + 1];
+  int turn(int dx) const { return turns[dx + HALO]; }  // dx mod width, for rotations
+#endif
   int row(int y) const { return wrapped[y + HALO]; }
   // Rows of a field: the row y of a lane, around the edges of the world; and whether there is such a row.
   int line(int lane, int y) const {

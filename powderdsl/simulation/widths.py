@@ -1,0 +1,44 @@
+"""Native code by the width of grids: each width has a library of its own, or shares one with others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Generic, TypeVar
+
+from torch import Tensor
+
+from powderdsl.targets.cpp.build import building, current
+from powderdsl.targets.cpp.program import PackedState
+from powderdsl.targets.cpp.source import known_words
+from powderdsl.targets.job import Job, Runnable
+
+Program_ = TypeVar("Program_", bound=Runnable)
+
+
+class ByWidth(Generic[Program_]):
+    """A program for each number of words in a row (`known_words`), made when the first such grid comes.
+
+    It is built with the settings that are in effect now.
+    """
+
+    def __init__(self, make: Callable[[int], Program_]):
+        self._make, self._how = make, current()
+        self._made: dict[int, Program_] = {}
+
+    def of(self, words: int) -> Program_:
+        """The program for a number of words."""
+        made = self._made.get(words)
+        if made is None:
+            with building(self._how):
+                made = self._made.setdefault(words, self._make(words))
+        return made
+
+    def for_job(self, job: Job) -> Program_:
+        """The program that runs a job."""
+        state = job.state
+        shape = state.like["element"][1] if isinstance(state, PackedState) else state["element"].shape
+        return self.of(known_words(shape[-1]))
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        return self.for_job(job).run(job)
