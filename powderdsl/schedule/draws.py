@@ -88,7 +88,7 @@ def cheap_questions(schedule: Schedule) -> Schedule:
 def conditions(schedule: Schedule) -> Schedule:
     """Draws get a last argument: the condition under which their result is read. Elsewhere the result is undefined.
 
-    `busy & chance(s)` → `busy & chance(s, busy)`.
+    `busy & chance(s)` → `busy & chance(s, busy)`; `busy ? chance(s) : a` → `busy ? chance(s, busy) : a`.
     """
     return map_computes(schedule, lambda statement: [_with_conditions(statement, schedule.graph)])
 
@@ -111,17 +111,28 @@ def _with_conditions(statement: Compute, graph: Graph) -> Compute:
                 for other in node.args:
                     if node.op == "and" and not random[id(other)] and len(flags) < MAX_CONDITIONS:
                         flags[id(other)] = other
+                if node.op == "select" and not random[id(node.args[0])] and len(flags) < MAX_CONDITIONS:
+                    chosen = _chosen(node, arg, graph)
+                    flags[id(chosen)] = chosen
                 known = where.get(id(arg), flags)
                 where[id(arg)] = {key: flag for key, flag in known.items() if key in flags}
     done: dict[int, Node] = {}
-    for node in sorted(nodes, key=lambda node: random[id(node)]):  # conditions contain no draws
+    for node in nodes:
         args = [done[id(arg)] for arg in node.args]
         flags = {} if id(node) in fixed else where.get(id(node), {})  # a variable's value is read everywhere
-        asked = [done[id(flag)] for flag in flags.values()]
+        asked = list(flags.values())
         if node.op in DRAWS and takes_bits(node) and asked:
             args.append(combined("and", asked, graph))
         done[id(node)] = with_args(node, tuple(args), graph)
     return replace(statement, outs=tuple(replace(out, value=done[id(out.value)]) for out in statement.outs))
+
+
+def _chosen(node: Node, arg: Node, graph: Graph) -> Node:
+    """Where a choice reads one of its two values: its condition or the opposite; everywhere, if both are that value."""
+    condition, yes, no = node.args
+    if yes is no:
+        return graph.node("const", FLAG, (), True)
+    return condition if arg is yes else graph.node("not", FLAG, (condition,))
 
 
 def asked_for(draw: Node, where: Node, graph: Graph) -> Node:

@@ -18,6 +18,8 @@ class Layout:
     param_reals: dict[str, int] = field(default_factory=dict)
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
+    coins: dict[int, int] = field(default_factory=dict)
+    """By stream: the draws of one bit, each of which is made once a step."""
     active: int = 0
     """The largest number of lists of active rows in a pass."""
     moving: int = 0

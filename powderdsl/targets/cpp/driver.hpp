@@ -65,6 +65,7 @@ static Context* new_context(const Grid& g) {
   c->late = aligned<V>((MOVING + 1) * g.words);
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
   c->active = aligned<u64>((size_t)(ACTIVE + 1) * LANES * c->active_words());
+  for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells()), c->tossed[i].resize(g.height);
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
     for (int y = 0; y < g.height; y++)
@@ -86,6 +87,7 @@ static void free_context(Context* c) {
   free(c->zeros);
   free(c->active);
   for (V* p : c->fixed) free(p);
+  for (int i = 0; i < COINS; i++) free(c->coins[i]);
   c->~Context();
   operator delete(c, std::align_val_t(64));
 }
@@ -156,6 +158,7 @@ static void begin_step(Context& c, const Clocks& k, int number, long done) {
       c.k0[s][2 * l] = c.k0[s][2 * l + 1] = a + l * strip * 0x9E3779B1u;  // as draw_plane multiplies
       c.k1[s][2 * l] = c.k1[s][2 * l + 1] = b;
     }
+  for (int i = 0; i < COINS; i++) std::fill(c.tossed[i].begin(), c.tossed[i].end(), 0);
   for (int i = 0; i < STEP_PLANES; i++)
     for (int l = 0; l < LANES; l++) {
       u64 step = k.step[world_of(c, number, l)] + done;

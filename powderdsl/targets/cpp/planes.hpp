@@ -99,31 +99,52 @@ ALWAYS V draw_plane(const Context& c, int stream, int y, int w, int j) {
   h ^= h >> 16;
   return (V)h;
 }
+// Several planes at once, since the multiplications of one wait for each other.
+constexpr int AHEAD = 4;
+#define EACH_AHEAD _Pragma("GCC unroll 4") for (int i = 0; i < AHEAD; i++)
+struct Drawn { V plane[AHEAD]; };
+ALWAYS Drawn draw_planes(const Context& c, int stream, int y, int w, int first) {
+  Drawn d;
+  EACH_AHEAD d.plane[i] = draw_plane(c, stream, y, w, first + i);
+  return d;
+}
+// Of the cells still open, those whose draw has a 0 where the limit has a 1 are below it; equal bits leave a cell open.
+ALWAYS void compare_bit(V& below, V& open, V drawn, V limit) {
+  below |= open & limit & ~drawn;
+  open &= ~(limit ^ drawn);
+}
+ALWAYS V limit_bit(u64 limit, int bits, int j) { return splat(0 - (limit >> (bits - 1 - j) & 1)); }
 // Which of the wanted cells draw below a constant; stops when all are decided.
 OUTLINE V draw_below(const Context& c, int stream, int y, int w, V wanted, int bits, u64 limit) {
   V below = splat(0), open = wanted;
-  int last = bits - __builtin_ctzll(limit);
-  for (int j = 0; j < last; j++) {
-    V p = draw_plane(c, stream, y, w, j);
-    if (limit >> (bits - 1 - j) & 1) {
-      below |= open & ~p;
-      open &= p;
-    } else {
-      open &= ~p;
-    }
-    if (!any(open)) break;
+  int j = 0;
+  const int last = bits - __builtin_ctzll(limit);
+  for (; j + AHEAD <= last && any(open); j += AHEAD) {
+    const Drawn d = draw_planes(c, stream, y, w, j);
+    EACH_AHEAD compare_bit(below, open, d.plane[i], limit_bit(limit, bits, j + i));
   }
+  for (; j < last && any(open); j++) compare_bit(below, open, draw_plane(c, stream, y, w, j), limit_bit(limit, bits, j));
   return below;
 }
 // The same with a limit given plane by plane, most significant (the carry) first.
 OUTLINE V draw_below_planes(const Context& c, int stream, int y, int w, V wanted, int bits, const V* limit) {
   V below = wanted & limit[0], open = wanted & ~limit[0];
-  for (int j = 0; j < bits && any(open); j++) {
-    V p = draw_plane(c, stream, y, w, j), t = limit[1 + j];
-    below |= open & t & ~p;
-    open &= ~(t ^ p);
+  int j = 0;
+  for (; j + AHEAD <= bits && any(open); j += AHEAD) {
+    const Drawn d = draw_planes(c, stream, y, w, j);
+    EACH_AHEAD compare_bit(below, open, d.plane[i], limit[1 + j + i]);
   }
+  for (; j < bits && any(open); j++) compare_bit(below, open, draw_plane(c, stream, y, w, j), limit[1 + j]);
   return below;
+}
+// A row of the highest bit of a draw. Many masks ask for it, in several passes: it is made once a step.
+ALWAYS const V* coin_row(Context& c, int coin, int stream, int y) {
+  V* row = c.coins[coin] + y * c.g.words;
+  if (!c.tossed[coin][y]) {
+    c.tossed[coin][y] = 1;
+    for (int w = 0; w < c.g.words; w++) row[w] = draw_plane(c, stream, y, w, 0);
+  }
+  return row;
 }
 // A draw of one world's cell as float32.
 OUTLINE float draw_cell(const Context& c, int stream, int lane, int y, int x, int bits) {

@@ -50,6 +50,8 @@ struct Context {
   u64* active;  // lists of rows, a bit each: [ACTIVE][LANES][active_words]
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
+  V* coins[COINS + 1];  // planes, filled row by row when they are asked for
+  std::vector<uint8_t> tossed[COINS + 1];  // the rows that this step has filled
   V step_bits[STEP_PLANES + 1];
   V param_bits[PARAM_PLANES + 1];
   float param_real[PARAM_REALS + 1][LANES];

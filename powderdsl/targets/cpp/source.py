@@ -76,6 +76,7 @@ def native_source(program: Program, words: int = 0) -> NativeSource:
         f"#define PARAM_PLANES {len(layout.param_planes)}",
         f"#define PARAM_REALS {len(layout.param_reals)}",
         f"#define SLOTS {len(layout.planes)}",
+        f"#define COINS {len(layout.coins)}",
         f"#define REALS {len(layout.reals)}",
         f"#define MOVING {layout.moving}",
         f"#define ACTIVE {layout.active}",

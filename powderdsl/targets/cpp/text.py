@@ -8,7 +8,7 @@ from powderdsl.ir.ops import FLAG, REAL, Node
 from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import Compute, Forget, Guard, Move, Release, Schedule, Statement, Sweeps, Var
 from powderdsl.targets.cpp.cells import sweeps_text
-from powderdsl.targets.layout import Layout, param_key
+from powderdsl.targets.layout import Layout, number, param_key
 from powderdsl.targets.values import WordValues
 
 _LOGIC = {"and": "&", "or": "|", "xor": "^"}
@@ -95,12 +95,12 @@ class _Printer:
     def leave(self, schedule: Schedule) -> Iterator[str]:
         """The new values of slots; all are read before any is stored."""
         left = []
-        for number, (slot, node) in enumerate(schedule.leaves):
+        for i, (slot, node) in enumerate(schedule.leaves):
             value = node.attr if node.op == "load" else "c.everything" if node.attr else "c.nothing"
-            yield f"{'Field' if node.type == REAL else 'Plane'}* s{number} = keep({value});"
+            yield f"{'Field' if node.type == REAL else 'Plane'}* s{i} = keep({value});"
             left.append(self.slot(slot, Var(value, node.type)))
-        for number, place in enumerate(left):
-            yield f"if ({place}) give(c, {place}); {place} = s{number};"
+        for i, place in enumerate(left):
+            yield f"if ({place}) give(c, {place}); {place} = s{i};"
         names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
         yield " ".join(f"give(c, {name});" for name in names)
 
@@ -308,6 +308,9 @@ class _Words(WordValues):
             case "chance":
                 stream, bits, limit = attr
                 wanted = self.clean(node.args[0]) if args else "valid"
+                if limit == 1 << bits - 1:
+                    coin = number(self.layout.coins, self.layout.streams[stream])
+                    return f"{wanted} & ~coin_row(c, {coin}, {self.layout.streams[stream]}, y)[w]"
                 return f"draw_below(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, {limit}ull)"
             case "below_planes":
                 bits = attr[1]
@@ -315,17 +318,23 @@ class _Words(WordValues):
             case "below_param":
                 _, bits, name, view = attr
                 numbers = [self.layout.param_planes[name, view, i] for i in range(bits, -1, -1)]
-                return self.below(node, [f"c.param_bits[{number}]" for number in numbers], node.args)
+                limit = [f"c.param_bits[{number}]" for number in numbers]
+                return self.below(node, limit, node.args, numbers)
             case "not":
                 return f"~{args[0]}"
             case "select":
                 return f"mux({', '.join(args)})"
         raise AssertionError(f"no C++ kernel for {node.op}")
 
-    def below(self, node: Node, limit: Sequence[str], where: Sequence[Node]) -> str:
-        """A draw below a limit, given plane by plane from the highest."""
+    def below(
+        self, node: Node, limit: Sequence[str], where: Sequence[Node], numbers: Sequence[int] = ()
+    ) -> str:
+        """A draw below a limit, given plane by plane from the highest. `numbers`: where they lie among parameters."""
         stream, bits = node.attr[:2]
         wanted = self.clean(where[0]) if where else "valid"
+        first = numbers[0] if numbers else -1
+        if numbers and list(numbers) == list(range(first, first + bits + 1)):
+            return f"draw_below_planes(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, c.param_bits + {first})"
         self.count += 1
         name = f"limit{self.count}"
         self.lines.append(f"const V {name}[] = {{{', '.join(limit)}}};")
