@@ -27,7 +27,7 @@ def empty(schedule: Schedule) -> Schedule:
     graph = schedule.graph
 
     def change(loop: Compute) -> list[Statement]:
-        if loop.over != "words":
+        if loop.over != "words" or loop.region is not None:
             return [loop]
         whole = [out for out in loop.outs if is_whole(out.value)]
         rest = tuple(out for out in loop.outs if not is_whole(out.value))

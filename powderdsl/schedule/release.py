@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from powderdsl.schedule.types import (
     ANSWER,
+    Compute,
     Guard,
     Move,
     Release,
@@ -22,9 +23,9 @@ from powderdsl.schedule.types import (
 
 
 def release(schedule: Schedule) -> Schedule:
-    """Every variable is released exactly once, even if nothing reads it; moving planes overwrite old ones that end.
+    """Every variable is released exactly once, even if nothing reads it; planes overwrite old ones that end.
 
-    `swap by m: b = a`, where `a` is not read again → `b = a into a`.
+    `swap by m: b = a`, where `a` is not read again → `b = a into a`; the same where a loop over words changes some words.
     """
     live = set(loaded(node for _, node in schedule.leaves))
     body = _block(schedule.body, live)
@@ -51,6 +52,9 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
         elif isinstance(statement, Move):
             statement = _in_place(statement, after)
             gone -= {str(plane.old.attr) for plane in statement.planes if plane.into}
+        elif isinstance(statement, Compute) and statement.region is not None:
+            statement = _updated(statement, after)
+            gone -= {out.into for out in statement.outs if out.into is not None}
         elif isinstance(statement, Sweeps):
             gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
         result.append(statement)
@@ -69,6 +73,16 @@ def _in_place(move: Move, after: set[str]) -> Move:
         for plane in move.planes
     )
     return replace(move, planes=tuple(planes))
+
+
+def _updated(loop: Compute, after: set[str]) -> Compute:
+    olds = Counter(str(out.otherwise.attr) for out in loop.outs if out.otherwise is not None)
+    outs = []
+    for out in loop.outs:
+        old = str(out.otherwise.attr) if out.otherwise is not None else ""
+        ends = old and old not in after and olds[old] == 1
+        outs.append(replace(out, into=old) if ends else out)
+    return replace(loop, outs=tuple(outs))
 
 
 def _names(statement: Statement) -> set[str]:

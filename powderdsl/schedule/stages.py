@@ -26,6 +26,7 @@ from powderdsl.schedule.release import release
 from powderdsl.schedule.rewrite import without_unread
 from powderdsl.schedule.share import share
 from powderdsl.schedule.types import Schedule
+from powderdsl.schedule.updates import updates
 from powderdsl.schedule.verify import verify
 
 
@@ -97,6 +98,11 @@ CPP = (
         "where loops over rows begin and end, and which movements happen in place",
     ),
     Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),
+    Stage(
+        "updates",
+        updates,
+        "which planes change only where a mask holds; before `empty`, which takes loops apart",
+    ),
     Stage("empty", empty, "which loops over words give nothing because a plane is empty"),
     Stage("narrow", narrow, "in which cells a loop has anything to do"),
     Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read"),

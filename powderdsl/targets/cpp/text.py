@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from powderdsl.ir.ops import FLAG, REAL, Node
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node
 from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import Compute, Forget, Guard, Move, Release, Schedule, Statement, Sweeps, Var
+from powderdsl.schedule.updates import asked, is_cleared
 from powderdsl.targets.cpp.cells import sweeps_text
 from powderdsl.targets.layout import Layout, number, param_key
 from powderdsl.targets.values import WordValues
@@ -20,7 +21,7 @@ LOOP = (
 
 def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
     """The function of a pass."""
-    printer = _Printer(layout)
+    printer = _Printer(layout, schedule.graph)
     changed = {slot for slot, _ in schedule.leaves}
     lines = []
     if schedule.when is not None:
@@ -59,8 +60,8 @@ def answer(node: Node) -> str:
 
 
 class _Printer:
-    def __init__(self, layout: Layout):
-        self.layout = layout
+    def __init__(self, layout: Layout, graph: Graph):
+        self.layout, self.graph = layout, graph
         self.active = 0
         """The number of lists of active rows used so far."""
 
@@ -76,6 +77,8 @@ class _Printer:
                 case Compute((out,), _, "words") if is_whole(out.value):
                     type = "" if out.var.name in declared else "Plane* "
                     yield f"{type}{out.var.name} = {whole(out.value, self.layout)};"
+                case Compute() if statement.region is not None:
+                    yield from self.update(statement, declared)
                 case Compute():
                     yield from self.words(statement, declared)
                 case Sweeps():
@@ -152,6 +155,24 @@ class _Printer:
             call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(targets)});"
             yield f"{{ Plane** const all[] = {{{', '.join(targets)}}}; {call} }}"
 
+    def update(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
+        """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""
+        values = _Words(self.layout)
+        for out in loop.outs:
+            assert out.otherwise is not None
+            name, old = out.var.name, str(out.otherwise.attr)
+            values.places[old] = name
+            yield f"{'' if name in declared else 'Plane* '}{name} = {old if out.into else f'keep({old})'};"
+        masks = [str(node.attr) for node in asked(loop)]
+        yield f"if ({' || '.join(f'!{mask}->zero' for mask in masks)}) {{"
+        for out in loop.outs:
+            name = out.var.name
+            change = f"own(c, {name}); {name}->zero = false;"
+            yield f"if (!{name}->zero) {{ {change} }}" if is_cleared(out, self.graph) else change
+        some = " | ".join(f"{mask}->data[i]" for mask in masks)
+        stores = [f"{out.var.name}->data[i] = {values.clean(out.value)};" for out in loop.outs]
+        yield "\n".join([LOOP, f"if (!any({some})) continue;", *values.lines, *stores, "} }"])
+
     def words(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
         names = [out.var.name for out in loop.outs]
         values = _Words(self.layout)
@@ -223,6 +244,8 @@ class _Words(WordValues):
         self.edges: dict[tuple[str, str], int] = {}
         """The largest distance in rows at which a plane is read, by the function that prepares such rows and the plane."""
         self.clear: dict[int, bool] = {}
+        self.places: dict[str, str] = {}
+        """The planes that hold the old values of planes which are changed in place."""
 
     def ready(self) -> str:
         """Statements before the loop that prepare the rows of other strips."""
@@ -291,7 +314,7 @@ class _Words(WordValues):
             return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
         match node.op:
             case "load":
-                return f"{attr}->data[y * words + w]"
+                return f"{self.places.get(str(attr), attr)}->data[y * words + w]"
             case "shift":
                 return self.shift(node)
             case "const":
