@@ -63,6 +63,8 @@ static Context* new_context(const Grid& g) {
   c->nothing_row = aligned<V>(g.words);
   c->change = aligned<V>(2 * g.words);
   c->late = aligned<V>((MOVING + 1) * g.words);
+  c->entered = aligned<V>(g.height);
+  c->moving.resize(g.height + 1);
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
   c->active = aligned<u64>((size_t)(ACTIVE + 1) * LANES * c->active_words());
   for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells()), c->tossed[i].resize(g.height);
@@ -84,6 +86,7 @@ static void free_context(Context* c) {
   free(c->nothing_row);
   free(c->change);
   free(c->late);
+  free(c->entered);
   free(c->zeros);
   free(c->active);
   for (V* p : c->fixed) free(p);

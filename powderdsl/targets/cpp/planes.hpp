@@ -227,6 +227,76 @@ static void own(Context& c, Plane*& p) {
 }
 // Planes that move together, in place.
 enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
+// Rows of one word, not in strips: every row that changes is read and written once. What leaves it for the next one waits
+// in a register, and a few planes go together, since each waits for what it reads.
+constexpr int TOGETHER = 4;
+#define EACH_PLANE _Pragma("GCC unroll 4") for (int k = 0; k < N; k++)
+ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && !c.g.strips && abs(dy) <= 1; }
+template <bool TURNS> ALWAYS V around(V x, int by) { return TURNS ? (x >> by) | (x << (64 - by)) : x; }
+template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {  // `by` columns to the left on the torus
+  if (WORDS || !TURNS) return around<TURNS>(x, by);
+  return ((x >> by) | (x << (c.g.width - by))) & c.valid(0);
+}
+// The rows that movers leave or enter, in the direction in which they move, and the cells that they enter.
+template <bool TURNS> ALWAYS int rows_of(Context& c, const V* m, int dy, int back) {
+  const int height = c.g.height;
+  int count = 0, y = dy < 0 ? height - 1 : 0, before = dy > 0 ? height - 1 : 0;  // the row that moves into row y
+  for (int i = 0; i < height; i++) {
+    const V from = dy ? m[before] : m[y];
+    c.entered[y] = around<TURNS>(c, from, back);
+    c.moving[count] = y;
+    count += any(from | m[y]);
+    before = y;
+    y += dy < 0 ? -1 : 1;
+  }
+  return count;
+}
+template <int N, bool TURNS> ALWAYS void swap_near(const Context& c, V* const* data, const V* m, int rows, int dy, int by, int back) {
+  const int edge = dy > 0 ? c.g.height - 1 : 0, first = dy > 0 ? 0 : c.g.height - 1;
+  V comes[N], last[N];
+  if (dy)
+    EACH_PLANE {
+      last[k] = (data[k][edge] ^ around<TURNS>(c, data[k][first], by)) & m[edge];
+      comes[k] = around<TURNS>(c, last[k], back);
+    }
+  for (int i = 0; i < rows; i++) {
+    const int y = c.moving[i];
+    const V gone = m[y];
+    EACH_PLANE {
+      const V a = data[k][y];
+      const V d = dy && y == edge ? last[k] : (a ^ around<TURNS>(c, data[k][y + dy], by)) & gone;
+      const V goes = around<TURNS>(c, d, back);
+      data[k][y] = a ^ d ^ (dy ? comes[k] : goes);
+      comes[k] = goes;
+    }
+  }
+}
+template <int N, Leaves LEAVES, bool TURNS> ALWAYS void arrive_near(const Context& c, V* const* data, const V* m, int rows, int dy, int back) {
+  const int edge = dy > 0 ? c.g.height - 1 : 0;
+  V comes[N];
+  if (dy) EACH_PLANE comes[k] = data[k][edge] & m[edge];
+  for (int i = 0; i < rows; i++) {
+    const int y = c.moving[i];
+    const V gone = m[y], entered = c.entered[y];
+    EACH_PLANE {
+      const V a = data[k][y], goes = a & gone, left = LEAVES == NOTHING ? a & ~gone : LEAVES == EVERYTHING ? a | gone : a;
+      data[k][y] = mux(entered, around<TURNS>(c, dy ? comes[k] : goes, back), left);
+      comes[k] = goes;
+    }
+  }
+}
+template <bool TURNS> ALWAYS void swap_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int by, int back) {
+  const int rows = rows_of<TURNS>(c, m, dy, back);
+  int k = 0;
+  for (; k + TOGETHER <= count; k += TOGETHER) swap_near<TOGETHER, TURNS>(c, data + k, m, rows, dy, by, back);
+  for (; k < count; k++) swap_near<1, TURNS>(c, data + k, m, rows, dy, by, back);
+}
+template <Leaves LEAVES, bool TURNS> ALWAYS void arrive_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int back) {
+  const int rows = rows_of<TURNS>(c, m, dy, back);
+  int k = 0;
+  for (; k + TOGETHER <= count; k += TOGETHER) arrive_near<TOGETHER, LEAVES, TURNS>(c, data + k, m, rows, dy, back);
+  for (; k < count; k++) arrive_near<1, LEAVES, TURNS>(c, data + k, m, rows, dy, back);
+}
 // A row that exchanges with one of other strips, `by` of them on.
 OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int by, int dx) {
   const int words = c.g.words;
@@ -271,6 +341,11 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
     data[n++] = p->data;
   }
   const int words = c.g.words, by = c.turn(dx), back = c.g.width - by;
+  if (near_rows(c, dy)) {
+    if (by) swap_near_rows<true>(c, data, n, movers->data, dy, by, back);
+    else swap_near_rows<false>(c, data, n, movers->data, dy, by, back);
+    return;
+  }
   for (int y = 0; y < c.g.height; y++) {
     const V* m = movers->data + y * words;
     if (c.g.strips && (u32)(y + dy) >= (u32)c.g.height) {
@@ -368,6 +443,12 @@ template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* mov
     own(c, p);
     p->zero = false;
     data[n++] = p->data;
+  }
+  if (near_rows(c, dy)) {
+    const int back = c.turn(-dx);
+    if (back) arrive_near_rows<LEAVES, true>(c, data, n, movers->data, dy, back);
+    else arrive_near_rows<LEAVES, false>(c, data, n, movers->data, dy, back);
+    return;
   }
   const int words = c.g.words, height = c.g.height;
   V* targets = c.change;

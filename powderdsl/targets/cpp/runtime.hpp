@@ -47,6 +47,8 @@ struct Context {
   Field* calm;  // no row of it is live
   V* nothing_row;
   V *change, *late;  // two rows of words; a row for each plane that moves
+  V* entered;               // [height]: the cells that movers enter
+  std::vector<int> moving;  // the rows that a movement changes
   u64* active;  // lists of rows, a bit each: [ACTIVE][LANES][active_words]
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
