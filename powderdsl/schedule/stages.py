@@ -15,7 +15,7 @@ from powderdsl.schedule.cut_rows import cut_rows
 from powderdsl.schedule.draws import cheap_questions, conditions, thresholds
 from powderdsl.schedule.empty import empty
 from powderdsl.schedule.flatten import flatten
-from powderdsl.schedule.floats import late, led
+from powderdsl.schedule.floats import chosen, late, led
 from powderdsl.schedule.join import join
 from powderdsl.schedule.lower import lower
 from powderdsl.schedule.moves import moves
@@ -85,6 +85,7 @@ CUDA = (
 CPP = (
     Stage("thresholds", thresholds, "which draws are compared with a parameter"),
     Stage("late", late, "floats are computed where they are used"),
+    Stage("chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them"),
     Stage("led", led, "which comparisons are computed only where another one holds"),
     Stage("conditions", conditions, "where the result of each draw matters"),
     Stage(
