@@ -30,6 +30,9 @@ from powderdsl.schedule.types import (
     load,
 )
 
+ONLY_READER = 4
+"""How many gates more are recomputed for a single reader: about what a loop that stores a plane costs."""
+
 FEWEST = 3
 """The shortest chain of choices that is worth a field of its own."""
 
@@ -270,13 +273,22 @@ class _RowCutter(Cutter):
                 _, dx, wraps = top.attr
                 if self.have(source) or (is_constant(source) and wraps):
                     continue
-                if wraps and not dx and gate_cost(source, self.have) <= self.costs.gates:
+                if wraps and self.is_again(source, dx):
                     stack.append(source)
                 else:
                     found[id(source)] = source
             else:
                 stack.extend(top.args)
         return list(found.values())
+
+    def is_again(self, source: Node, dx: int) -> bool:
+        """Whether a flag is recomputed at a neighbor. What is read at one neighbor only would fill a plane for it alone."""
+        most = self.costs.gates
+        if self.askers.get(id(source), 1) == 1:
+            most += ONLY_READER
+        elif dx:
+            return False
+        return abs(dx) <= 1 and gate_cost(source, self.have) <= most
 
     def store(
         self, floats: list[Node], flags: list[Node], pairs: Pairs, place: str, when: Node | None
