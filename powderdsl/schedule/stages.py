@@ -85,7 +85,9 @@ CUDA = (
 CPP = (
     Stage("thresholds", thresholds, "which draws are compared with a parameter"),
     Stage("late", late, "floats are computed where they are used"),
-    Stage("chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them"),
+    Stage(
+        "chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them"
+    ),
     Stage("led", led, "which comparisons are computed only where another one holds"),
     Stage("conditions", conditions, "where the result of each draw matters"),
     Stage(
