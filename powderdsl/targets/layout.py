@@ -20,8 +20,8 @@ class Layout:
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
     coins: dict[int, int] = field(default_factory=dict)
     """By stream: the draws of one bit, each of which is made once a step."""
-    active: int = 0
-    """The largest number of lists of active rows in a pass."""
+    turned: int = 0
+    """The largest number of masks of choices that a loop applies."""
     moving: int = 0
     """The largest number of planes in a movement."""
     reach: int = 1

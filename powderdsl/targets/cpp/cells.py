@@ -11,23 +11,33 @@ from powderdsl.schedule.types import Compute, Out, Sweeps, in_order, ordered
 from powderdsl.targets.layout import Layout, literal, param_key
 from powderdsl.targets.values import CellValues
 
+SIDE_BY_SIDE = 8
+"""The masks of a loop begin at a multiple of this many words: the most that a vector has."""
+
+AT_ONCE = 4
+"""Choices that are skipped together: whether one of them chooses something is hard to predict."""
+
 _INFIX = {"add": "+", "sub": "-", "mul": "*"}
 
 
-def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, active: int) -> tuple[str, int]:
-    """The text of one loop over lanes (worlds), and the number of lists of active rows used so far.
+def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout) -> str:
+    """The text of one loop over lanes (worlds).
 
     Lanes that are strips of one world read each other: a loop that reads other rows of an earlier loop follows it block
     by block, see EACH_BLOCK in fields.hpp.
     """
     over = {out.var.name: out.into for loop in sweeps.loops for out in loop.outs if out.into is not None}
-    before, rows, after = [], [], []
+    before, turns, rows, after = [], [], [], []
+    turned = 0
     used: set[str] = set()
     for part, loop in zip(sweeps.parts, sweeps.loops, strict=True):
-        printed = _Loop(loop, layout, active)
-        active = printed.active
+        printed = _Loop(loop, layout, turned)
         before.append(printed.before(over))
-        rows.append((f"if (!strips || part == {part}) " if sweeps.parts[-1] else "") + printed.rows())
+        here = f"if (!strips || part == {part}) " if sweeps.parts[-1] else ""
+        if loop.over == "choices":
+            turns.append(here + printed.turns())
+            turned += -(-len(printed.masks()) // SIDE_BY_SIDE) * SIDE_BY_SIDE
+        rows.append(here + printed.rows())
         after.append(printed.after())
         used |= printed.fields
     lasting = {_first(name, over) for name in in_order(used) if name not in sweeps.passing}
@@ -35,10 +45,19 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, active
         f"const int l{name} = {'l' if _first(name, over) in lasting else 'l & strips'};"
         for name in in_order(used)
     )
+    layout.turned = max(layout.turned, turned)
     blocks = f"EACH_BLOCK({sweeps.parts[-1]})"
     inner = "\n".join(rows)
     loop_text = "\n".join(
-        [*before, f"{blocks} for (int l = 0; l < c.lanes; l++) {{ {places}", inner, "}", *after]
+        [
+            *before,
+            f"{blocks} {{",
+            *turns,
+            f"for (int l = 0; l < c.lanes; l++) {{ {places}",
+            inner,
+            "} }",
+            *after,
+        ]
     )
     outs = [out for loop in sweeps.loops for out in loop.outs]
     declares = " ".join(
@@ -48,15 +67,12 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, active
     )
     written = {out.var.name for out in outs}
     if any(loop.region is None or _keeps(loop) for loop in sweeps.loops):
-        return f"{declares}\n{{\n{loop_text}\n}}", active
+        return f"{declares}\n{{\n{loop_text}\n}}"
     asked = dict.fromkeys(
         question for loop in sweeps.loops for name, question in _asked(loop) if name not in written
     )
     quiet = " ".join(f"{out.var.name} = {out.into or f'keep({_quiet(out)})'};" for out in outs)
-    return (
-        f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}",
-        active,
-    )
+    return f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}"
 
 
 def _first(name: str, over: dict[str, str]) -> str:
@@ -97,9 +113,8 @@ def _quiet(out: Out) -> str:
 class _Loop:
     """One loop over the rows of a world."""
 
-    def __init__(self, loop: Compute, layout: Layout, active: int):
-        self.loop, self.layout, self.first = loop, layout, active
-        self.active = active
+    def __init__(self, loop: Compute, layout: Layout, turned: int):
+        self.loop, self.layout, self.first = loop, layout, turned
         self.fields: set[str] = {out.var.name for out in loop.outs if out.var.type == REAL}
         self.floats = [out for out in loop.outs if out.var.type == REAL]
         self.flags = [out for out in loop.outs if out.var.type != REAL]
@@ -123,11 +138,14 @@ class _Loop:
                     f"for (int l = c.lanes; l < LANES; l++) for (int i = 0; i < height * words; i++) "
                     f"((u64*){name}->data)[i * LANES + l] = 0;"
                 )
-        if self.loop.over == "choices":
-            masks = self.masks()
-            lists = " ".join(f"active_rows(c, {mask}, {self.first + i});" for i, mask in enumerate(masks))
-            lines.append(f"{lists} active_together(c, {self.first}, {len(masks)});")
         return "\n".join(lines)
+
+    def turns(self) -> str:
+        masks = self.masks()
+        return (
+            f"{{ const Plane* const all[] = {{{', '.join(masks)}}}; "
+            f"turn_masks(c, all, {len(masks)}, {self.first}, first, last); }}"
+        )
 
     def rows(self) -> str:
         if self.loop.over == "choices":
@@ -231,45 +249,55 @@ class _Loop:
         return [str(choice.args[0].attr) for choice in reversed(self.chains()[0])]
 
     def laid(self) -> Iterator[str]:
-        """Loops over the active rows of each choice, a few rows at a time, which stay in the first-level cache."""
-        chains, masks, first = self.chains(), self.masks(), self.first
+        """A row of all choices: 64 columns stay in registers while the choices whose masks hold there are applied."""
+        chains, masks = self.chains(), self.masks()
         names = [out.var.name for out in self.loop.outs]
         count = len(masks)
-        self.active = first + count + 1
-        self.layout.active = max(self.layout.active, self.active)
         bases = [str(chain[-1].args[2].attr) for chain in chains]
         self.fields |= set(bases)
-        copies = " ".join(
-            f"some{name} |= lay_row(c, {name}, l{name}, {base}, l{base}, y, any);"
-            for name, base in zip(names, bases, strict=True)
-        )
-        yield "for (int from = first; from < last; from += c.near_rows) {"
-        yield (
-            f"for (int y = from; y < from + c.near_rows && y < last; y++) {{ "
-            f"const bool any = is_active(c, {first + count}, l, y); {copies} }}"
-        )
+        values = _Chunks(self.layout, ())
+        levels = []
         for level in range(count):
             at = count - 1 - level
-            values = _Chunks(self.layout, ())
-            olds = [values.temporary(f"*(const F*)(o{name} + x)") for name in names]
-            values.known |= {id(chain[at].args[2]): old for chain, old in zip(chains, olds, strict=True)}
+            values.lines, values.known = [], {}
+            values.known |= {
+                id(chain[at].args[2]): f"g{name}[k]" for chain, name in zip(chains, names, strict=True)
+            }
             found = [values.of(chain[at].args[1]) for chain in chains]
-            self.fields |= values.fields
-            stores = [
-                f"*(F*)(o{name} + x) = blend(bits, {value}, {old});"
-                for name, value, old in zip(names, found, olds, strict=True)
+            changes = [
+                f"g{name}[k] = blend(bits, {value}, g{name}[k]);"
+                for name, value in zip(names, found, strict=True)
             ]
-            rows = [f"float* o{name} = row_of(c, {name}, l{name}, y);" for name in names]
-            rows += [f"const float* {name} = {call};" for call, name in values.rows.items()]
-            yield f"EACH_ACTIVE({first + level}) {{ {' '.join(rows)}"
-            yield (
-                f"for (int w = 0; w < words; w++) if (const u64 m = ((const u64*){masks[level]}->data)"
-                "[(y * words + w) * LANES + l])"
+            lines = " ".join([*values.lines, *changes])
+            levels.append(
+                f"{{ const u64 m = masks[{level}]; "
+                f"EACH_REGISTER {{ const u32 bits = m >> (x & 63) & ALL; {lines} }} }}"
             )
-            yield "EACH_CHUNK { const u32 bits = m >> (x & 63) & ALL;"
-            yield f"{' '.join([*values.lines, *stores])} }} }}"
-        finish = " ".join(f"finish_row(c, row_of(c, {name}, l{name}, y));" for name in names)
-        yield f"EACH_ACTIVE({first + count}) {{ {finish} }}\n}}"
+        self.fields |= values.fields
+        yield "for (int y = first; y < last; y++) {"
+        yield f"const u64* turned = turned_row(c, l, y - first) + {self.first}; const bool any = any_turned(c, turned, {count});"
+        for name, base in zip(names, bases, strict=True):
+            kept = f"{name}->live[l{name} * height + y] = any || {base}->live[l{base} * height + y]"
+            yield f"some{name} |= {kept};"
+        rests = " ".join(
+            f"if ({name}->live[l{name} * height + y]) copy_floats(c.g, row_of(c, {name}, l{name}, y), row_of(c, {base}, l{base}, y));"
+            for name, base in zip(names, bases, strict=True)
+        )
+        yield f"if (!any) {{ {rests} continue; }}"
+        yield " ".join(f"float* o{name} = row_of(c, {name}, l{name}, y);" for name in names)
+        yield " ".join(
+            f"const float* b{name} = real_row(c, {base}, l{base}, y);"
+            for name, base in zip(names, bases, strict=True)
+        )
+        yield " ".join(f"const float* {name} = {call};" for call, name in values.rows.items())
+        yield "for (int w = 0; w < words; w++) { const u64* masks = turned + w * c.masks;"
+        yield " ".join(f"F g{name}[64 / CHUNK];" for name in names)
+        yield f"EACH_REGISTER {{ {' '.join(f'g{name}[k] = load(b{name}, x);' for name in names)} }}"
+        for begin in range(0, count, AT_ONCE):
+            some = " | ".join(f"masks[{level}]" for level in range(begin, min(count, begin + AT_ONCE)))
+            yield f"if ({some}) {{ {' '.join(levels[begin : begin + AT_ONCE])} }}"
+        yield f"EACH_REGISTER {{ {' '.join(f'*(F*)(o{name} + x) = g{name}[k];' for name in names)} }} }}"
+        yield f"{' '.join(f'finish_row(c, o{name});' for name in names)} }}"
 
 
 class _Chunks(CellValues):

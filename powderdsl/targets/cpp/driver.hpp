@@ -43,7 +43,6 @@ static Context* new_context(const Grid& g) {
   Context* c = new (std::align_val_t(64)) Context();
   c->g = g;
   c->near_rows = g.stride > 512 ? 8 : 16;
-  c->near_bits = (1u << c->near_rows) - 1;
   c->block = g.strips && REAL_ROWS <= c->near_rows ? c->near_rows : g.height;
 #if !WORDS
   c->rest = g.width - 64 * (g.words - 1);
@@ -66,7 +65,7 @@ static Context* new_context(const Grid& g) {
   c->entered = aligned<V>(g.height);
   c->moving.resize(g.height + 1);
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
-  c->active = aligned<u64>((size_t)(ACTIVE + 1) * LANES * c->active_words());
+  c->turned = aligned<u64>((size_t)LANES * c->most_rows() * g.words * TURNED);
   for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells()), c->tossed[i].resize(g.height);
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
@@ -88,7 +87,7 @@ static void free_context(Context* c) {
   free(c->late);
   free(c->entered);
   free(c->zeros);
-  free(c->active);
+  free(c->turned);
   for (V* p : c->fixed) free(p);
   for (int i = 0; i < COINS; i++) free(c->coins[i]);
   c->~Context();

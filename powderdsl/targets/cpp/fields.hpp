@@ -32,47 +32,50 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
     for (int w = 0; w < c.g.words; w++, i++) some |= p->data[i] &= c.valid(w);
   p->zero = !any(some);
 }
-// Which rows of which world a plane has cells in.
-OUTLINE void active_rows(Context& c, const Plane* p, int list) {
-  const int many = c.active_words();
-  u64* out = c.active + (size_t)list * LANES * many;
-  memset(out, 0, sizeof(u64) * LANES * many);
-  if (p->zero) return;
-  for (int first = 0; first < c.g.height; first += 64) {
-    alignas(64) uint8_t worlds[64] = {};  // a bit for each world
-    for (int y = first; y < first + 64 && y < c.g.height; y++) {
-      V some = p->data[y * c.g.words];
-      for (int w = 1; w < c.g.words; w++) some |= p->data[y * c.g.words + w];
-      worlds[y - first] = lanes_of(some);
-    }
-    for (int l = 0; l < LANES; l++) {
-#if defined(__AVX512BW__)
-      out[l * many + first / 64] = _mm512_test_epi8_mask(_mm512_load_si512(worlds), _mm512_set1_epi8((char)(1 << l)));
-#elif VECTOR == 32
-      for (int half = 0; half < 2; half++) {
-        const __m256i flag = _mm256_slli_epi16(_mm256_load_si256((const __m256i*)worlds + half), 7 - l);
-        out[l * many + first / 64] |= (u64)(u32)_mm256_movemask_epi8(flag) << 32 * half;
+// Masks of choices, lane by lane: [LANES][rows of a block][words][c.masks], so that a lane finds the words of all masks side by side.
+ALWAYS void turn(const V* in, V* out) {  // LANES vectors of LANES words
+#if VECTOR == 64
+  const __m512i low[3] = {
+      _mm512_setr_epi64(0, 8, 2, 10, 4, 12, 6, 14), _mm512_setr_epi64(0, 1, 8, 9, 4, 5, 12, 13), _mm512_setr_epi64(0, 1, 2, 3, 8, 9, 10, 11)};
+  const __m512i high[3] = {
+      _mm512_setr_epi64(1, 9, 3, 11, 5, 13, 7, 15), _mm512_setr_epi64(2, 3, 10, 11, 6, 7, 14, 15), _mm512_setr_epi64(4, 5, 6, 7, 12, 13, 14, 15)};
+  __m512i rows[8];
+  _Pragma("GCC unroll 8") for (int i = 0; i < 8; i++) rows[i] = (__m512i)in[i];
+  _Pragma("GCC unroll 3") for (int s = 0; s < 3; s++)  // pairs of rows, then of pairs, then of fours
+    _Pragma("GCC unroll 8") for (int i = 0; i < 8; i++)
+      if (!(i >> s & 1)) {
+        const __m512i a = rows[i], b = rows[i | 1 << s];
+        rows[i] = _mm512_permutex2var_epi64(a, low[s], b);
+        rows[i | 1 << s] = _mm512_permutex2var_epi64(a, high[s], b);
       }
+  _Pragma("GCC unroll 8") for (int i = 0; i < 8; i++) out[i] = (V)rows[i];
 #else
-      for (int i = 0; i < 64; i++) out[l * many + first / 64] |= (u64)(worlds[i] >> l & 1) << i;
+  for (int i = 0; i < LANES; i++)
+    for (int l = 0; l < LANES; l++) out[l][i] = in[i][l];
 #endif
+}
+OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int place, int first, int last) {
+  const int begin = first * c.g.words, cells = (last - first) * c.g.words;
+  const size_t apart = (size_t)c.most_rows() * c.g.words * c.masks;
+  for (int i = 0; i < cells; i++)
+    for (int from = 0; from < count; from += LANES) {
+      V in[LANES], out[LANES];
+      for (int k = 0; k < LANES; k++) in[k] = from + k < count ? planes[from + k]->data[begin + i] : splat(0);
+      turn(in, out);
+      for (int l = 0; l < c.lanes; l++) *(V*)(c.turned + l * apart + (size_t)i * c.masks + place + from) = out[l];
     }
-  }
 }
-static void active_together(Context& c, int first, int count) {  // into the list behind them
-  const size_t size = (size_t)LANES * c.active_words();
-  u64 *lists = c.active + first * size, *all = lists + count * size;
-  for (size_t i = 0; i < size; i++) {
-    all[i] = 0;
-    for (int k = 0; k < count; k++) all[i] |= lists[k * size + i];
-  }
+ALWAYS const u64* turned_row(const Context& c, int lane, int y) {
+  return c.turned + ((size_t)lane * c.most_rows() + y) * c.g.words * c.masks;
 }
-ALWAYS bool is_active(const Context& c, int list, int lane, int y) {
-  return c.active[((size_t)list * LANES + lane) * c.active_words() + y / 64] >> (y & 63) & 1;
+ALWAYS bool any_turned(const Context& c, const u64* masks, int count) {
+  V some = splat(0);
+  for (int w = 0; w < c.g.words; w++)
+    for (int from = 0; from < count; from += LANES) some |= *(const V*)(masks + w * c.masks + from);
+  return any(some);
 }
-#define EACH_ACTIVE(list) /* of the near rows that begin at `from` */ \
-  for (u32 rest = c.active[((size_t)(list) * LANES + l) * c.active_words() + from / 64] >> (from & 63) & c.near_bits; rest; rest &= rest - 1) \
-    if (const int y = from + __builtin_ctz(rest); true)
+// The chunks of word w, whose values wait in registers.
+#define EACH_REGISTER _Pragma("GCC unroll 16") for (int k = 0, x = 64 * w; k < 64 / CHUNK && (WORDS || x < width); k++, x += CHUNK)
 // Sweeps over the rows of lanes, one after the other. In strips, a sweep follows the one before it two blocks later: a
 // block is computed from blocks of the sweep before that are next to it, around the edge of the strips, and so finds them
 // in a near cache. Each begins a block further on, and comes around to its first blocks at the end.
@@ -112,17 +115,6 @@ ALWAYS float* row_of(const Context& c, const Field* f, int lane, int y) {
 }
 static void copy_floats(const Grid& g, float* to, const float* from) {  // a row and its halo
   memcpy(to - REACH, from - REACH, sizeof(float) * (g.width + 2 * REACH));
-}
-// A row that choices will be laid over, or that stays as it is; whether it is live.
-ALWAYS bool lay_row(const Context& c, Field* to, int to_lane, const Field* from, int from_lane, int y, bool chosen) {
-  const bool live = chosen || from->live[from_lane * c.g.height + y];
-  to->live[to_lane * c.g.height + y] = live;
-  if (!live) return false;
-  float* out = row_of(c, to, to_lane, y);
-  const float* in = real_row(c, from, from_lane, y);
-  for (int x = 0; x < c.g.width; x += CHUNK) *(F*)(out + x) = load(in, x);
-  if (!chosen) finish_row(c, out);
-  return true;
 }
 ALWAYS bool copy_row(const Context& c, Field* to, const Field* from, int lane, int y) {
   size_t at = lane * (size_t)c.g.height + y;

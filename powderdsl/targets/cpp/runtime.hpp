@@ -37,7 +37,6 @@ struct Grid {
 struct Context {
   Grid g;
   int near_rows;  // of reals, that a near cache holds while several loops pass over them
-  u32 near_bits;  // as many ones
   int block;      // rows that one sweep takes before the next
   std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
   std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus
@@ -49,7 +48,8 @@ struct Context {
   V *change, *late;  // two rows of words; a row for each plane that moves
   V* entered;               // [height]: the cells that movers enter
   std::vector<int> moving;  // the rows that a movement changes
-  u64* active;  // lists of rows, a bit each: [ACTIVE][LANES][active_words]
+  u64* turned;                        // masks of choices, lane by lane, see turn_masks
+  static constexpr int masks = TURNED;  // of a word, a multiple of LANES
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
   V* coins[COINS + 1];  // planes, filled row by row when they are asked for
@@ -82,7 +82,7 @@ struct Context {
   bool has_line(int lane, int y) const {
     return g.strips ? (u32)(lane * g.height + y) < (u32)(LANES * g.height) : (u32)y < (u32)g.height;
   }
-  int active_words() const { return (g.height + 63) / 64; }
+  int most_rows() const { return std::min(g.height, 2 * block); }  // of a block
 };
 
 template <class T> static T* aligned(size_t count) {

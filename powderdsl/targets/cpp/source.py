@@ -79,7 +79,7 @@ def native_source(program: Program, words: int = 0) -> NativeSource:
         f"#define COINS {len(layout.coins)}",
         f"#define REALS {len(layout.reals)}",
         f"#define MOVING {layout.moving}",
-        f"#define ACTIVE {layout.active}",
+        f"#define TURNED {layout.turned}",
         f"#define REACH {layout.reach}",
         f"#define REAL_ROWS {layout.rows}",
         f"#define HALO {layout.halo}",

@@ -62,8 +62,6 @@ def answer(node: Node) -> str:
 class _Printer:
     def __init__(self, layout: Layout, graph: Graph):
         self.layout, self.graph = layout, graph
-        self.active = 0
-        """The number of lists of active rows used so far."""
 
     def slot(self, name: str, var: Var) -> str:
         if var.type == REAL:
@@ -82,8 +80,7 @@ class _Printer:
                 case Compute():
                     yield from self.words(statement, declared)
                 case Sweeps():
-                    text, self.active = sweeps_text(statement, declared, self.layout, self.active)
-                    yield text
+                    yield sweeps_text(statement, declared, self.layout)
                 case Move():
                     yield from self.move(statement, declared)
                 case Guard():
