@@ -25,7 +25,7 @@ class Layout:
     moving: int = 0
     """The largest number of planes in a movement."""
     reach: int = 1
-    """The largest distance in columns at which a row of floats is read."""
+    """The largest distance in columns at which a row of floats is read around the edges."""
     rows: int = 1
     """The largest distance in rows at which floats are read."""
     halo: int = 16
@@ -67,8 +67,8 @@ def _place(node: Node, layout: Layout) -> None:
             # A value recomputed at a neighbor reads neighbors itself, up to a few levels deep.
             layout.halo = max(layout.halo, -(-4 * max(abs(attr[0]), abs(attr[1])) // 16) * 16)
             if node.type.name == "real":
-                layout.reach = max(layout.reach, 3 * abs(attr[1]))
-            elif node.op == "shift" and not attr[2]:
+                return
+            if node.op == "shift" and not attr[2]:
                 layout.beyond = max(layout.beyond, abs(attr[0]))
             else:
                 layout.around = max(layout.around, abs(attr[0]))

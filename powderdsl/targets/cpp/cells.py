@@ -2,25 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import numpy as np
+from collections.abc import Iterator, Mapping
 
 from powderdsl.ir.ops import REAL, Node
-from powderdsl.schedule.types import Compute, Out, Sweeps, in_order, ordered
-from powderdsl.targets.layout import Layout, literal, param_key
-from powderdsl.targets.values import CellValues
+from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, in_order, ordered, values_of
+from powderdsl.targets.cpp.chunks import Chunks
+from powderdsl.targets.layout import Layout
 
 SIDE_BY_SIDE = 8
 """The masks of a loop begin at a multiple of this many words: the most that a vector has."""
 
+ANY_PASS = 1 << 30
+"""A field is read as far as any pass reads its slot."""
+
 AT_ONCE = 4
 """Choices that are skipped together: whether one of them chooses something is hard to predict."""
 
-_INFIX = {"add": "+", "sub": "-", "mul": "*"}
+
+def reaches_of(schedule: Schedule) -> dict[str, int]:
+    """How many columns of each field are read beyond the edges; ANY_PASS for fields that slots may get."""
+    found = {str(node.attr): ANY_PASS for _, node in schedule.leaves if node.op == "load"}
+    copies: list[tuple[str, Node]] = []  # a field whose rows may be those of another one
+    for statement in flat(schedule.body):
+        for node in ordered(values_of(statement)):
+            if node.op == "shift" and node.type == REAL and node.attr[2]:
+                name = str(node.args[0].attr)
+                found[name] = max(found.get(name, 0), abs(node.attr[1]))
+        match statement:
+            case Guard(_, _, keeps):
+                copies += [(var.name, value) for var, value in keeps]
+            case Sweeps(loops):
+                for out in (out for loop in loops for out in loop.outs):
+                    copies += [(out.var.name, _base(out.value))]
+                    copies += [(out.var.name, out.otherwise)] if out.otherwise is not None else []
+    for _ in copies:
+        before = dict(found)
+        for name, old in copies:
+            if old.op == "load" and old.type == REAL:
+                found[str(old.attr)] = max(found.get(str(old.attr), 0), found.get(name, 0))
+        if found == before:
+            break
+    return found
 
 
-def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout) -> str:
+def _base(value: Node) -> Node:
+    while value.op == "select":
+        value = value.args[2]
+    return value
+
+
+def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
     """The text of one loop over lanes (worlds).
 
     Lanes that are strips of one world read each other: a loop that reads other rows of an earlier loop follows it block
@@ -31,7 +62,7 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout) -> str
     turned = 0
     used: set[str] = set()
     for part, loop in zip(sweeps.parts, sweeps.loops, strict=True):
-        printed = _Loop(loop, layout, turned)
+        printed = _Loop(loop, layout, turned, reaches)
         before.append(printed.before(over))
         here = f"if (!strips || part == {part}) " if sweeps.parts[-1] else ""
         if loop.over == "choices":
@@ -113,8 +144,8 @@ def _quiet(out: Out) -> str:
 class _Loop:
     """One loop over the rows of a world."""
 
-    def __init__(self, loop: Compute, layout: Layout, turned: int):
-        self.loop, self.layout, self.first = loop, layout, turned
+    def __init__(self, loop: Compute, layout: Layout, turned: int, reaches: Mapping[str, int]):
+        self.loop, self.layout, self.first, self.reaches = loop, layout, turned, reaches
         self.fields: set[str] = {out.var.name for out in loop.outs if out.var.type == REAL}
         self.floats = [out for out in loop.outs if out.var.type == REAL]
         self.flags = [out for out in loop.outs if out.var.type != REAL]
@@ -122,6 +153,11 @@ class _Loop:
             self.text = "\n".join(self.laid())
         else:
             self.text = self.swept()
+
+    def reach(self, name: str) -> int | str:
+        """How far columns of a field are read beyond the edges."""
+        reach = self.reaches.get(name, 0)
+        return "REACH" if reach == ANY_PASS else reach
 
     def before(self, over: dict[str, str]) -> str:
         lines = []
@@ -160,7 +196,7 @@ class _Loop:
 
     def swept(self) -> str:
         """The body of a loop over rows."""
-        values = _Chunks(self.layout, self.loop.outs)
+        values = Chunks(self.layout, self.loop.outs)
         found = [(out, values.of(out.value)) for out in self.loop.outs]
         values.close()
         self.fields |= values.fields
@@ -175,7 +211,7 @@ class _Loop:
                     f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= (I)blend(inside, o, splatf(0)); }}"
                 )
                 ends.append(
-                    f"finish_row(c, o{name}); {{ const bool some = any((V)(n{name} + n{name})); "
+                    f"finish_row<{self.reach(name)}>(c, o{name}); {{ const bool some = any((V)(n{name} + n{name})); "
                     f"{name}->live[l{name} * height + y] = some; some{name} |= some; }}"
                 )
             else:
@@ -255,7 +291,7 @@ class _Loop:
         count = len(masks)
         bases = [str(chain[-1].args[2].attr) for chain in chains]
         self.fields |= set(bases)
-        values = _Chunks(self.layout, ())
+        values = Chunks(self.layout, ())
         levels = []
         for level in range(count):
             at = count - 1 - level
@@ -297,163 +333,4 @@ class _Loop:
             some = " | ".join(f"masks[{level}]" for level in range(begin, min(count, begin + AT_ONCE)))
             yield f"if ({some}) {{ {' '.join(levels[begin : begin + AT_ONCE])} }}"
         yield f"EACH_REGISTER {{ {' '.join(f'*(F*)(o{name} + x) = g{name}[k];' for name in names)} }} }}"
-        yield f"{' '.join(f'finish_row(c, o{name});' for name in names)} }}"
-
-
-class _Chunks(CellValues):
-    """Values of sixteen cells of one world."""
-
-    def __init__(self, layout: Layout, outs: tuple[Out, ...]):
-        super().__init__()
-        self.layout = layout
-        self.rows: dict[str, str] = {}
-        self.words: dict[str, str] = {}
-        self.fields: set[str] = set()
-        self.choices = [node for node in ordered(out.value for out in outs) if node.op == "select"]
-        self.led: dict[str, tuple[list[str], dict[int, str], list[str]]] = {}
-        """Lines that run only where a comparison holds somewhere in the chunk, by the comparison's name."""
-
-    def temporary(self, text: str, type: str = "F", prefix: str = "v") -> str:
-        self.count += 1
-        name = f"{prefix}{self.count}"
-        self.lines.append(f"const {type} {name} = {text};")
-        return name
-
-    def of(self, root: Node) -> str:
-        """The name of a value: sixteen floats or sixteen bits."""
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if node.op == "select":
-                self.choice(node)
-            elif node.op == "led":
-                self.under(node)
-            elif ready or not node.args or node.op == "shift":
-                self.known[id(node)] = self.node(node)
-            else:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-        return self.known[id(root)]
-
-    def row(self, field: str, dy: int, *, wraps: bool = True) -> str:
-        """The pointer to a field's row, set up once a row."""
-        self.fields.add(field)
-        self.layout.rows = max(self.layout.rows, abs(dy))
-        kind = "_wrapped" if wraps and dy else "" if wraps else "_or_nothing"
-        at = f"y + {dy}" if dy or not wraps else "y"
-        return self.rows.setdefault(f"real_row{kind}(c, {field}, l{field}, {at})", f"r{len(self.rows)}")
-
-    def word(self, node: Node) -> str:
-        """The word of a flag's plane, read once per row and word."""
-        if node.op == "param":
-            return f"c.param_bits[{self.layout.param_planes[param_key(node)]}][l]"
-        return self.words.setdefault(str(node.attr), f"m{len(self.words)}")
-
-    def mask(self, node: Node) -> str:
-        """Sixteen bits of a flag's plane."""
-        return f"(u32)({self.word(node)} >> (x & 63) & ALL)"
-
-    def node(self, node: Node) -> str:
-        attr = node.attr
-        match node.op:
-            case "const":
-                return f"splatf({literal(float(attr))})"
-            case "load" if node.type != REAL:
-                return self.temporary(self.mask(node), "u32", "b")
-            case "load":
-                return self.temporary(f"load({self.row(str(attr), 0)}, x + 0)")
-            case "param":
-                return self.temporary(f"splatf(c.param_real[{self.layout.param_reals[attr[0]]}][l])")
-            case "draw":
-                return self.draw(node)
-            case "shift":
-                dy, dx, wraps = attr
-                loaded = f"load({self.row(str(node.args[0].attr), dy, wraps=wraps)}, x + {dx})"
-                self.layout.reach = max(self.layout.reach, abs(dx))
-                return self.temporary(
-                    loaded if wraps or not dx else f"inside_columns({loaded}, x, {dx}, width)"
-                )
-        args = [self.known[id(arg)] for arg in node.args]
-        match node.op:
-            case "eq" | "lt" | "le":
-                return self.temporary(f"bits_{node.op}({args[0]}, {args[1]})", "u32", "b")
-            case "add" | "sub" | "mul":
-                return self.temporary(f"{args[0]} {_INFIX[node.op]} {args[1]}")
-            case "div" if node.args[1].op == "const" and node.args[1].attr:
-                return self.temporary(quotient(args[0], float(node.args[1].attr)))
-            case "div":
-                return self.temporary(f"divide({args[0]}, {args[1]})")
-            case "neg":
-                return self.temporary(f"-{args[0]}")
-            case "abs" | "min" | "max" | "sqrt":
-                call = {"abs": "magnitude", "min": "smaller", "max": "larger", "sqrt": "root"}[node.op]
-                return self.temporary(f"{call}({', '.join(args)})")
-            case "settle":
-                lo, hi = attr
-                return self.temporary(f"settle({args[0]}, {literal(lo)}, {literal(hi)}, SNAP)")
-        raise AssertionError(f"no C++ kernel for {node.op}")
-
-    def draw(self, node: Node) -> str:
-        stream, bits = node.attr
-        self.count += 1
-        name = f"d{self.count}"
-        cell = f"draw_cell(c, {self.layout.streams[stream]}, l, y, std::min(x + i, width - 1), {bits})"
-        self.lines.append(f"F {name}; for (int i = 0; i < CHUNK; i++) {name}[i] = {cell};")
-        return name
-
-    def under(self, node: Node) -> None:
-        """A comparison, computed only where its leader holds somewhere in the chunk."""
-        leader, comparison = node.args
-        first = self.of(leader)
-        self.count += 1
-        name = f"b{self.count}"
-        self.lines.append(f"u32 {name} = 0;")
-        lines, known, ends = self.led.setdefault(first, ([], dict(self.known), []))
-        outer, before = self.lines, self.known
-        self.lines, self.known = lines, known
-        value = self.of(comparison)
-        self.lines, self.known = outer, before
-        ends.append(f"{name} = {value} & {first};")
-        self.known[id(node)] = name
-
-    def close(self) -> None:
-        """Append the lines that depend on comparisons."""
-        for first, (lines, _, ends) in self.led.items():
-            self.lines.append(f"if ({first}) {{ {' '.join([*lines, *ends])} }}")
-
-    def choice(self, node: Node) -> None:
-        """A chain of choices. A choice is computed only if it chooses some cell of the chunk."""
-        chains = self.alike(node)
-        masks = [choice.args[0] for choice in chains[0]]
-        names = []
-        for one in chains:
-            base = self.of(one[-1].args[2])
-            self.count += 1
-            names.append(f"v{self.count}")
-            self.lines.append(f"F {names[-1]} = {base};")
-        for level in reversed(range(len(masks))):
-            self.count += 1
-            bits = f"b{self.count}"
-            outer, before = self.lines, self.known
-            running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
-            self.lines, self.known = [], before | running  # valid only here, since the variables change
-            chosen = [self.of(one[level].args[1]) for one in chains]
-            blends = [
-                f"{name} = blend({bits}, {value}, {name});" for name, value in zip(names, chosen, strict=True)
-            ]
-            inner, self.lines, self.known = self.lines, outer, before
-            self.lines.append(
-                f"if (const u32 {bits} = {self.mask(masks[level])}) {{ {' '.join([*inner, *blends])} }}"
-            )
-        for one, name in zip(chains, names, strict=True):
-            self.known[id(one[0])] = name
-
-
-def quotient(value: str, divisor: float) -> str:
-    """A division by a constant; a product, unless the divisor's fraction is all ones (Markstein 1990, theorem 8)."""
-    short = np.float32(divisor)
-    if short.view(np.uint32) & 0x7FFFFF == 0x7FFFFF or not 2.0**-60 < abs(divisor) < 2.0**60:
-        return f"{value} / splatf({literal(divisor)})"
-    return f"divide_by({value}, {literal(divisor)}, {literal(float(np.float32(1) / short))})"
+        yield f"{' '.join(f'finish_row<{self.reach(name)}>(c, o{name});' for name in names)} }}"

@@ -98,15 +98,15 @@ ALWAYS void put_bits(u64* word, int x, u32 bits) {
   const int by = x & 63;
   *word = (*word & ~((u64)ALL << by)) | (u64)bits << by;
 }
-// After the chunks of a row: nothing beyond the width, then the halo.
-ALWAYS void finish_row(const Context& c, float* row) {
+// After the chunks of a row: the halo, as far as columns are read beyond the edges.
+template <int FAR = REACH> ALWAYS void finish_row(const Context& c, float* row) {
   int w = c.g.width;
-  if (__builtin_expect(w >= REACH, 1)) {
-    for (int i = 0; i < REACH; i++) row[w + i] = row[i];
-    for (int i = 1; i <= REACH; i++) row[-i] = row[w - i];
+  if (__builtin_expect(w >= FAR, 1)) {
+    for (int i = 0; i < FAR; i++) row[w + i] = row[i];
+    for (int i = 1; i <= FAR; i++) row[-i] = row[w - i];
   } else {
-    for (int i = 0; i < REACH; i++) row[w + i] = row[i % w];
-    for (int i = 1; i <= REACH; i++) row[-i] = row[(w - i % w) % w];
+    for (int i = 0; i < FAR; i++) row[w + i] = row[i % w];
+    for (int i = 1; i <= FAR; i++) row[-i] = row[(w - i % w) % w];
   }
 }
 

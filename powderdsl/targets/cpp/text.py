@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.ir.ops import FLAG, REAL, Node
 from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import Compute, Forget, Guard, Move, Release, Schedule, Statement, Sweeps, Var
 from powderdsl.schedule.updates import asked, is_cleared
-from powderdsl.targets.cpp.cells import sweeps_text
+from powderdsl.targets.cpp.cells import reaches_of, sweeps_text
 from powderdsl.targets.layout import Layout, number, param_key
 from powderdsl.targets.values import WordValues
 
@@ -21,7 +21,7 @@ LOOP = (
 
 def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
     """The function of a pass."""
-    printer = _Printer(layout, schedule.graph)
+    printer = _Printer(layout, schedule)
     changed = {slot for slot, _ in schedule.leaves}
     lines = []
     if schedule.when is not None:
@@ -60,8 +60,8 @@ def answer(node: Node) -> str:
 
 
 class _Printer:
-    def __init__(self, layout: Layout, graph: Graph):
-        self.layout, self.graph = layout, graph
+    def __init__(self, layout: Layout, schedule: Schedule):
+        self.layout, self.graph, self.reaches = layout, schedule.graph, reaches_of(schedule)
 
     def slot(self, name: str, var: Var) -> str:
         if var.type == REAL:
@@ -80,7 +80,7 @@ class _Printer:
                 case Compute():
                     yield from self.words(statement, declared)
                 case Sweeps():
-                    yield sweeps_text(statement, declared, self.layout)
+                    yield sweeps_text(statement, declared, self.layout, self.reaches)
                 case Move():
                     yield from self.move(statement, declared)
                 case Guard():
