@@ -14,6 +14,7 @@ from powderdsl.schedule.cut import cut
 from powderdsl.schedule.cut_rows import cut_rows
 from powderdsl.schedule.draws import cheap_questions, conditions, thresholds
 from powderdsl.schedule.empty import empty
+from powderdsl.schedule.exact import exact
 from powderdsl.schedule.flatten import flatten
 from powderdsl.schedule.floats import chosen, late, led
 from powderdsl.schedule.join import join
@@ -108,6 +109,11 @@ CPP = (
     ),
     Stage("empty", empty, "which loops over words give nothing because a plane is empty"),
     Stage("narrow", narrow, "in which cells a loop has anything to do"),
+    Stage(
+        "exact",
+        exact,
+        "which products and quotients of floats are exact; after `narrow`, which evaluates values",
+    ),
     Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read"),
     Stage("release", release, "when a plane is no longer needed; last, after all reads have their place"),
 )

@@ -116,7 +116,7 @@ def _is_region(node: Node | None) -> bool:
 SCHEDULE_OPS = frozenset({
     "load",
     "stack", "member", "swap_onto", "leave", "cells", "choose", "places", "moved", "update", "carry", "copy",
-    "below_param", "any", "when", "led", "live", "present",
+    "below_param", "any", "when", "led", "live", "present", "fused", "ratio",
 })  # fmt: skip
 """Operations that only schedules have: `load` → what a variable holds; `stack` planes → block; `member` (block) → a plane; `swap` (block, movers) and
 `leave` (block, movers) → block; `arrive` and `swap_onto` (block, movers, rest) → block; `cells` (flag) → bool cells;
@@ -124,7 +124,8 @@ SCHEDULE_OPS = frozenset({
 (places, no, other) → `no`, and there `other` added to it, taken off or multiplied; `carry` (places, moved, no, other) →
 the same at neighbors with what `other` has at the places; `copy` (floats) → the same in an array of their own;
 `below_param` → a draw below a parameter; `any` (flag) → whether it holds in some cell; `when` (flag, flag) → both, the
-second computed only in words where the first holds somewhere; `led` (comparison, comparison) → the same in cells; `live` (floats), attribute (rows, reach) → whether the field may be
+second computed only in words where the first holds somewhere; `fused` (a, b, c) → a + b·c, where b·c
+is exact, `ratio` (a, b) → a / b far from the limits of floats (`exact`); `led` (comparison, comparison) → the same in cells; `live` (floats), attribute (rows, reach) → whether the field may be
 other than zero so many rows down, at most so many columns to either side."""
 
 
