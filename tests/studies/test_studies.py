@@ -197,6 +197,22 @@ def test_what_was_found_is_said_as_it_is() -> None:
     assert fell.verdict.startswith("does not rise")
 
 
+def test_each_value_of_another_setting_has_a_verdict_of_its_own() -> None:
+    study = read(TEXT)
+    rising, falling = (1.0, 1.1, 0.9), (9.0, 9.1, 9.2)
+    points = {
+        ("100", "0"): rising,
+        ("100", "5"): falling,
+        ("200", "0"): (2.0, 2.0, 2.0),
+        ("200", "5"): rising,
+    }
+    (found,) = findings(study, outcomes(study, points))
+    one, other = found.verdict.split("; ")
+    assert one.startswith("squares 0: rises at every point, in 3 of 3 seeds (last − first: +1.00")
+    assert other.startswith("squares 5: does not rise (last − first: -8.1")
+    assert as_markdown(study, "small", outcomes(study, points)).count("- ") == 2
+
+
 def test_ratios_are_compared_on_the_scale_log() -> None:
     text = TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", "")
     study = read(text.replace("expect: rises", "expect: rises, scale: log"))

@@ -67,6 +67,8 @@ def _label(config: Mapping[str, Any], differ: Sequence[str]) -> str:
     words = []
     for name in shown:
         value = config.get(name)
+        if value is None:  # settings at their defaults are not recorded
+            continue
         words.append(f"{name} {Path(value).name if isinstance(value, str) and '/' in value else value}")
     return ", ".join(words)
 
@@ -127,6 +129,6 @@ def write_curves(
     axes.grid(linewidth=0.3)
     axes.set_title(title, fontsize=8)
     if any(curve.label for curve in curves):
-        axes.legend(fontsize=8)
+        figure.legend(fontsize=8, loc="outside lower center")
     with replacing(path, follow=True) as temporary:
         figure.savefig(temporary, dpi=150)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,33 +44,44 @@ class Cell:
 
 
 @dataclass(frozen=True)
+class Trend:
+    """A measure along the first setting, the others fixed, which `label` names. `change` compares the last with the first,
+    seed by seed: their difference, on the scale ``log`` their ratio. `agreeing`: in how many seeds it goes as expected,
+    and how many have both. `ordered`: all means do."""
+
+    label: str
+    change: Interval
+    ordered: bool
+    agreeing: tuple[int, int]
+
+    def verdict(self, measure: Measure) -> str:
+        """A sentence: whether the measure went as expected."""
+        sign = 1 if measure.expect == "rises" else -1
+        log = measure.scale == "log"
+        same = 1.0 if log else 0.0
+        plus = "+" if not log and self.change.mean > 0 else ""
+        ends = f"last {'/' if log else '−'} first: {plus}{shown(self.change, measure.scale)}"
+        label = f"{self.label}: " if self.label else ""
+        if sign * (self.change.mean - same) <= 0:
+            return f"{label}does not {str(measure.expect)[:-1]} ({ends})"
+        sure = f", but the interval holds {same:.0f}" if self.change.low <= same <= self.change.high else ""
+        every = "at every point" if self.ordered else "not at every point"
+        seeds = "{} of {} seeds".format(*self.agreeing)
+        return f"{label}{measure.expect} {every}, in {seeds}{sure} ({ends})"
+
+
+@dataclass(frozen=True)
 class Finding:
-    """A measure over all combinations. `trend` compares the last with the first, seed by seed: their difference, on the
-    scale ``log`` their ratio. `agreeing`: in how many seeds it goes as expected, and how many have both. `ordered`: all
-    means do."""
+    """A measure over all combinations, and its trends, one for each combination of all settings but the first."""
 
     measure: Measure
     cells: tuple[Cell, ...]
-    trend: Interval | None
-    ordered: bool
-    agreeing: tuple[int, int] = (0, 0)
+    trends: tuple[Trend, ...]
 
     @property
     def verdict(self) -> str:
-        """A sentence: whether the measure went as expected."""
-        if self.measure.expect is None or self.trend is None:
-            return ""
-        sign = 1 if self.measure.expect == "rises" else -1
-        log = self.measure.scale == "log"
-        same = 1.0 if log else 0.0
-        plus = "+" if not log and self.trend.mean > 0 else ""
-        ends = f"last {'/' if log else '−'} first: {plus}{shown(self.trend, self.measure.scale)}"
-        if sign * (self.trend.mean - same) <= 0:
-            return f"does not {self.measure.expect[:-1]} ({ends})"
-        sure = f", but the interval holds {same:.0f}" if self.trend.low <= same <= self.trend.high else ""
-        every = "at every point" if self.ordered else "not at every point"
-        seeds = "{} of {} seeds".format(*self.agreeing)
-        return f"{self.measure.expect} {every}, in {seeds}{sure} ({ends})"
+        """Whether the measure went as expected; empty if nothing is expected."""
+        return "; ".join(trend.verdict(self.measure) for trend in self.trends)
 
 
 def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
@@ -100,20 +111,41 @@ def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
     for values, by_seed in groups.items():
         samples = tuple(value for _, value in sorted(by_seed.items()))
         cells.append(Cell(values, interval(samples, measure.scale), samples))
-    trend, ordered, agreeing = None, False, (0, 0)
-    if len(cells) > 1 and measure.expect is not None:
-        first, *_, last = groups.values()
-        both = sorted(first.keys() & last.keys())
-        sign = 1 if measure.expect == "rises" else -1
-        if both:
-            agreeing = sum(sign * (last[seed] - first[seed]) > 0 for seed in both), len(both)
-            if measure.scale == "log":
-                trend = interval([last[seed] / first[seed] for seed in both], "log")
-            else:
-                trend = interval([last[seed] - first[seed] for seed in both])
-        means = [sign * cell.over_seeds.mean for cell in cells]
-        ordered = all(one < two for one, two in itertools.pairwise(means))
-    return Finding(measure, tuple(cells), trend, ordered, agreeing)
+    trends = []
+    for label, line in _lines(cells).items():
+        found = _trend(measure, label, line, [groups[cell.values] for cell in line])
+        trends += [found] if found else []
+    return Finding(measure, tuple(cells), tuple(trends))
+
+
+def _trend(
+    measure: Measure, label: str, cells: Sequence[Cell], by_seed: Sequence[Mapping[int, float]]
+) -> Trend | None:
+    """How a measure goes along some cells, if that is asked and seeds have both ends."""
+    first, last = by_seed[0], by_seed[-1]
+    both = sorted(first.keys() & last.keys())
+    if measure.expect is None or len(cells) < 2 or not both:
+        return None
+    sign = 1 if measure.expect == "rises" else -1
+    agreeing = sum(sign * (last[seed] - first[seed]) > 0 for seed in both), len(both)
+    log = measure.scale == "log"
+    change = [last[seed] / first[seed] if log else last[seed] - first[seed] for seed in both]
+    means = [sign * cell.over_seeds.mean for cell in cells]
+    ordered = all(one < two for one, two in itertools.pairwise(means))
+    return Trend(label, interval(change, measure.scale), ordered, agreeing)
+
+
+def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
+    """The cells of each combination of all settings but the first, by the values of those that vary."""
+    values: dict[str, set[str]] = {}
+    for cell in cells:
+        for name, value in cell.values[1:]:
+            values.setdefault(name, set()).add(value)
+    found: dict[str, list[Cell]] = {}
+    for cell in cells:
+        label = ", ".join(f"{name} {value}" for name, value in cell.values[1:] if len(values[name]) > 1)
+        found.setdefault(label, []).append(cell)
+    return found
 
 
 def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -163,7 +195,9 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
     for values, numbers in rows.items():
         words = [*(value for _, value in values), *numbers, str(counts[values])]
         lines.append("| " + " | ".join(words) + " |")
-    verdicts = [f"- {one.measure.about}: {one.verdict}" for one in found if one.verdict]
+    verdicts = [
+        f"- {one.measure.about}: {trend.verdict(one.measure)}" for one in found for trend in one.trends
+    ]
     failed = [f"- {one.point.name}: {one.problem}" for one in outcomes if one.problem]
     text = [f"{study.about} Size: {size}.", "", *lines]
     text += ["", *verdicts] if verdicts else []
@@ -219,9 +253,7 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
     numbers = _numbers(ticks)
     joined = "-" if numbers is not None else ""  # between words there is nothing
     numbers = numbers or [float(place) for place in range(len(ticks))]
-    lines: dict[str, list[Cell]] = {}
-    for cell in finding.cells:
-        lines.setdefault(", ".join(f"{name} {value}" for name, value in cell.values[1:]), []).append(cell)
+    lines = _lines(finding.cells)
     for label, cells in lines.items():
         across = [numbers[ticks.index(cell.values[0][1])] for cell in cells]
         found = [cell.over_seeds for cell in cells]
@@ -240,8 +272,9 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
         )
         for place, cell in zip(across, cells, strict=True):
             axes.plot([place] * len(cell.samples), cell.samples, "k.", markersize=3, alpha=0.4)
-    if min(numbers) > 0 and max(numbers) >= 10 * min(numbers):
-        axes.set_xscale("log")
+    above = [number for number in numbers if number > 0]
+    if joined and min(numbers) >= 0 and above and max(above) >= 10 * min(above):
+        axes.set_xscale("symlog", linthresh=min(above)) if 0 in numbers else axes.set_xscale("log")
     axes.set_xticks(numbers, ticks, minor=False)
     if not joined and sum(map(len, ticks)) > 40:
         axes.tick_params("x", labelrotation=25)
