@@ -57,7 +57,7 @@ def require_minari() -> None:
     """Raises CompileError (PD612) if Minari or h5py is not installed."""
     try:
         import h5py  # noqa: F401  only whether it can be imported
-        import minari  # noqa: F401
+        import minari  # noqa: F401  likewise
     except ModuleNotFoundError as error:
         helps = ("pip install 'powderdsl[minari]'",)
         raise failure("PD612", f"Minari datasets need the package {error.name}", helps=helps) from None

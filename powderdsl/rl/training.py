@@ -168,8 +168,8 @@ def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
 def _rate(config: TrainConfig) -> float | Callable[[float], float]:
     """The learning rate, or that of an update by the share of `steps` left after its rollout.
 
-    It falls evenly over the updates: the first has all of it, the last one part of as many as there are. The share left
-    does not do by itself, since it is negative where the last rollout goes beyond `steps`.
+    It falls evenly over the updates: the first of n has all of it, the last 1/n. The share left cannot be used as it is,
+    since it is negative where the last rollout goes beyond `steps`.
     """
     if config.schedule == "constant":
         return config.learning_rate

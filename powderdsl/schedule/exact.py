@@ -35,7 +35,7 @@ ZERO = Size(MOST, MOST, LEAST)
 def exact(schedule: Schedule) -> Schedule:
     """Products that are exact become part of the sum; divisions by constants that stay far from the limits are marked.
 
-    `a + b * 0.5` → `fused(a, b, 0.5)`, rounded once: equal, since `b * 0.5` is exact where it is no smaller than normal
+    `a + b * 0.5` → `fused(a, b, 0.5)`, rounded once: equal, since `b * 0.5` is exact where it is not below normal
     floats. `a / 18` → `ratio(a, 18)`. Slots hold 0 or magnitudes from SNAP on: that bounds everything computed of them.
     """
     graph = schedule.graph

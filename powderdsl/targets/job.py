@@ -13,7 +13,7 @@ from powderdsl.targets.profiling import PassClock
 class Clock(NamedTuple):
     """Seed and world index of each world, int64 [B], and its step: `since` steps after `start`, int64 [B].
 
-    The sum is left to those who need it: a step of one small world takes no longer than a few operations of torch.
+    Whoever needs the sum computes it: a step of one small world takes no longer than a few operations of torch.
     """
 
     seed: Tensor

@@ -56,6 +56,36 @@ class CellValues(Values):
 
     choices: list[Node]
 
+    def node(self, node: Node) -> str:
+        """The name or expression of a node whose arguments have names; a shift reads its argument directly."""
+        raise NotImplementedError
+
+    def led(self, node: Node) -> str:
+        """The name of a comparison that is computed only where its leader holds."""
+        raise NotImplementedError
+
+    def choice(self, node: Node) -> None:
+        """Name a chain of choices."""
+        raise NotImplementedError
+
+    def of(self, root: Node) -> str:
+        """The name of a value."""
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            if node.op == "select":
+                self.choice(node)
+            elif node.op == "led":
+                self.known[id(node)] = self.led(node)
+            elif ready or not node.args or node.op == "shift":
+                self.known[id(node)] = self.node(node)
+            else:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(node.args))
+        return self.known[id(root)]
+
     def chain(self, node: Node) -> list[Node]:
         """A choice and those below it in its third argument, the outermost first."""
         chain: list[Node] = []

@@ -136,7 +136,7 @@ def _trend(
 
 
 def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
-    """The cells of each combination of all settings but the first, by the values of those that vary."""
+    """The cells of each combination of all settings but the first, labeled with the settings that vary."""
     values: dict[str, set[str]] = {}
     for cell in cells:
         for name, value in cell.values[1:]:

@@ -1,4 +1,4 @@
-"""Loops over cells as C++: world by world, row by row, sixteen floats at a time. Rows outside the region are skipped."""
+"""Loops over cells as C++: world by world, row by row, as many floats at a time as a vector holds. Rows outside the region are skipped."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ _INFIX = {"add": "+", "sub": "-", "mul": "*"}
 
 
 class Chunks(CellValues):
-    """Values of sixteen cells of one world."""
+    """Values of the cells of a chunk, in one world: floats, or flags as bits."""
 
     def __init__(self, layout: Layout, outs: tuple[Out, ...]):
         super().__init__()
@@ -22,7 +22,7 @@ class Chunks(CellValues):
         self.words: dict[str, str] = {}
         self.fields: set[str] = set()
         self.choices = [node for node in ordered(out.value for out in outs) if node.op == "select"]
-        self.led: dict[str, tuple[list[str], dict[int, str], list[str]]] = {}
+        self.blocks: dict[str, tuple[list[str], dict[int, str], list[str]]] = {}
         """Lines that run only where a comparison holds somewhere in the chunk, by the comparison's name."""
 
     def temporary(self, text: str, type: str = "F", prefix: str = "v") -> str:
@@ -30,24 +30,6 @@ class Chunks(CellValues):
         name = f"{prefix}{self.count}"
         self.lines.append(f"const {type} {name} = {text};")
         return name
-
-    def of(self, root: Node) -> str:
-        """The name of a value: sixteen floats or sixteen bits."""
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if node.op == "select":
-                self.choice(node)
-            elif node.op == "led":
-                self.under(node)
-            elif ready or not node.args or node.op == "shift":
-                self.known[id(node)] = self.node(node)
-            else:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-        return self.known[id(root)]
 
     def row(self, field: str, dy: int, *, wraps: bool = True) -> str:
         """The pointer to a field's row, set up once a row."""
@@ -64,7 +46,7 @@ class Chunks(CellValues):
         return self.words.setdefault(str(node.attr), f"m{len(self.words)}")
 
     def mask(self, node: Node) -> str:
-        """Sixteen bits of a flag's plane."""
+        """The bits of a chunk in a flag's plane."""
         return f"(u32)({self.word(node)} >> (x & 63) & ALL)"
 
     def node(self, node: Node) -> str:
@@ -117,24 +99,24 @@ class Chunks(CellValues):
         self.lines.append(f"F {name}; for (int i = 0; i < CHUNK; i++) {name}[i] = {cell};")
         return name
 
-    def under(self, node: Node) -> None:
+    def led(self, node: Node) -> str:
         """A comparison, computed only where its leader holds somewhere in the chunk."""
         leader, comparison = node.args
         first = self.of(leader)
         self.count += 1
         name = f"b{self.count}"
         self.lines.append(f"u32 {name} = 0;")
-        lines, known, ends = self.led.setdefault(first, ([], dict(self.known), []))
+        lines, known, ends = self.blocks.setdefault(first, ([], dict(self.known), []))
         outer, before = self.lines, self.known
         self.lines, self.known = lines, known
         value = self.of(comparison)
         self.lines, self.known = outer, before
         ends.append(f"{name} = {value} & {first};")
-        self.known[id(node)] = name
+        return name
 
     def close(self) -> None:
         """Append the lines that depend on comparisons."""
-        for first, (lines, _, ends) in self.led.items():
+        for first, (lines, _, ends) in self.blocks.items():
             self.lines.append(f"if ({first}) {{ {' '.join([*lines, *ends])} }}")
 
     def choice(self, node: Node) -> None:

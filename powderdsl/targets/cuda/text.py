@@ -222,23 +222,6 @@ class _Cells(CellValues):
         self.lines.append(f"const float {name} = {text};")
         return name
 
-    def of(self, root: Node) -> str:
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if node.op == "select":
-                self.choice(node)
-            elif node.op == "led":
-                self.known[id(node)] = self.led(node)
-            elif ready or not node.args or node.op == "shift":
-                self.known[id(node)] = self.node(node)
-            else:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-        return self.known[id(root)]
-
     def nested(self, root: Node, known: dict[int, str]) -> tuple[list[str], str]:
         """Statements of a block, and the value that it computes."""
         outer, self.lines = self.lines, []
