@@ -123,10 +123,13 @@ def test_rounds_are_interleaved():
     now, done = 0.0, []
 
     def work(name, seconds):
-        def run():
+        def run(watch):
             nonlocal now
             done.append(name)
-            now += seconds
+            now += 1000
+            for _ in range(2):
+                with watch:
+                    now += seconds / 2
 
         return run
 

@@ -125,3 +125,59 @@ def test_without_a_compiler_arrays_are_measured(monkeypatch):
 def test_help_says_what_the_workloads_are():
     text = powderdsl("bench", "--help").stdout
     assert all(f"\n    {name} " in text for name in ("gusts", "shapes", "noise", "few"))
+
+
+# Programs beside the backends
+
+PROGRAM = """
+CALLS = []
+
+
+def load(state):
+    assert state["element"].shape == (2, 6, 8)
+    assert not state["element"][0, 0, 0] == 99
+    state["element"][:] = 99  # a program may write into the worlds that it is given
+    return CALLS.append
+"""
+
+
+def test_a_program_is_measured_beside_a_backend(tmp_path):
+    (tmp_path / "mine.py").write_text(PROGRAM)
+    result = powderdsl(*TORCH, "--beside", "mine.py", "--out", "x.json")
+    assert result.exit_code == 0, result.stderr
+    assert "÷ mine" in result.stdout
+    data = json.loads((tmp_path / "x.json").read_text())
+    torch, mine = data["cells"]
+    assert (torch["backend"], mine["backend"], data["programs"]) == ("torch", "mine", ["mine"])
+    assert mine["beside"] == {"mine": 1.0}
+    assert torch["beside"]["mine"] > 1
+    assert len(mine["round_seconds"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("def load(state)\n    pass\n", "bad.py:1: SyntaxError"),
+        ("x = 1\n", "does not define `load(state)`"),
+        ("def load(state):\n    pass\n", "does not return a function"),
+        ("def load(state):\n    return state['lava']\n", "bad.py:2: KeyError"),
+        (
+            "def load(state):\n    def run(steps):\n        1 / 0\n    return run\n",
+            "bad.py:3: ZeroDivisionError",
+        ),
+        ("import no_such_module\n", "bad.py:1: ModuleNotFoundError"),
+    ],
+)
+def test_a_program_with_a_mistake_is_named_with_its_line(tmp_path, text, words):
+    (tmp_path / "bad.py").write_text(text)
+    result = powderdsl(*TORCH, "--beside", "bad.py")
+    assert result.exit_code == exits.BAD_INPUT
+    assert words in result.stderr
+
+
+def test_a_program_cannot_be_named_as_a_backend(tmp_path):
+    (tmp_path / "torch.py").write_text(PROGRAM)
+    result = powderdsl(*TORCH, "--beside", "torch.py")
+    assert result.exit_code == exits.BAD_INPUT
+    assert "`torch` is the name of another program or of a backend" in result.stderr
+    assert powderdsl(*TORCH, "--beside", "missing.py").exit_code == exits.BAD_INPUT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from powderdsl.experiments.bench.machine import load_average, this_machine
 from powderdsl.experiments.bench.measure import measuring
 from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
+from powderdsl.experiments.bench.programs import read_program
 from powderdsl.experiments.bench.report import CellFigures, Report, make_report, report_data, report_text
 from powderdsl.model.state import fitting
 from powderdsl.system.writing import write_text
@@ -46,6 +48,14 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.integer("--elements", 1, 256, "Use only the first N elements in the worlds.", multiple=True)
 @click.option("--only", metavar="NAME,NAME", callback=_names, help="Use only these elements in the worlds.")
 @opt.integer("--threads", 1, 1024, "CPU threads.", (1,), multiple=True)
+@click.option(
+    "--beside",
+    "programs",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE.py",
+    multiple=True,
+    help="Also measure a program of yours that makes the same steps: `load(state)` returns `run(steps)`.",
+)
 @opt.choice("--workload", list(WORKLOADS), "The worlds to start from.", "gusts")
 @opt.device
 @opt.integer("--steps", 1, 1 << 20, "Maximum steps per call.", 16)
@@ -63,6 +73,7 @@ def command(
     sizes: tuple[tuple[int, int], ...],
     device: str,
     settings: dict[str, str],
+    programs: tuple[Path, ...],
     as_json: bool,
     data: Path | None,
     plot: Path | None,
@@ -85,9 +96,11 @@ def command(
             backends=backends or _usual_backends(device),
             sizes=sizes or ((fitting(ruleset, 64),) * 2,),
             device=device,
+            programs=[read_program(file) for file in programs],
             **asked,
         )
-    report, interrupt = _measured(plan)
+    with user_values() if plan.programs else nullcontext():
+        report, interrupt = _measured(plan)
     if as_json:
         print_json(report_data(report))
     else:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from powderdsl.experiments.bench.machine import load_average, peak_growth, this_machine
 from powderdsl.experiments.bench.plan import Cell, Plan, start_worlds
+from powderdsl.experiments.bench.programs import Program, State
 from powderdsl.experiments.bench.report import CellFigures, Report, make_report
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
     threads = torch.get_num_threads()
     try:
         simulators: dict[tuple[str, int], tuple[Simulator, float]] = {}
-        runs = []
+        runs: list[_Run | _ProgramRun] = []
         for cell in plan.cells:
             yield "compile", cell
             run, figures = _make_ready(plan, cell, simulators)
@@ -63,18 +64,39 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
         torch.set_num_threads(threads)
 
 
+@dataclass
+class Stopwatch:
+    """Adds up the seconds, and the processor's, that are spent within `with` blocks of it."""
+
+    clock: Clock = time.perf_counter
+    processor: Clock = time.process_time
+    seconds: float = 0.0
+    processor_seconds: float = 0.0
+
+    def __enter__(self) -> None:
+        self.seconds -= self.clock()
+        self.processor_seconds -= self.processor()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds += self.clock()
+        self.processor_seconds += self.processor()
+
+
 def interleaved(
-    works: Sequence[Callable[[], None]],
+    works: Sequence[Callable[[Stopwatch], None]],
     rounds: int,
     clock: Clock = time.perf_counter,
     processor: Clock = time.process_time,
 ) -> Iterator[tuple[int, int, float, float]]:
-    """Do each work once, then each once more, and so on; yields (round, index of the work, seconds, processor seconds)."""
+    """Do each work once, then each once more, and so on; yields (round, index of the work, seconds, processor seconds).
+
+    A work gets a stopwatch for what is to be timed.
+    """
     for number in range(rounds):
         for index, work in enumerate(works):
-            began, used = clock(), processor()
-            work()
-            yield number, index, clock() - began, processor() - used
+            watch = Stopwatch(clock, processor)
+            work(watch)
+            yield number, index, watch.seconds, watch.processor_seconds
 
 
 @dataclass
@@ -103,13 +125,14 @@ class _Run:
         synchronize(self.sim)
         return after, max(time.perf_counter() - began, 1e-9)
 
-    def sample(self) -> None:
+    def sample(self, watch: Stopwatch) -> None:
         import torch
 
         torch.set_num_threads(self.threads)
-        for _ in range(self.calls):
-            self.sim.step(self.world, self.steps)
-        synchronize(self.sim)
+        with watch:
+            for _ in range(self.calls):
+                self.sim.step(self.world, self.steps)
+            synchronize(self.sim)
 
     def costs(self) -> tuple[tuple[str, float], ...]:
         """Seconds a world and step of each pass; empty if the backend cannot say."""
@@ -128,6 +151,48 @@ class _Run:
         return tuple((name, spent / world_steps) for name, spent in seconds.items())
 
 
+@dataclass
+class _ProgramRun:
+    """A cell of another program: `calls` times, its worlds are loaded, untimed, and make `steps` steps."""
+
+    program: Program
+    state: State
+    threads: int
+    steps: int = 1
+    calls: int = 1
+    first: float = 0.0
+
+    def begin(self, most_steps: int, budget: float) -> None:
+        """Make the first step, and find out how many calls fit into `budget` seconds, loading included."""
+        self.first = self._timed(1)[1]
+        self.steps = max(1, min(most_steps, int(budget / max(self._timed(1)[1], 1e-9))))
+        self.calls = max(1, int(budget / max(self._timed(self.steps)[0], 1e-9)))
+
+    def _timed(self, steps: int) -> tuple[float, float]:
+        """Seconds of a call with and without loading."""
+        began = time.perf_counter()
+        run = self.program.load(self._copy())
+        loaded = time.perf_counter()
+        run(steps)
+        return time.perf_counter() - began, time.perf_counter() - loaded
+
+    def _copy(self) -> State:
+        return {name: values.copy() for name, values in self.state.items()}
+
+    def sample(self, watch: Stopwatch) -> None:
+        import torch
+
+        torch.set_num_threads(self.threads)
+        for _ in range(self.calls):
+            run = self.program.load(self._copy())
+            with watch:
+                run(self.steps)
+
+    def costs(self) -> tuple[tuple[str, float], ...]:
+        """Nobody knows a program's passes."""
+        return ()
+
+
 def synchronize(sim: Simulator) -> None:
     """Wait for what a GPU still has to do."""
     import torch
@@ -138,13 +203,16 @@ def synchronize(sim: Simulator) -> None:
 
 def _make_ready(
     plan: Plan, cell: Cell, simulators: dict[tuple[str, int], tuple[Simulator, float]]
-) -> tuple[_Run, CellFigures]:
+) -> tuple[_Run | _ProgramRun, CellFigures]:
     """Compile a cell's backend unless another cell has, and run the first calls."""
     import torch
 
     from powderdsl.simulation.simulator import compile
 
     torch.set_num_threads(cell.threads)
+    program = plan.program(cell)
+    if program is not None:
+        return _program_ready(plan, cell, program)
     key = (cell.backend, cell.threads)
     if key not in simulators:
         began = time.perf_counter()
@@ -157,3 +225,15 @@ def _make_ready(
     run = _Run(sim, start, cell.threads)
     memory = peak_growth(lambda: run.begin(plan.steps, plan.seconds / plan.rounds), plan.device)
     return run, CellFigures(cell, compiling, run.first, memory, state_bytes, run.steps, run.calls)
+
+
+def _program_ready(plan: Plan, cell: Cell, program: Program) -> tuple[_ProgramRun, CellFigures]:
+    """Load the worlds that the backends start from into another program, and run the first calls."""
+    from powderdsl.simulation.simulator import compile
+
+    start = start_worlds(compile(plan.ruleset, "reference"), cell, plan.workload, plan.seed)
+    state = {name: values.numpy() for name, values in start.state.items()}
+    run = _ProgramRun(program, state, cell.threads)
+    memory = peak_growth(lambda: run.begin(plan.steps, plan.seconds / plan.rounds), "cpu")
+    state_bytes = sum(values.nbytes for values in state.values())
+    return run, CellFigures(cell, 0.0, run.first, memory, state_bytes, run.steps, run.calls)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from powderdsl.analysis.reactions import moved_ids
 from powderdsl.compiler import BACKENDS, current_backend
 from powderdsl.diagnostics import suggest
+from powderdsl.experiments.bench.programs import Program
 from powderdsl.model.state import check_sides
 from powderdsl.model.types import Field, Ruleset
 from powderdsl.worlds.raster import Size, mask
@@ -37,7 +38,10 @@ MAX_SECONDS = 3600.0
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination of the cross product. `size` is (rows, columns) of a world, `elements` are in the worlds."""
+    """One combination of the cross product. `size` is (rows, columns) of a world, `elements` are in the worlds.
+
+    `backend` may be the name of a program that is measured beside the backends.
+    """
 
     backend: str
     batch: int
@@ -73,6 +77,11 @@ class Plan:
     seconds: float
     rounds: int
     profile: bool
+    programs: tuple[Program, ...] = ()
+
+    def program(self, cell: Cell) -> Program | None:
+        """The program that a cell measures, unless it measures a backend."""
+        return next((one for one in self.programs if one.name == cell.backend), None)
 
 
 def make_plan(
@@ -91,6 +100,7 @@ def make_plan(
     seconds: float = 2.0,
     rounds: int = 5,
     profile: bool = False,
+    programs: Sequence[Program] = (),
 ) -> Plan:
     """The plan of a cross product of backends, batches, sizes (rows, columns), elements and threads.
 
@@ -101,6 +111,7 @@ def make_plan(
         steps: maximum steps of a call.
         seconds: measured time of each cell, all rounds together.
         profile: time each pass too.
+        programs: other programs for the same rules, measured beside the backends.
 
     Raises:
         KeyError: an unknown backend, workload or element. ValueError: numbers out of range.
@@ -112,6 +123,10 @@ def make_plan(
     for backend in backends:
         if backend not in BACKENDS:
             raise KeyError(f"no backend `{backend}`; {'; '.join(suggest(backend, BACKENDS, 'backends'))}")
+    names = [program.name for program in programs]
+    for name in names:
+        if name in BACKENDS or names.count(name) > 1:
+            raise ValueError(f"programs: `{name}` is the name of another program or of a backend")
     counts = {"batches": batches, "threads": threads, "steps": (steps,), "rounds": (rounds,)}
     for name, numbers in {**counts, "sizes": [side for size in sizes for side in size]}.items():
         if not numbers or min(numbers) < 1:
@@ -124,14 +139,16 @@ def make_plan(
         check_cells(batch, size)
     chosen = _elements(ruleset, workload, elements, only)
     points = product(
-        dict.fromkeys(backends),
+        dict.fromkeys([*backends, *names]),
         dict.fromkeys(sizes),
         dict.fromkeys(chosen),
         dict.fromkeys(threads),
         dict.fromkeys(batches),
     )
-    cells = tuple(Cell(backend, batch, size, names, count) for backend, size, names, count, batch in points)
-    return Plan(ruleset, cells, workload, device, seed, steps, seconds, rounds, profile)
+    cells = tuple(
+        Cell(backend, batch, size, present, count) for backend, size, present, count, batch in points
+    )
+    return Plan(ruleset, cells, workload, device, seed, steps, seconds, rounds, profile, tuple(programs))
 
 
 def _elements(

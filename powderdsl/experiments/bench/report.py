@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -124,11 +125,12 @@ def report_data(report: Report) -> dict[str, Any]:
         "seed": plan.seed,
         "rounds": plan.rounds,
         "interrupted": report.interrupted,
-        "cells": [_cell_data(figures) for figures in report.cells],
+        "programs": [program.name for program in plan.programs],
+        "cells": [_cell_data(figures, report) for figures in report.cells],
     }
 
 
-def _cell_data(figures: CellFigures) -> dict[str, Any]:
+def _cell_data(figures: CellFigures, report: Report) -> dict[str, Any]:
     cell = figures.cell
     seconds, growth, cells = figures.world_step_seconds, figures.memory.growth, cell.cells
     return {
@@ -153,6 +155,9 @@ def _cell_data(figures: CellFigures) -> dict[str, Any]:
         "microseconds_per_world_step": seconds.scaled(1e6),
         "processor_microseconds_per_world_step": figures.processor_step_seconds.scaled(1e6),
         "nanoseconds_per_cell_step": seconds.scaled(1e9 / cell.world_cells),
+        "beside": {
+            program.name: ratio(figures, report.cells, program.name) for program in report.plan.programs
+        },
         "passes": [
             {"name": name, "microseconds_per_world_step": spent * 1e6, "share": share}
             for name, spent, share in pass_shares(figures)
@@ -180,7 +185,7 @@ def report_text(report: Report) -> str:
     """The whole report, without a newline at its end."""
     parts = [header(report)]
     if report.cells:
-        parts.append(cell_table(report.cells))
+        parts.append(cell_table(report.cells, [program.name for program in report.plan.programs]))
         parts.append("\n".join(_footnotes(report)))
     if any(figures.passes for figures in report.cells):
         parts.append(pass_table(report.cells))
@@ -212,8 +217,11 @@ def header(report: Report) -> str:
     return "\n".join(lines)
 
 
-def cell_table(cells: Sequence[CellFigures]) -> str:
-    """One line per cell. Elements and threads have columns only if cells differ in them."""
+def cell_table(cells: Sequence[CellFigures], programs: Sequence[str] = ()) -> str:
+    """One line per cell. Elements and threads have columns only if cells differ in them.
+
+    Each of `programs` has a column: the processor time of a cell divided by the program's for the same worlds.
+    """
     columns: list[tuple[str, Callable[[CellFigures], str]]] = [
         ("backend", lambda one: one.cell.backend),
         ("batch", lambda one: f"{one.cell.batch:,}"),
@@ -233,8 +241,25 @@ def cell_table(cells: Sequence[CellFigures]) -> str:
         ("to first step", lambda one: f"{one.to_first_step:.2f} s"),
         ("memory", _memory),
         ("state", lambda one: f"{one.state_bytes / one.cell.cells:.3g} B/cell"),
+        *((f"÷ {name}", partial(_times, cells, name)) for name in programs),
     ]
     return aligned([[name for name, _ in columns], *([show(one) for _, show in columns] for one in cells)])
+
+
+def ratio(figures: CellFigures, cells: Iterable[CellFigures], backend: str) -> float | None:
+    """The median processor time of a cell divided by that of a backend or program for the same worlds."""
+    other = replace(figures.cell, backend=backend)
+    for one in cells:
+        if one.cell == other and (spent := one.processor_step_seconds.median):
+            return figures.processor_step_seconds.median / spent
+    return None
+
+
+def _times(cells: Sequence[CellFigures], backend: str, figures: CellFigures) -> str:
+    times = ratio(figures, cells, backend)
+    if times is None:
+        return "?"
+    return number(times) if times >= 0.1 else f"1/{number(1 / times)}"
 
 
 def pass_table(cells: Sequence[CellFigures]) -> str:
@@ -298,4 +323,6 @@ def _footnotes(report: Report) -> list[str]:
         "state: the worlds' tensors, which are there before memory is measured",
     ]
     hows = dict.fromkeys(figures.memory.how for figures in report.cells)
+    if plan.programs:
+        notes.append("÷: processor time divided by that of another program, from the same worlds")
     return [*notes, *(f"memory: {how}" for how in hows)]
