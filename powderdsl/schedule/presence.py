@@ -30,6 +30,10 @@ MAX_SETS = 4
 
 _ELEMENT = "element:"
 
+Time = tuple[int, int]
+ALWAYS: Time = (0, 1 << 30)
+"""A half-open range of changes of the element."""
+
 Sets = frozenset[int]
 """Sets of ids (bits of a word): at least one id of each must be present."""
 
@@ -44,13 +48,14 @@ def presence(schedule: Schedule) -> Schedule:
     if not bits:
         return schedule
     body: list[Statement] = []
+    times = _times(schedule, bits)
     for i, statement in enumerate(schedule.body):
         after = schedule.body[i + 1] if i + 1 < len(schedule.body) else None
         match statement:
             case Compute(outs) if isinstance(after, Guard):
                 asked = {node.attr for node in after.when if node.op == "load"}
                 if asked == {out.var.name for out in outs}:
-                    when = _asked([out.value for out in outs], bits, schedule.graph)
+                    when = _asked([out.value for out in outs], bits, times, schedule.graph)
                     statement = replace(statement, when=when)
                 body.append(statement)
             case Guard(_, inner, keeps):
@@ -86,6 +91,33 @@ def _element_bits(schedule: Schedule) -> dict[str, int]:
             if known in bits:
                 bits.setdefault(other, bits[known])
     return bits if max(bits.values(), default=MAX_PLANES) < MAX_PLANES else {}
+
+
+def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
+    """From when until when each variable of `bits` holds the current bit, counted in changes of the element.
+
+    Bits that change one after the other are one change, until one of them changes again.
+    """
+    change, changed = 0, set[int]()
+    current: dict[int, str] = {}
+    begins: dict[str, int] = {}
+    ends: dict[str, int] = {}
+    assigned = [var.name for _, var in schedule.finds]
+    for statement in flat(schedule.body):
+        if isinstance(statement, Compute):
+            assigned += [out.var.name for out in statement.outs]
+    for name in assigned:
+        if name not in bits:
+            continue
+        bit = bits[name]
+        if bit in changed:
+            change, changed = change + 1, set()
+        changed.add(bit)
+        begins[name] = change
+        if bit in current:
+            ends[current[bit]] = change
+        current[bit] = name
+    return {name: (begins[name], ends.get(name, change + 1)) for name in begins}
 
 
 def _only_swaps(guard: Guard, olds: dict[str, Node]) -> bool:
@@ -130,12 +162,12 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
             name = str(old.attr)
         if found.get(name) != slot:
             return None
-    return _asked(asked, bits, schedule.graph)
+    return _asked(asked, bits, {}, schedule.graph)
 
 
-def _asked(masks: list[Node], bits: dict[str, int], graph: Graph) -> Node | None:
+def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], graph: Graph) -> Node | None:
     """An answer that is true whenever one of some masks holds anywhere; None if none is known."""
-    needs = _Needs(1 + max(bits.values()), bits)
+    needs = _Needs(1 + max(bits.values()), bits, times)
     ways = dict.fromkeys(needs.of(mask) for mask in masks)
     if not ways or frozenset() in ways:
         return None
@@ -155,10 +187,15 @@ def asked_ids(schedule: Schedule) -> int:
 @dataclass
 class _Needs:
     """For each flag: the ids for which it holds, if it depends on the cell's element alone; the ids that a cell
-    can have where it holds; and sets of ids of each of which one must be present somewhere."""
+    can have where it holds; and sets of ids of each of which one must be present somewhere.
+
+    A cell has an id at a time: bits from before and after a change say nothing together.
+    """
 
     planes: int
     bits: dict[str, int]
+    times: dict[str, Time]
+    time: dict[int, Time] = field(default_factory=dict)
     exact: dict[int, int | None] = field(default_factory=dict)
     cell: dict[int, int] = field(default_factory=dict)
     sets: dict[int, Sets] = field(default_factory=dict)
@@ -173,11 +210,28 @@ class _Needs:
     def of(self, mask: Node) -> Sets:
         """Sets of ids of each of which one must be present for the mask to hold anywhere."""
         for node in ordered([mask]):
-            if id(node) not in self.exact:
-                exact = self.exact[id(node)] = self._exact(node)
-                self.cell[id(node)] = self._cell(node) if exact is None else exact
-                self.sets[id(node)] = frozenset() if exact is not None else self._sets(node)
+            key = id(node)
+            if key in self.exact:
+                continue
+            begin, end = self.time[key] = self._time(node)
+            exact = self.exact[key] = self._exact(node) if begin < end else None
+            if begin >= end:
+                self.cell[key], self.time[key] = self.everything, ALWAYS
+            else:
+                self.cell[key] = self._cell(node) if exact is None else exact
+            self.sets[key] = frozenset() if exact is not None else self._sets(node)
         return self._all(mask)
+
+    def _time(self, node: Node) -> Time:
+        """When the cell's ids are those that `exact` and `cell` know; empty if they never are together."""
+        if node.op == "load":
+            return self.times.get(str(node.attr), ALWAYS)
+        if node.op not in ("and", "or", "xor", "not", "select"):
+            return ALWAYS
+        times = [self.time[id(arg)] for arg in node.args if self.cell[id(arg)] != self.everything]
+        return max([begin for begin, _ in times], default=0), min(
+            [end for _, end in times], default=ALWAYS[1]
+        )
 
     def _all(self, node: Node) -> Sets:
         cell = self.cell[id(node)]

@@ -99,6 +99,28 @@ def test_random_rulesets(seed: int, stages: tuple[Stage, ...]) -> None:
     run_stages(load_text(random_ruleset_text(seed), f"seed{seed}.yaml"), stages)
 
 
+BEFORE_AND_AFTER = """
+pack: marks
+elements:
+  ground: {id: 0, color: '#000000'}
+  block: {id: 8, color: '#808080'}
+passes:
+  move:
+    conflicts: first_wins
+    let:
+      was_free: here not in block
+    do: block swaps right, with chance 0.5
+    then:
+      - block swaps below if was_free
+"""
+
+
+@pytest.mark.parametrize("stages", PLANNERS.values(), ids=PLANNERS)
+def test_a_mask_may_depend_on_a_cell_before_and_after_it_changed(stages: tuple[Stage, ...]) -> None:
+    """`presence` took the element before a swap for that after it: no cell is a block and is not."""
+    run_stages(load_text(BEFORE_AND_AFTER, "marks.yaml"), stages)
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize("stages", PLANNERS.values(), ids=PLANNERS)
 def test_many_random_rulesets(stages: tuple[Stage, ...]) -> None:
