@@ -21,8 +21,9 @@ from tests.compilers import skip_without_compiler
 from tests.fuzz.compare import find_difference
 
 MOMENTS = (1, 2, 5, 10, 100, 1000)
-SHAPES = [(2, 9, 130), (3, 33, 17)]
-"""Widths that end inside a word: more than two words, less than one."""
+SHAPES = [(2, 9, 130), (3, 33, 17), (9, 16, 64), (1, 24, 128)]
+"""Widths that end inside a word, more than two words and less than one; whole words, for which native code has a library
+each, in more worlds than lie side by side, and as strips of one world."""
 
 
 def complete(name: str) -> bool:
@@ -58,6 +59,9 @@ def run_all_backends(name: str, shape: tuple[int, int, int], moments: Sequence[i
         together = start.world(simulator)
         for step, state in states(together, moments):
             assert find_difference(expected[step], state) is None, (backend, step)
+        if backend == "native":
+            for step, state in states(start.world(compile_ruleset(ruleset, backend, threads=2)), moments):
+                assert find_difference(expected[step], state) is None, (backend, "two threads", step)
         for i in (0, len(together) - 1):
             for step, state in states(together.select([i]), moments):
                 wanted = {slot: value[i : i + 1] for slot, value in expected[step].items()}
