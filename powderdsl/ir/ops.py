@@ -11,7 +11,7 @@ from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
+from powderdsl.ir.single import divided, larger, single, smaller, square_root
 
 Offset = tuple[int, int]
 
@@ -53,8 +53,7 @@ class Threshold:
 class Op:
     """A row of the table: argument types (`?` any, `=` all alike, `*` any number of them), result, what `attr` is.
 
-    `evaluate` gives the result for `attr` and the values of the arguments, numbers or NumPy arrays: stages fold
-    constants with it. None where the result depends on more than these, or is a choice between planes.
+    `evaluate` gives the result for `attr` and the values of the arguments, with which stages fold constants. None where the result depends on more than these, or is a choice between planes.
     """
 
     name: str
@@ -65,22 +64,19 @@ class Op:
     evaluate: Callable[..., Any] | None = None
 
 
-def _divide(attr: None, a: Any, b: Any) -> Any:
-    return np.where(b == 0, np.float32(0), a / b)[()]
-
-
-def _quotient(attr: None, a: Any, b: Any) -> Any:
-    return np.where(b == 0, 0, a // np.where(b == 0, 1, b))[()]
-
-
-def _settle(attr: tuple[float, float], a: Any) -> Any:
-    kept = np.clip(a, np.float32(attr[0]), np.float32(attr[1]))
-    return np.where(np.abs(kept) >= np.float32(SNAP), kept, np.float32(0))[()]  # NaN is not ≥ SNAP
+def _settle(attr: tuple[float, float], a: float) -> float:
+    kept = smaller(larger(a, single(attr[0])), single(attr[1]))
+    return kept if abs(kept) >= SNAP else 0.0  # NaN is not ≥ SNAP
 
 
 def _plain(evaluate: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of the arguments alone."""
-    return lambda attr, *args: evaluate(*args)
+    """A function of the arguments alone; floats are rounded to float32."""
+
+    def result(attr: None, *args: Any) -> Any:
+        found = evaluate(*args)
+        return single(found) if isinstance(found, float) else found
+
+    return result
 
 
 # fmt: off
@@ -113,14 +109,14 @@ _TABLE = (
     Op("add", ("=", "="), "=", evaluate=_plain(operator.add)),
     Op("sub", ("=", "="), "=", evaluate=_plain(operator.sub)),
     Op("mul", ("=", "="), "=", evaluate=_plain(operator.mul)),
-    Op("div", ("real", "real"), "real", about="x / 0 is 0", evaluate=_divide),
-    Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0", evaluate=_quotient),
+    Op("div", ("real", "real"), "real", about="x / 0 is 0", evaluate=_plain(divided)),
+    Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0", evaluate=_plain(lambda a, b: a // b if b else 0)),
     Op("neg", ("?",), "=", evaluate=_plain(operator.neg)),
     Op("abs", ("?",), "=", evaluate=_plain(abs)),
-    Op("min", ("=", "="), "=", evaluate=_plain(np.minimum)),
-    Op("max", ("=", "="), "=", evaluate=_plain(np.maximum)),
+    Op("min", ("=", "="), "=", evaluate=_plain(smaller)),
+    Op("max", ("=", "="), "=", evaluate=_plain(larger)),
     Op("mod", ("int",), "int", "modulus", evaluate=lambda modulus, a: a % modulus),
-    Op("sqrt", ("real",), "real", evaluate=_plain(np.sqrt)),
+    Op("sqrt", ("real",), "real", evaluate=_plain(square_root)),
     Op("to_real", ("?",), "real"),
     Op("settle", ("real",), "real", "(low, high)", "NaN → 0, clamped to the bounds, smaller than SNAP → 0", _settle),
     # choices and movements

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from powderdsl.ir.build import Builder
 from powderdsl.ir.gates import Gates
 from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, SubstepGraph, nodes_of
+from powderdsl.ir.single import single
 
 WORTH = 0.75
 """A calm form must have at most this share of the pass's nodes."""
@@ -53,11 +52,9 @@ def _quiet(node: Node, args: list[Node], gates: Gates) -> Node:
     if op == "input" and node.type == REAL:
         return build.real(0.0)
     if known and args[0].type == REAL:
-        values = [np.float32(arg.attr) for arg in args]
-        with np.errstate(all="ignore"):
-            if evaluate is not None:
-                found = evaluate(node.attr, *values)
-                return build.flag(bool(found)) if node.type == FLAG else build.real(float(found))
+        if evaluate is not None:
+            found = evaluate(node.attr, *(single(arg.attr) for arg in args))
+            return build.flag(bool(found)) if node.type == FLAG else build.real(found)
         if op == "shift" and (node.attr[2] or not args[0].attr):
             return args[0]
     if op == "select" and args[0].op == "const":

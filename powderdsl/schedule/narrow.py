@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node
+from powderdsl.ir.single import single
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -126,13 +125,13 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
         if id(node) in memo:
             return memo[id(node)]
         if node.op == "load":
-            result: Any = np.float32(0)
+            result: Any = 0.0
         elif node.op == "led" and node.args[0].op == "load":
             result = visit(node.args[1])
             if result:  # the result depends on the flag
                 raise LookupError
         elif node.op == "const":
-            result = np.float32(node.attr)
+            result = single(node.attr)
         elif node.op == "select":
             masks[id(node.args[0])] = node.args[0]
             result = visit(node.args[2])
@@ -152,12 +151,11 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
         memo[id(node)] = result
         return result
 
-    with np.errstate(all="ignore"):
-        try:
-            found = [visit(value) for value in values]
-        except LookupError:
-            return None
-    if any(isinstance(number, np.floating) and number != 0 for number in found):
+    try:
+        found = [visit(value) for value in values]
+    except LookupError:
+        return None
+    if any(isinstance(number, float) and number != 0 for number in found):
         return None
     return found, list(masks.values())
 

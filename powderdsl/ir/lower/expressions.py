@@ -9,10 +9,9 @@ from functools import partial
 from math import ceil, floor
 from typing import Any
 
-import numpy as np
-
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, REAL, Node, Threshold, component_names, integer, kernel_rows
+from powderdsl.ir.single import single
 from powderdsl.model.types import Expr, Kernel, Property, Ruleset
 
 Pair = tuple[Node, Node]
@@ -95,7 +94,7 @@ def _const(expr: Expr, at: Inputs) -> Node:
 
 def _float32(value: object) -> float:
     """A constant as the float32 it is rounded to, going through float64 as the reference does."""
-    return float(np.float32(float(value)))  # type: ignore[arg-type]  # a constant is a number
+    return single(float(value))  # type: ignore[arg-type]  # a constant is a number
 
 
 def _property(expr: Expr, at: Inputs) -> Node:

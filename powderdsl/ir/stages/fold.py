@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from math import frexp
 
-import numpy as np
-
 from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, OPS, REAL, Node
 from powderdsl.ir.rewrite import Rules
+from powderdsl.ir.single import following, preceding, single, square_root
 
 FOLD = Rules()
 
@@ -176,15 +175,15 @@ def _root(node: Node, build: Builder) -> Node | None:
     """c < √x = c' < x, where c' is the last float whose root does not exceed c: roots are rounded, but never out of order."""
     if node.args[1].op != "sqrt" or node.args[0].op != "const":
         return None
-    limit = np.float32(node.args[0].attr)
+    limit = single(node.args[0].attr)
     if not 0 <= limit < 1e18:  # its square must be finite
         return None
-    square = np.float32(limit) * np.float32(limit)
-    while np.sqrt(square) > limit:
-        square = np.nextafter(square, np.float32(0))
-    while np.sqrt(after := np.nextafter(square, np.float32(np.inf))) <= limit:
+    square = single(limit * limit)
+    while square_root(square) > limit:
+        square = preceding(square)
+    while square_root(after := following(square)) <= limit:
         square = after
-    return build.compare("lt", build.real(float(square)), node.args[1].args[0])
+    return build.compare("lt", build.real(square), node.args[1].args[0])
 
 
 @FOLD.on("inside")

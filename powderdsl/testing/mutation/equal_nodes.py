@@ -369,10 +369,14 @@ _EVALUATE: dict[str, Callable[..., Any]] = {
     "xor": lambda attr, a, b: a ^ b,
     "in_set": lambda attr, a: np.isin(a, sorted(attr)),
     "table": lambda attr, a: np.asarray(attr, np.int32)[np.clip(a, 0, len(attr) - 1)],
+    "min": lambda attr, a, b: np.minimum(a, b),
+    "max": lambda attr, a, b: np.maximum(a, b),
+    "quotient": lambda attr, a, b: np.where(b == 0, 0, a // np.where(b == 0, 1, b)),
     "select": lambda attr, c, a, b: np.where(c != 0, a, b),
     "swap": lambda attr, moves, there, target, back, rest: np.where(
         moves != 0, there, np.where(target != 0, back, rest)
     ),
     "arrive": lambda attr, target, back, rest: np.where(target != 0, back, rest),
 }
-"""Exact evaluation of the operations that read cells, look up values, or work on flags; `OPS` has the arithmetic."""
+"""Exact evaluation of the operations that read cells, look up values, or work on flags, and of those that `OPS` has for
+numbers only."""

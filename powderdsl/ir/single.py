@@ -1,0 +1,53 @@
+"""Float32 arithmetic on Python's numbers, which are float64: round after each operation, and the result is exact.
+
+Sums, differences, products, quotients and roots of float32 values that are rounded to float64 and then to float32 are
+rounded correctly (Figueroa 1995: 53 bits are at least 2·24 + 2).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from array import array
+
+
+def single(value: float) -> float:
+    """The nearest float32; infinite beyond the largest."""
+    return array("f", (value,))[0]
+
+
+def _bits(value: float) -> int:
+    """The 32 bits of a float32."""
+    return int.from_bytes(struct.pack("<f", value), "little")
+
+
+def following(value: float) -> float:
+    """The next larger float32 after one that is 0 or more and finite."""
+    found: float = struct.unpack("<f", struct.pack("<I", _bits(abs(value)) + 1))[0]
+    return found
+
+
+def preceding(value: float) -> float:
+    """The next smaller float32 before one above 0."""
+    found: float = struct.unpack("<f", struct.pack("<I", _bits(value) - 1))[0]
+    return found
+
+
+def square_root(value: float) -> float:
+    """The square root; NaN below 0."""
+    return single(math.sqrt(value)) if value >= 0 else math.nan
+
+
+def divided(a: float, b: float) -> float:
+    """a / b; 0 where b is 0."""
+    return single(a / b) if b != 0 else 0.0
+
+
+def smaller(a: float, b: float) -> float:
+    """The minimum; NaN if either is."""
+    return math.nan if a != a or b != b else min(a, b)
+
+
+def larger(a: float, b: float) -> float:
+    """The maximum; NaN if either is."""
+    return math.nan if a != a or b != b else max(a, b)
