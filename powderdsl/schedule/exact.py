@@ -16,9 +16,6 @@ DIGITS = 23
 LEAST, MOST = -126, 127
 """Exponents of normal float32 values."""
 
-NEAR = 60
-"""Where the exponents of a dividend and of a divisor are at most this large, a quotient can be made of products."""
-
 
 @dataclass(frozen=True)
 class Size:
@@ -66,13 +63,21 @@ def exact(schedule: Schedule) -> Schedule:
             if node.op == "add" and (found := product(first)):
                 return graph.node("fused", REAL, (second, found[0], graph.node("const", REAL, (), found[1])))
         if node.op == "div" and node.args[1].op == "const" and node.args[1].attr:
-            size, divisor = known.of(node.args[0]), _constant(float(node.args[1].attr))
-            small = size is not None and -NEAR <= size.least and size.most <= NEAR
-            if small and -NEAR <= divisor.least and divisor.most <= NEAR:
+            size = known.of(node.args[0])
+            if size is not None and _is_near(size, _constant(float(node.args[1].attr))):
                 return graph.node("ratio", REAL, node.args)
         return None
 
     return map_values(schedule, rule)
+
+
+def _is_near(dividend: Size, divisor: Size) -> bool:
+    """Whether a quotient can be made of products: it is normal, and so is what a product of it leaves of the dividend.
+
+    That rest is a multiple of the last binary place of the quotient times that of the divisor.
+    """
+    least, most = dividend.least - divisor.most - 1, dividend.most - divisor.least + 1
+    return LEAST <= least - DIGITS + divisor.grid and LEAST <= least and most < MOST
 
 
 class _Sizes:
