@@ -1,32 +1,45 @@
-"""Merges consecutive loops over cells, so that values of a world are read while they are in the cache."""
+"""Merges consecutive loops over cells, so that values of a row are read while they are in the cache."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
-from powderdsl.ir.ops import REAL, Node
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node
 from powderdsl.schedule.types import (
     Compute,
+    Out,
     Schedule,
     Statement,
     Sweeps,
     flat,
-    in_order,
     loaded,
     map_blocks,
     ordered,
+    over_variables,
     values_of,
 )
 
-Read = tuple[str, int, int]
-"""A field and the rows and columns by which a read is offset."""
+FEW = 8
+"""The most operations that are applied to the result of choices while it is in registers."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """A field that is read at an offset in rows and columns, or asked whether it is zero there (`live`)."""
+
+    name: str
+    dy: int
+    dx: int
+    wraps: bool
+    live: bool
 
 
 def join(schedule: Schedule) -> Schedule:
     """Every run of consecutive loops over cells, also a single one, becomes a `Sweeps`.
 
-    `loop cells: a = …`, `loop cells: b = a[0,1] + …` → one loop over worlds, row by row.
+    `loop cells: a = …`, `loop cells: b = a[0,1|0] + …` → one loop over the rows of a world, in which `b` follows `a`
+    one row behind. Where a loop only continues the choices before it, it becomes one with them.
     """
     everything = [node for _, node in schedule.leaves]
     everything += [node for statement in flat(schedule.body) for node in values_of(statement)]
@@ -39,7 +52,13 @@ def join(schedule: Schedule) -> Schedule:
         run: list[Compute] = []
         for statement in (*block, None):
             if isinstance(statement, Compute) and statement.over in ("cells", "choices"):
-                run.append(statement)
+                if run and _asks_masks_of(statement, run):
+                    result.append(_joined(run, reads))
+                    run = []
+                if run and (one := _continued(run[-1], statement, reads, schedule.graph)):
+                    run[-1] = one
+                else:
+                    run.append(statement)
                 continue
             if run:
                 result.append(_joined(run, reads))
@@ -51,58 +70,99 @@ def join(schedule: Schedule) -> Schedule:
     return replace(schedule, body=map_blocks(schedule.body, change))
 
 
-def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
-    written = [out.var.name for loop in run for out in loop.outs if out.var.type == REAL]
-    inside = dict.fromkeys(written, 0)
-    for name in loaded(node for loop in run for node in values_of(loop)):
-        if name in inside:
-            inside[name] += 1
-    passing = {name for name in written if reads.get(name, 0) == inside[name]}
-    over = _written_over(run, passing)
-    loops = tuple(
-        replace(loop, outs=tuple(replace(out, into=over.get(out.var.name)) for out in loop.outs))
-        for loop in run
+def _asks_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
+    """Whether choices are made by flags of a run, which must be there in all rows before."""
+    flags = {out.var.name for one in run for out in one.outs if out.var.type == FLAG}
+    return loop.over == "choices" and not flags.isdisjoint(loaded(values_of(loop)))
+
+
+def _continued(first: Compute, second: Compute, reads: dict[str, int], graph: Graph) -> Compute | None:
+    """Choices and a few operations on their results as one loop, if nothing else reads these results.
+
+    `loop choices: a = m ? x : y`, `loop cells: b = 0.9 * a` → `loop choices: b = 0.9 * (m ? x : y)`.
+    """
+    made = {out.var.name: out.value for out in first.outs}
+    if first.over != "choices" or first.region is None or second.region is None:
+        return None
+    asked = list(loaded([second.region]))
+    if any(out.var.type != REAL or not _is_zero(out.otherwise) for out in second.outs):
+        return None
+    nodes = ordered(out.value for out in second.outs)
+    names = [str(node.attr) for node in nodes if node.op == "load"]
+    simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
+    if not simple or len(nodes) > FEW or not made.keys() >= {*names, *asked}:
+        return None
+    inside = list(loaded(values_of(second)))
+    if any(reads.get(name, 0) != inside.count(name) for name in made):
+        return None
+
+    def known(node: Node) -> Node | None:
+        return made[str(node.attr)] if node.op == "load" else None
+
+    outs = tuple(
+        Out(out.var, over_variables(out.value, graph, known), None, out.otherwise) for out in second.outs
     )
-    return Sweeps(loops, tuple(_parts(run)), tuple(name for name in written if name in passing))
+    return replace(first, outs=outs)
 
 
-def field_reads(loop: Compute) -> list[Read]:
-    """The fields that a loop or its region reads, with offsets."""
-    found: dict[Read, None] = {}
-    nodes: list[Node] = ordered(values_of(loop))
-    for node in nodes:
+CONTINUING = ("load", "const", "param", "add", "sub", "mul", "fused", "neg", "abs")
+"""Operations that are applied to the results of choices in registers."""
+
+
+def _is_zero(node: Node | None) -> bool:
+    return node is not None and node.op == "const" and not node.attr
+
+
+def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
+    parts, lags = _places(run)
+    written = {
+        out.var.name: part
+        for loop, part in zip(run, parts, strict=True)
+        for out in loop.outs
+        if out.var.type == REAL
+    }
+    inside = dict.fromkeys(written, 0)
+    for loop, part in zip(run, parts, strict=True):
+        for name in loaded(values_of(loop)):
+            if written.get(name) == part:
+                inside[name] += 1
+    kept = {
+        out.var.name
+        for loop in run
+        for out in loop.outs
+        if out.otherwise is not None and out.otherwise.op == "load"
+    }
+    passing = (name for name in written if reads.get(name, 0) == inside[name] and name not in kept)
+    return Sweeps(tuple(run), tuple(parts), tuple(lags), tuple(passing))
+
+
+def field_reads(loop: Compute) -> Iterator[Read]:
+    """The fields that a loop or its region reads."""
+    for node in ordered(values_of(loop)):
         if node.op == "load" and node.type == REAL:
-            found[str(node.attr), 0, 0] = None
-        elif node.op in ("shift", "live") and node.args[0].op == "load":
-            dy, dx = node.attr[:2]
-            if node.args[0].type == REAL:
-                found[str(node.args[0].attr), dy, dx if node.op == "shift" else 0] = None
-    return list(found)
+            yield Read(str(node.attr), 0, 0, True, False)
+        elif node.op in ("shift", "live") and node.args[0].op == "load" and node.args[0].type == REAL:
+            dy, dx, *wraps = node.attr
+            live = node.op == "live"
+            yield Read(str(node.args[0].attr), dy, 0 if live else dx, bool(wraps and wraps[0]), live)
 
 
-def _parts(run: Sequence[Compute]) -> list[int]:
-    """The part of each loop: a loop that reads other rows of an earlier one is in a later part."""
+def _places(run: Sequence[Compute]) -> tuple[list[int], list[int]]:
+    """The part of each loop and its lag.
+
+    A row that is read at other columns was stored a row earlier: a processor waits for what it has just stored if a load
+    does not begin where the store did.
+    """
     parts: list[int] = []
-    made: dict[str, int] = {}
+    lags: list[int] = []
+    made: dict[str, tuple[int, int]] = {}
     for loop in run:
-        far = [made[name] + 1 for name, dy, _ in field_reads(loop) if dy and name in made]
-        parts.append(max([*far, *parts[-1:]], default=0))
-        made |= {out.var.name: parts[-1] for out in loop.outs if out.var.type == REAL}
-    return parts
-
-
-def _written_over(run: Sequence[Compute], passing: set[str]) -> dict[str, str]:
-    """Fields that overwrite, cell by cell, a field of the run that their loop is the last to read."""
-    over: dict[str, str] = {}
-    earlier: set[str] = set()
-    reads = [field_reads(loop) for loop in run]
-    for number, loop in enumerate(run):
-        others = [read for i, one in enumerate(reads) if i != number for read in one]
-        later = {name for one in reads[number + 1 :] for name, _, _ in one}
-        far = {name for name, dy, _ in others if dy} | {name for name, dy, dx in reads[number] if dy or dx}
-        free = in_order({name for name, _, _ in reads[number]} & earlier & passing - later - far)
-        fields = [out.var.name for out in loop.outs if out.var.type == REAL]
-        if loop.over == "cells":
-            over |= dict(zip(fields, free, strict=False))
-        earlier |= set(fields)
-    return over
+        reads = [read for read in field_reads(loop) if read.name in made]
+        around = [made[read.name][0] + 1 for read in reads if read.wraps and read.dy]
+        parts.append(max([*around, *parts[-1:]], default=0))
+        behind = [
+            made[read.name][1] + read.dy + (read.dx != 0) for read in reads if made[read.name][0] == parts[-1]
+        ]
+        lags.append(max([0, *behind]))
+        made |= {out.var.name: (parts[-1], lags[-1]) for out in loop.outs if out.var.type == REAL}
+    return parts, lags

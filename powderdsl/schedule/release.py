@@ -56,7 +56,7 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
             statement = _updated(statement, after)
             gone -= {out.into for out in statement.outs if out.into is not None}
         elif isinstance(statement, Sweeps):
-            gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
+            gone -= set(statement.passing)
         result.append(statement)
         if gone:
             result.append(Release(tuple(in_order(gone))))
@@ -92,7 +92,8 @@ def _names(statement: Statement) -> set[str]:
 def live_before(statement: Statement, after: set[str]) -> set[str]:
     """The variables that are live before a statement, given those that are live after it."""
     live = after - {var.name for var in defined_by(statement)}
-    return live | (reads(statement) - made_in([statement]))
+    passing = set(statement.passing) if isinstance(statement, Sweeps) else set()
+    return live | (reads(statement) - made_in([statement]) - passing)
 
 
 def reads(statement: Statement) -> set[str]:

@@ -88,9 +88,11 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
             yield f"{indent}sync"
         case Forget():
             yield f"{indent}forget elements"
-        case Sweeps(loops):
-            for loop in loops:
-                yield from _statement(loop, indent, names)
+        case Sweeps(loops, parts, lags):
+            for loop, part, lag in zip(loops, parts, lags, strict=True):
+                if len(loops) > 1:
+                    yield f"{indent}{f'row by row, part {part}' if parts[-1] else 'row by row'}{f', {lag} behind' if lag else ''}"
+                yield from _statement(loop, indent + ("  " if len(loops) > 1 else ""), names)
         case Move(op, (dy, dx), movers, planes):
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
             for plane in planes:

@@ -111,14 +111,16 @@ class Release:
 
 @dataclass(frozen=True)
 class Sweeps:
-    """Consecutive loops over cells, merged into one loop over worlds, so that a world's data stay in the cache.
+    """Consecutive loops over cells that run together, world by world and row by row, so that data stay in the cache.
 
-    Loops of the same part run together row by row; a loop that reads other rows of an earlier one is in a later part.
-    `passing` lists fields that only these loops read: they need memory for one world.
+    Each loop runs `lags` rows behind the first of its part: then the rows that it reads of earlier loops are there. A
+    loop that reads an earlier one around the edge is in a later part, which begins when all rows are done.
+    `passing` lists fields that only loops of one part read: they need memory for a few rows.
     """
 
     loops: tuple[Compute, ...]
     parts: tuple[int, ...]
+    lags: tuple[int, ...]
     passing: tuple[str, ...]
 
 
@@ -267,7 +269,7 @@ def defined_by(statement: Statement) -> Iterator[Var]:
             yield from (out.var for out in outs)
         case Sweeps(loops):
             for loop in loops:
-                yield from defined_by(loop)
+                yield from (var for var in defined_by(loop) if var.name not in statement.passing)
         case Move(_, _, _, planes):
             yield from (plane.new for plane in planes)
         case Guard(_, _, keeps):

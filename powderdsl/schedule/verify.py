@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from powderdsl.ir.ops import FLAG, OPS, Node
+from powderdsl.ir.ops import FLAG, OPS, Node, Type
 from powderdsl.ir.verify import InvalidIR
+from powderdsl.schedule.join import field_reads
 from powderdsl.schedule.types import (
     ANSWER,
     BLOCK,
@@ -21,6 +22,7 @@ from powderdsl.schedule.types import (
     Var,
     defined_by,
     in_order,
+    loaded,
     ordered,
     values_of,
 )
@@ -79,7 +81,8 @@ class _Checker:
                             _demand(out.into in live, f"{out.into} is overwritten, but not there")
                             live.discard(out.into)
                 case Sweeps(loops):
-                    live = self.block(loops, live)
+                    _check_order(statement)
+                    live = self.block(loops, live) - set(statement.passing)
                     continue
                 case Move(op, _, movers, planes):
                     live -= {plane.old.attr for plane in planes if plane.into}
@@ -105,6 +108,27 @@ class _Checker:
                 _demand(node.op in OPS or node.op in SCHEDULE_OPS, f"unknown operation {node.op}")
                 _demand(node.op != "input", "a value reads a slot")
                 _demand(node.type.name in _KINDS, f"a value is a {node.type}")
+
+
+def _check_order(sweeps: Sweeps) -> None:
+    """A row is computed before loops that run together read it, or hold masks of choices; none reads it around the edge."""
+    made: dict[str, tuple[int, int]] = {}
+    types: dict[str, Type] = {}
+    for loop, part, lag in zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True):
+        for read in field_reads(loop):
+            if made.get(read.name, (part - 1,))[0] == part:
+                _demand(read.live or not (read.wraps and read.dy), f"{read.name} is read around the edge")
+                _demand(lag >= made[read.name][1] + read.dy, f"{read.name} is read before it is there")
+            else:
+                _demand(
+                    read.name not in made or read.name not in sweeps.passing,
+                    f"{read.name} is gone when it is read",
+                )
+        if loop.over == "choices":
+            early = [name for name in loaded(values_of(loop)) if name in made and types[name] == FLAG]
+            _demand(not early, f"choices are made by {early}, which are not there in all rows")
+        made |= {out.var.name: (part, lag) for out in loop.outs}
+        types |= {out.var.name: out.var.type for out in loop.outs}
 
 
 def _is_region(node: Node | None) -> bool:

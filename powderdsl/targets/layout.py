@@ -22,6 +22,8 @@ class Layout:
     """By stream: the draws of one bit, each of which is made once a step."""
     turned: int = 0
     """The largest number of masks of choices that a loop applies."""
+    waiting: int = 0
+    """The largest number of rows of floats that wait for loops some rows behind."""
     moving: int = 0
     """The largest number of planes in a movement."""
     reach: int = 1

@@ -126,6 +126,8 @@ class _State:
                         self.set(var, kept[var.name])
                 case Sweeps(loops):
                     self.block(loops)
+                    for name in statement.passing:
+                        del self.held[name]
                 case Forget():
                     self.world = replace(self.world, known=False)
                 case Release(names):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 from powderdsl.ir.ops import REAL, Node
-from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, in_order, ordered, values_of
+from powderdsl.schedule.join import field_reads
+from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, ordered, values_of
 from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
 
@@ -32,9 +34,8 @@ def reaches_of(schedule: Schedule) -> dict[str, int]:
             case Guard(_, _, keeps):
                 copies += [(var.name, value) for var, value in keeps]
             case Sweeps(loops):
-                for out in (out for loop in loops for out in loop.outs):
-                    copies += [(out.var.name, _base(out.value))]
-                    copies += [(out.var.name, out.otherwise)] if out.otherwise is not None else []
+                outs = (out for loop in loops for out in loop.outs)
+                copies += [(out.var.name, out.otherwise) for out in outs if out.otherwise is not None]
     for _ in copies:
         before = dict(found)
         for name, old in copies:
@@ -45,55 +46,80 @@ def reaches_of(schedule: Schedule) -> dict[str, int]:
     return found
 
 
-def _base(value: Node) -> Node:
-    while value.op == "select":
-        value = value.args[2]
-    return value
+@dataclass(frozen=True)
+class Rows:
+    """The rows of a field that only loops of one part read, where they wait: `depth`, a power of two, of them.
+
+    `bare`: the columns beyond the edges that hold zeros, since no loop reads this field around them; None if one does.
+    """
+
+    first: int
+    depth: int
+    bare: int | None
+
+    def at(self, name: str, dy: int) -> str:
+        """The pointer to a row; to zeros if nothing is there."""
+        return f"at{name}[(y + {dy}) & {self.depth - 1}]"
+
+
+def _waiting(sweeps: Sweeps) -> dict[str, Rows]:
+    """The rows of passing fields, numbered one after another."""
+    lags = {
+        out.var.name: lag for loop, lag in zip(sweeps.loops, sweeps.lags, strict=True) for out in loop.outs
+    }
+    depths = dict.fromkeys(sweeps.passing, 1)
+    bare: dict[str, int | None] = dict.fromkeys(sweeps.passing, 0)
+    for loop, lag in zip(sweeps.loops, sweeps.lags, strict=True):
+        for read in field_reads(loop):
+            if (name := read.name) in depths:
+                depths[name] = max(depths[name], lag - lags[name] - read.dy + 1)
+                around, reach = read.wraps and read.dx, bare[name]
+                bare[name] = None if around or reach is None else max(reach, abs(read.dx))
+    found: dict[str, Rows] = {}
+    count = 0
+    for name, depth in depths.items():
+        found[name] = Rows(count, 1 << (depth - 1).bit_length(), bare[name])
+        count += found[name].depth
+    return found
 
 
 def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
-    """The text of one loop over lanes (worlds).
-
-    Lanes that are strips of one world read each other: a loop that reads other rows of an earlier loop follows it block
-    by block, see EACH_BLOCK in fields.hpp.
-    """
-    over = {out.var.name: out.into for loop in sweeps.loops for out in loop.outs if out.into is not None}
-    before, turns, rows, after = [], [], [], []
-    turned = 0
-    used: set[str] = set()
-    for part, loop in zip(sweeps.parts, sweeps.loops, strict=True):
-        printed = _Loop(loop, layout, turned, reaches)
-        before.append(printed.before(over))
-        here = f"if (!strips || part == {part}) " if sweeps.parts[-1] else ""
+    """The text of one loop over worlds, see EACH_WORLD in fields.hpp."""
+    waiting = _waiting(sweeps)
+    layout.waiting = max(layout.waiting, sum(rows.depth for rows in waiting.values()))
+    before: list[str] = []
+    rows: list[str] = []
+    turns, after = [], []
+    turned, part = 0, -1
+    last = {part: lag for lag, part in sorted(zip(sweeps.lags, sweeps.parts, strict=True))}
+    for number, loop in enumerate(sweeps.loops):
+        printed = _Loop(loop, layout, turned, reaches, waiting)
+        before += printed.before()
         if loop.over == "choices":
-            turns.append(here + printed.turns())
-            turned += -(-len(printed.masks()) // SIDE_BY_SIDE) * SIDE_BY_SIDE
-        rows.append(here + printed.rows())
+            turns.append(printed.turns())
+            turned += -(-len(printed.masks) // SIDE_BY_SIDE) * SIDE_BY_SIDE
+        if sweeps.parts[number] != part:
+            rows += ["}"] if rows else []
+            part = sweeps.parts[number]
+            rows.append(f"for (int step = 0; step < rows + {last[part]}; step++) {{")
+        rows.append(
+            f"if (const int y = step - {sweeps.lags[number]}; (u32)y < (u32)rows) {{\n{printed.text}\n}}"
+        )
+        gone = " ".join(f"{waiting[name].at(name, 0)} = nothing;" for name in printed.waits)
+        if gone and sweeps.lags[number] < last[part]:
+            rows.append(f"else if (y >= rows) {{ {gone} }}")
         after.append(printed.after())
-        used |= printed.fields
-    lasting = {_first(name, over) for name in in_order(used) if name not in sweeps.passing}
-    places = " ".join(
-        f"const int l{name} = {'l' if _first(name, over) in lasting else 'l & strips'};"
-        for name in in_order(used)
-    )
     layout.turned = max(layout.turned, turned)
-    blocks = f"EACH_BLOCK({sweeps.parts[-1]})"
-    inner = "\n".join(rows)
-    loop_text = "\n".join(
-        [
-            *before,
-            f"{blocks} {{",
-            *turns,
-            f"for (int l = 0; l < c.lanes; l++) {{ {places}",
-            inner,
-            "} }",
-            *after,
-        ]
+    pointers = " ".join(
+        f"const float* at{name}[{own.depth}]; std::fill_n(at{name}, {own.depth}, nothing);"
+        for name, own in waiting.items()
     )
+    loop_text = "\n".join([*before, *turns, f"EACH_WORLD {{ {pointers}", *rows, "} }", *after])
     outs = [out for loop in sweeps.loops for out in loop.outs]
+    lasting = [out for out in outs if out.var.name not in waiting]
     declares = " ".join(
         f"{'Field' if out.var.type == REAL else 'Plane'}* {out.var.name};"
-        for out in outs
+        for out in lasting
         if out.var.name not in declared
     )
     written = {out.var.name for out in outs}
@@ -102,15 +128,8 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
     asked = dict.fromkeys(
         question for loop in sweeps.loops for name, question in _asked(loop) if name not in written
     )
-    quiet = " ".join(f"{out.var.name} = {out.into or f'keep({_quiet(out)})'};" for out in outs)
+    quiet = " ".join(f"{out.var.name} = keep({_quiet(out)});" for out in lasting)
     return f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}"
-
-
-def _first(name: str, over: dict[str, str]) -> str:
-    """The field at the end of a chain of replacements."""
-    while name in over:
-        name = over[name]
-    return name
 
 
 def _keeps(loop: Compute) -> bool:
@@ -142,195 +161,217 @@ def _quiet(out: Out) -> str:
 
 
 class _Loop:
-    """One loop over the rows of a world."""
+    """One loop over the rows of a world: the text of row y."""
 
-    def __init__(self, loop: Compute, layout: Layout, turned: int, reaches: Mapping[str, int]):
-        self.loop, self.layout, self.first, self.reaches = loop, layout, turned, reaches
-        self.fields: set[str] = {out.var.name for out in loop.outs if out.var.type == REAL}
+    def __init__(
+        self,
+        loop: Compute,
+        layout: Layout,
+        turned: int,
+        reaches: Mapping[str, int],
+        waiting: Mapping[str, Rows],
+    ):
+        self.loop, self.layout, self.first, self.reaches, self.waiting = (
+            loop,
+            layout,
+            turned,
+            reaches,
+            waiting,
+        )
         self.floats = [out for out in loop.outs if out.var.type == REAL]
         self.flags = [out for out in loop.outs if out.var.type != REAL]
+        self.waits = [out.var.name for out in self.floats if out.var.name in waiting]
+        self.lasts = [out.var.name for out in self.floats if out.var.name not in waiting]
+        self.values = Chunks(layout, loop.outs, {name: own.at for name, own in waiting.items()}, self.bare)
+        self.chains: list[list[Node]] = []
+        self.masks: list[str] = []
         if loop.over == "choices":
-            self.text = "\n".join(self.laid())
-        else:
-            self.text = self.swept()
+            self.chains = _chains(loop)
+            self.masks = [str(choice.args[0].attr) for choice in reversed(self.chains[0])]
+        self.text = "\n".join(self.laid() if loop.over == "choices" else self.swept())
 
-    def reach(self, name: str) -> int | str:
-        """How far columns of a field are read beyond the edges."""
-        reach = self.reaches.get(name, 0)
-        return "REACH" if reach == ANY_PASS else reach
+    @property
+    def bare(self) -> frozenset[str]:
+        """The fields whose rows have zeros beyond the edges."""
+        return frozenset(name for name, own in self.waiting.items() if own.bare is not None)
 
-    def before(self, over: dict[str, str]) -> str:
-        lines = []
-        for out in self.loop.outs:
-            name = out.var.name
-            if out.var.type == REAL:
-                lines.append(f"{name} = {over.get(name, 'take_field(c)')}; bool some{name} = false;")
-                lines.append(
-                    f"for (int l = c.lanes; l < LANES; l++) memset({name}->live + l * height, 0, height);"
-                )
-            else:
-                lines.append(f"{name} = take(c);")
-                lines.append(
-                    f"for (int l = c.lanes; l < LANES; l++) for (int i = 0; i < height * words; i++) "
-                    f"((u64*){name}->data)[i * LANES + l] = 0;"
-                )
-        return "\n".join(lines)
+    def before(self) -> Iterator[str]:
+        for name in self.lasts:
+            yield f"{name} = take_field(c); bool some{name} = false; no_rows(c, {name});"
+        for out in self.flags:
+            yield f"{out.var.name} = take(c); no_words(c, {out.var.name});"
 
     def turns(self) -> str:
-        masks = self.masks()
         return (
-            f"{{ const Plane* const all[] = {{{', '.join(masks)}}}; "
-            f"turn_masks(c, all, {len(masks)}, {self.first}, first, last); }}"
+            f"{{ const Plane* const all[] = {{{', '.join(self.masks)}}}; "
+            f"turn_masks(c, all, {len(self.masks)}, {self.first}); }}"
         )
 
-    def rows(self) -> str:
-        if self.loop.over == "choices":
-            return f"{{\n{self.text}\n}}"
-        return f"for (int y = first; y < last; y++) {{\n{self.text}\n}}"
-
     def after(self) -> str:
-        ends = [f"{out.var.name}->still = !some{out.var.name};" for out in self.floats]
+        ends = [f"{name}->still = !some{name};" for name in self.lasts]
         return " ".join([*ends, *(f"close_plane(c, {out.var.name});" for out in self.flags)])
+
+    # Rows that are written
+
+    def starts(self) -> Iterator[str]:
+        """Pointers to the rows that the loop writes."""
+        for out in self.flags:
+            yield f"u64* o{out.var.name} = &lane_word({out.var.name}, row * words, lane);"
+        for out in self.floats:
+            name = out.var.name
+            if name in self.waiting:
+                own = self.waiting[name]
+                yield f"float* o{name} = waiting_row(c, {own.first} + (y & {own.depth - 1})); {own.at(name, 0)} = o{name};"
+            else:
+                yield f"float* o{name} = row_of(c, {name}, base + y);"
+
+    def ends(self) -> Iterator[str]:
+        """The columns beyond the edges of what the loop has written."""
+        for out in self.floats:
+            name = out.var.name
+            own = self.waiting.get(name)
+            reach = self.reaches.get(name, 0)
+            if own is not None and own.bare is not None:
+                yield f"bare_row<{own.bare}>(c, o{name});" if own.bare else ""
+            else:
+                yield f"finish_row<{'REACH' if reach == ANY_PASS else reach}>(c, o{name});"
+
+    def quiet(self) -> Iterator[str]:
+        """What a row outside the region gets."""
+        for out in self.loop.outs:
+            name = out.var.name
+            if name in self.waiting:
+                yield f"{self.waiting[name].at(name, 0)} = nothing;"
+            elif out.otherwise is not None and out.otherwise.op == "load":
+                yield f"some{name} |= copy_row(c, {name}, {out.otherwise.attr}, base + y);"
+            elif out.var.type == REAL:
+                yield f"{name}->live[base + y] = 0;"
+            else:
+                rest = "c.valid(w)[lane]" if out.otherwise is not None and out.otherwise.attr else "0"
+                yield f"for (int w = 0; w < words; w++) lane_word({name}, row * words + w, lane) = {rest};"
 
     # Values, chunk by chunk
 
-    def swept(self) -> str:
-        """The body of a loop over rows."""
-        values = Chunks(self.layout, self.loop.outs)
+    def swept(self) -> Iterator[str]:
+        values = self.values
         found = [(out, values.of(out.value)) for out in self.loop.outs]
         values.close()
-        self.fields |= values.fields
-        starts, stores, ends = [], [], []
+        stores, counts, lives = [], [], []
         for out, value in found:
             name = out.var.name
-            if out.var.type == REAL:
-                starts.append(
-                    f"float* o{name} = {name}->data + ((size_t)l{name} * height + y) * c.g.stride + HALO; I n{name} = {{}};"
+            if out.var.type != REAL:
+                stores.append(f"put_bits(o{name} + w * LANES, x, {value});")
+                continue
+            stores.append(f"*(Fu*)(o{name} + x) = {value};")
+            if name in self.lasts:
+                counts.append(f"I n{name} = {{}};")
+                stores.append(f"n{name} |= (I)blend(inside, {value}, splatf(0));")
+                lives.append(
+                    f"{{ const bool some = any((V)(n{name} + n{name})); {name}->live[base + y] = some; some{name} |= some; }}"
                 )
-                stores.append(
-                    f"{{ const F o = {value}; *(Fu*)(o{name} + x) = o; n{name} |= (I)blend(inside, o, splatf(0)); }}"
-                )
-                ends.append(
-                    f"finish_row<{self.reach(name)}>(c, o{name}); {{ const bool some = any((V)(n{name} + n{name})); "
-                    f"{name}->live[l{name} * height + y] = some; some{name} |= some; }}"
-                )
-            else:
-                starts.append(f"if (!WORDS) ((u64*){name}->data)[(y * words + words - 1) * LANES + l] = 0;")
-                stores.append(
-                    f"{{ const u32 o = {value}; put_bits((u64*){name}->data + (y * words + w) * LANES + l, x, o); }}"
-                )
-        rows = [f"const float* {name} = {call};" for call, name in values.rows.items()]
+        region = self.loop.region
+        yield PLACE
+        if region is not None:
+            parts = _parts(region)
+            scans = [
+                f"some |= row_bits({part.attr}, row * words, words, lane);"
+                for part in parts
+                if part.op == "load"
+            ]
+            busy = " || ".join(self.busy(part) for part in parts if part.op == "live") or "false"
+            yield f"u64 some = {busy};" + (f" if (!some) {{ {' '.join(scans)} }}" if scans else "")
+            yield f"if (!some) {{ {' '.join(self.quiet())} }} else {{"
+        yield " ".join([*self.pointers(), *self.starts(), *counts])
+        yield from (f"if (!WORDS) o{out.var.name}[(words - 1) * LANES] = 0;" for out in self.flags)
         words = [
-            f"const u64 {name} = ((const u64*){plane}->data)[(y * words + w) * LANES + l];"
+            f"const u64 {name} = lane_word({plane}, row * words + w, lane);"
             for plane, name in values.words.items()
         ]
-        return "\n".join([
-            self.skipped(), " ".join([*rows, *starts]), f"for (int w = 0; w < words; w++) {{ {' '.join(words)}",
-            "EACH_CHUNK { const u32 inside = inside_of(x, width); (void)inside;",
-            *values.lines, *stores, "} }", " ".join(ends),
-        ])  # fmt: skip
+        yield f"for (int w = 0; w < words; w++) {{ {' '.join(words)}"
+        yield "EACH_CHUNK { const u32 inside = inside_of(x, width); (void)inside;"
+        yield from (*values.lines, *stores)
+        yield "} }"
+        yield " ".join([*self.ends(), *lives, "" if region is None else "}"])
 
-    def skipped(self) -> str:
-        """The text that skips a row outside the region."""
-        region = self.loop.region
-        if region is None:
-            return ""
-        parts = _parts(region)
-        planes = [str(part.attr) for part in parts if part.op == "load"]
-        quiet = []
-        if _keeps(self.loop):
-            scan = " | ".join(f"((const u64*){plane}->data)[(y * words + w) * LANES + l]" for plane in planes)
-            for out in self.loop.outs:
-                assert out.otherwise is not None
-                name, old = out.var.name, out.otherwise.attr
-                self.fields.add(str(old))
-                quiet.append(f"some{name} |= copy_row(c, {name}, {old}, l, y);")
-            return (
-                f"{{ u64 some = 0; for (int w = 0; w < words; w++) some |= {scan or 0}; "
-                f"if (!some) {{ {' '.join(quiet)} continue; }} }}"
-            )
-        for out in self.loop.outs:
-            name = out.var.name
-            if out.var.type == REAL:
-                quiet.append(f"{name}->live[l{name} * height + y] = 0;")
-            else:
-                rest = "c.valid(w)[l]" if out.otherwise is not None and out.otherwise.attr else "0"
-                word = f"((u64*){name}->data)[(y * words + w) * LANES + l] = q;"
-                quiet.append(f"for (int w = 0; w < words; w++) {{ const u64 q = {rest}; {word} }}")
-        busy = " || ".join(self.busy(part) for part in parts if part.op == "live") or "false"
-        scan = " ".join(f"some |= row_bits({plane}, y * words, words, l);" for plane in planes)
-        return (
-            f"{{ u64 some = ({busy}); if (!some) {{ {scan} }} if (!some) {{ {' '.join(quiet)} continue; }} }}"
-        )
+    def pointers(self) -> list[str]:
+        return [f"const float* {name} = {call};" for call, name in self.values.rows.items()]
 
     def busy(self, live: Node) -> str:
         """Whether a field has anything in a row."""
         name, dy = str(live.args[0].attr), live.attr[0]
-        self.fields.add(name)
-        return f"{name}->live[{f'c.line(l{name}, y + {dy})' if dy else f'l{name} * height + y'}]"
+        if name in self.waiting:
+            return f"{self.waiting[name].at(name, dy)} != nothing"
+        return f"{name}->live[base + {f'c.around(y + {dy})' if dy else 'y'}]"
 
     # Chains of choices
 
-    def chains(self) -> list[list[Node]]:
-        chains = []
-        for out in self.loop.outs:
-            chain, node = [], out.value
-            while node.op == "select":
-                chain.append(node)
-                node = node.args[2]
-            chains.append(chain)
-        return chains
-
-    def masks(self) -> list[str]:
-        return [str(choice.args[0].attr) for choice in reversed(self.chains()[0])]
-
     def laid(self) -> Iterator[str]:
         """A row of all choices: 64 columns stay in registers while the choices whose masks hold there are applied."""
-        chains, masks = self.chains(), self.masks()
-        names = [out.var.name for out in self.loop.outs]
-        count = len(masks)
-        bases = [str(chain[-1].args[2].attr) for chain in chains]
-        self.fields |= set(bases)
-        values = Chunks(self.layout, ())
+        values, count = self.values, len(self.masks)
+        heads = [f"g{number}" for number in range(len(self.chains))]
+        bases = [str(chain[-1].args[2].attr) for chain in self.chains]
         levels = []
         for level in range(count):
             at = count - 1 - level
             values.lines, values.known = [], {}
-            values.known |= {
-                id(chain[at].args[2]): f"g{name}[k]" for chain, name in zip(chains, names, strict=True)
-            }
-            found = [values.of(chain[at].args[1]) for chain in chains]
+            for chain, name in zip(self.chains, heads, strict=True):
+                values.known[id(chain[at].args[2])] = f"{name}[k]"
+            found = [values.of(chain[at].args[1]) for chain in self.chains]
             changes = [
-                f"g{name}[k] = blend(bits, {value}, g{name}[k]);"
-                for name, value in zip(names, found, strict=True)
+                f"{name}[k] = blend(bits, {value}, {name}[k]);"
+                for name, value in zip(heads, found, strict=True)
             ]
             lines = " ".join([*values.lines, *changes])
             levels.append(
                 f"{{ const u64 m = masks[{level}]; "
                 f"EACH_REGISTER {{ const u32 bits = m >> (x & 63) & ALL; {lines} }} }}"
             )
-        self.fields |= values.fields
-        yield "for (int y = first; y < last; y++) {"
-        yield f"const u64* turned = turned_row(c, l, y - first) + {self.first}; const bool any = any_turned(c, turned, {count});"
-        for name, base in zip(names, bases, strict=True):
-            kept = f"{name}->live[l{name} * height + y] = any || {base}->live[l{base} * height + y]"
-            yield f"some{name} |= {kept};"
-        rests = " ".join(
-            f"if ({name}->live[l{name} * height + y]) copy_floats(c.g, row_of(c, {name}, l{name}, y), row_of(c, {base}, l{base}, y));"
-            for name, base in zip(names, bases, strict=True)
-        )
-        yield f"if (!any) {{ {rests} continue; }}"
-        yield " ".join(f"float* o{name} = row_of(c, {name}, l{name}, y);" for name in names)
-        yield " ".join(
-            f"const float* b{name} = real_row(c, {base}, l{base}, y);"
-            for name, base in zip(names, bases, strict=True)
-        )
-        yield " ".join(f"const float* {name} = {call};" for call, name in values.rows.items())
+        values.lines = []
+        values.known = {id(chain[0]): f"{name}[k]" for chain, name in zip(self.chains, heads, strict=True)}
+        stores = [f"*(F*)(o{out.var.name} + x) = {values.of(out.value)};" for out in self.floats]
+        ends = " ".join([*values.lines, *stores])
+        olds = [values.row(base, 0) for base in bases]
+        yield f"const u64* turned = turned_row(c, base + y) + {self.first}; const bool any = any_turned(c, turned, {count});"
+        lives = " || ".join(dict.fromkeys(self.alive(base) for base in bases))
+        yield f"const bool some = any || {lives};"
+        yield " ".join(f"some{name} |= {name}->live[base + y] = some;" for name in self.lasts)
+        gone = " ".join(f"{self.waiting[name].at(name, 0)} = nothing;" for name in self.waits)
+        yield f"if (!some) {{ {gone} }} else {{"
+        yield " ".join([*self.pointers(), *self.starts()])
         yield "for (int w = 0; w < words; w++) { const u64* masks = turned + w * c.masks;"
-        yield " ".join(f"F g{name}[64 / CHUNK];" for name in names)
-        yield f"EACH_REGISTER {{ {' '.join(f'g{name}[k] = load(b{name}, x);' for name in names)} }}"
+        yield " ".join(f"F {name}[64 / CHUNK];" for name in heads)
+        yield f"EACH_REGISTER {{ {' '.join(f'{name}[k] = load({old}, x);' for name, old in zip(heads, olds, strict=True))} }}"
         for begin in range(0, count, AT_ONCE):
             some = " | ".join(f"masks[{level}]" for level in range(begin, min(count, begin + AT_ONCE)))
             yield f"if ({some}) {{ {' '.join(levels[begin : begin + AT_ONCE])} }}"
-        yield f"EACH_REGISTER {{ {' '.join(f'*(F*)(o{name} + x) = g{name}[k];' for name in names)} }} }}"
-        yield f"{' '.join(f'finish_row<{self.reach(name)}>(c, o{name});' for name in names)} }}"
+        yield f"EACH_REGISTER {{ {ends} }} }}"
+        yield f"{' '.join(self.ends())} }}"
+
+    def alive(self, name: str) -> str:
+        return (
+            f"{self.waiting[name].at(name, 0)} != nothing"
+            if name in self.waiting
+            else f"{name}->live[base + y]"
+        )
+
+
+PLACE = (
+    "const int lane = strips ? y / height : l, row = strips ? y - lane * height : y; (void)lane; (void)row;"
+)
+"""Where the words of row y lie in planes."""
+
+
+def _chains(loop: Compute) -> list[list[Node]]:
+    """The chains of choices of a loop, all on the same masks, the outermost choice first."""
+    chains: dict[int, list[Node]] = {}
+    below: set[int] = set()
+    for node in reversed(ordered(out.value for out in loop.outs)):
+        if node.op != "select" or id(node) in below:
+            continue
+        chain = []
+        while node.op == "select":
+            chain.append(node)
+            below.add(id(node))
+            node = node.args[2]
+        chains[id(chain[0])] = chain
+    return list(reversed(chains.values()))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 
 from powderdsl.ir.ops import REAL, Node
@@ -15,12 +17,17 @@ _INFIX = {"add": "+", "sub": "-", "mul": "*"}
 class Chunks(CellValues):
     """Values of the cells of a chunk, in one world: floats, or flags as bits."""
 
-    def __init__(self, layout: Layout, outs: tuple[Out, ...]):
+    def __init__(
+        self,
+        layout: Layout,
+        outs: tuple[Out, ...],
+        waiting: Mapping[str, Callable[[str, int], str]],
+        bare: frozenset[str],
+    ):
         super().__init__()
-        self.layout = layout
+        self.layout, self.waiting, self.bare = layout, waiting, bare
         self.rows: dict[str, str] = {}
         self.words: dict[str, str] = {}
-        self.fields: set[str] = set()
         self.choices = [node for node in ordered(out.value for out in outs) if node.op == "select"]
         self.blocks: dict[str, tuple[list[str], dict[int, str], list[str]]] = {}
         """Lines that run only where a comparison holds somewhere in the chunk, by the comparison's name."""
@@ -33,11 +40,14 @@ class Chunks(CellValues):
 
     def row(self, field: str, dy: int, *, wraps: bool = True) -> str:
         """The pointer to a field's row, set up once a row."""
-        self.fields.add(field)
         self.layout.rows = max(self.layout.rows, abs(dy))
-        kind = "_wrapped" if wraps and dy else "" if wraps else "_or_nothing"
-        at = f"y + {dy}" if dy or not wraps else "y"
-        return self.rows.setdefault(f"real_row{kind}(c, {field}, l{field}, {at})", f"r{len(self.rows)}")
+        if field in self.waiting:
+            call = self.waiting[field](field, dy)
+        elif wraps or not dy:
+            call = f"real_line(c, {field}, base + {f'c.around(y + {dy})' if dy else 'y'})"
+        else:
+            call = f"real_line_or_nothing(c, {field}, base, y + {dy}, rows)"
+        return self.rows.setdefault(call, f"r{len(self.rows)}")
 
     def word(self, node: Node) -> str:
         """The word of a flag's plane, read once per row and word."""
@@ -64,11 +74,11 @@ class Chunks(CellValues):
                 return self.draw(node)
             case "shift":
                 dy, dx, wraps = attr
-                loaded = f"load({self.row(str(node.args[0].attr), dy, wraps=wraps)}, x + {dx})"
-                self.layout.reach = max(self.layout.reach, abs(dx) if wraps else 0)
-                return self.temporary(
-                    loaded if wraps or not dx else f"inside_columns({loaded}, x, {dx}, width)"
-                )
+                field = str(node.args[0].attr)
+                loaded = f"load({self.row(field, dy, wraps=wraps)}, x + {dx})"
+                within = wraps or not dx or field in self.bare
+                self.layout.reach = max(self.layout.reach, abs(dx) if wraps or within else 0)
+                return self.temporary(loaded if within else f"inside_columns({loaded}, x, {dx}, width)")
         args = [self.known[id(arg)] for arg in node.args]
         match node.op:
             case "eq" | "lt" | "le":
@@ -95,7 +105,7 @@ class Chunks(CellValues):
         stream, bits = node.attr
         self.count += 1
         name = f"d{self.count}"
-        cell = f"draw_cell(c, {self.layout.streams[stream]}, l, y, std::min(x + i, width - 1), {bits})"
+        cell = f"draw_cell(c, {self.layout.streams[stream]}, lane, row, std::min(x + i, width - 1), {bits})"
         self.lines.append(f"F {name}; for (int i = 0; i < CHUNK; i++) {name}[i] = {cell};")
         return name
 

@@ -42,8 +42,6 @@ static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int 
 static Context* new_context(const Grid& g) {
   Context* c = new (std::align_val_t(64)) Context();
   c->g = g;
-  c->near_rows = g.stride > 512 ? 8 : 16;
-  c->block = g.strips && REAL_ROWS <= c->near_rows ? c->near_rows : g.height;
 #if !WORDS
   c->rest = g.width - 64 * (g.words - 1);
   c->valid_last = splat(c->rest == 64 ? ~0ull : (1ull << c->rest) - 1);
@@ -65,7 +63,8 @@ static Context* new_context(const Grid& g) {
   c->entered = aligned<V>(g.height);
   c->moving.resize(g.height + 1);
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
-  c->turned = aligned<u64>((size_t)LANES * c->most_rows() * g.words * TURNED);
+  c->turned = aligned<u64>((size_t)LANES * g.height * g.words * TURNED);
+  c->waiting = aligned<float>((size_t)WAITING * g.stride + HALO + CHUNK);
   for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells()), c->tossed[i].resize(g.height);
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
@@ -88,6 +87,7 @@ static void free_context(Context* c) {
   free(c->entered);
   free(c->zeros);
   free(c->turned);
+  free(c->waiting);
   for (V* p : c->fixed) free(p);
   for (int i = 0; i < COINS; i++) free(c->coins[i]);
   c->~Context();

@@ -4,14 +4,8 @@
 ALWAYS const float* real_line(const Context& c, const Field* f, int line) {
   return f->live[line] ? f->data + (size_t)line * c.g.stride + HALO : c.zeros + HALO;
 }
-ALWAYS const float* real_row(const Context& c, const Field* f, int lane, int y) {
-  return real_line(c, f, lane * c.g.height + y);
-}
-ALWAYS const float* real_row_wrapped(const Context& c, const Field* f, int lane, int y) {
-  return real_line(c, f, c.line(lane, y));
-}
-ALWAYS const float* real_row_or_nothing(const Context& c, const Field* f, int lane, int y) {
-  return c.has_line(lane, y) ? real_line(c, f, lane * c.g.height + y) : c.zeros + HALO;
+ALWAYS const float* real_line_or_nothing(const Context& c, const Field* f, int base, int y, int rows) {
+  return (u32)y < (u32)rows ? real_line(c, f, base + y) : c.zeros + HALO;
 }
 ALWAYS F inside_columns(F value, int x, int dx, int width) {
   if (__builtin_expect(x + dx >= 0 && x + dx + CHUNK <= width, 1)) return value;
@@ -20,11 +14,20 @@ ALWAYS F inside_columns(F value, int x, int dx, int width) {
   return (F)((I)value & (at >= 0) & (at < width));
 }
 ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
-// All columns of a world's row together.
+// A word of a lane, and all words of one of its rows together.
+ALWAYS u64& lane_word(const Plane* p, int i, int lane) { return ((u64*)p->data)[i * LANES + lane]; }
 ALWAYS u64 row_bits(const Plane* p, int first, int words, int lane) {
   u64 some = 0;
-  for (int w = 0; w < words; w++) some |= ((const u64*)p->data)[(first + w) * LANES + lane];
+  for (int w = 0; w < words; w++) some |= lane_word(p, first + w, lane);
   return some;
+}
+// Lanes of worlds that are not there hold nothing.
+static void no_words(const Context& c, Plane* p) {
+  for (int l = c.lanes; l < LANES; l++)
+    for (int i = 0; i < c.g.cells(); i++) lane_word(p, i, l) = 0;
+}
+static void no_rows(const Context& c, Field* f) {
+  memset(f->live + c.lanes * c.g.height, 0, (LANES - c.lanes) * c.g.height);
 }
 static void close_plane(const Context& c, Plane* p) {  // nothing beyond the width; and is there anything at all?
   V some = splat(0);
@@ -32,7 +35,7 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
     for (int w = 0; w < c.g.words; w++, i++) some |= p->data[i] &= c.valid(w);
   p->zero = !any(some);
 }
-// Masks of choices, lane by lane: [LANES][rows of a block][words][c.masks], so that a lane finds the words of all masks side by side.
+// Masks of choices, lane by lane: [LANES][height][words][c.masks], so that a lane finds the words of all masks side by side.
 ALWAYS void turn(const V* in, V* out) {  // LANES vectors of LANES words
 #if VECTOR == 64
   const __m512i low[3] = {
@@ -54,20 +57,17 @@ ALWAYS void turn(const V* in, V* out) {  // LANES vectors of LANES words
     for (int l = 0; l < LANES; l++) out[l][i] = in[i][l];
 #endif
 }
-OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int place, int first, int last) {
-  const int begin = first * c.g.words, cells = (last - first) * c.g.words;
-  const size_t apart = (size_t)c.most_rows() * c.g.words * c.masks;
+OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int place) {
+  const int cells = c.g.cells();
   for (int i = 0; i < cells; i++)
     for (int from = 0; from < count; from += LANES) {
       V in[LANES], out[LANES];
-      for (int k = 0; k < LANES; k++) in[k] = from + k < count ? planes[from + k]->data[begin + i] : splat(0);
+      for (int k = 0; k < LANES; k++) in[k] = from + k < count ? planes[from + k]->data[i] : splat(0);
       turn(in, out);
-      for (int l = 0; l < c.lanes; l++) *(V*)(c.turned + l * apart + (size_t)i * c.masks + place + from) = out[l];
+      for (int l = 0; l < c.lanes; l++) *(V*)(c.turned + ((size_t)l * cells + i) * c.masks + place + from) = out[l];
     }
 }
-ALWAYS const u64* turned_row(const Context& c, int lane, int y) {
-  return c.turned + ((size_t)lane * c.most_rows() + y) * c.g.words * c.masks;
-}
+ALWAYS const u64* turned_row(const Context& c, int line) { return c.turned + (size_t)line * c.g.words * c.masks; }
 ALWAYS bool any_turned(const Context& c, const u64* masks, int count) {
   V some = splat(0);
   for (int w = 0; w < c.g.words; w++)
@@ -76,16 +76,18 @@ ALWAYS bool any_turned(const Context& c, const u64* masks, int count) {
 }
 // The chunks of word w, whose values wait in registers.
 #define EACH_REGISTER _Pragma("GCC unroll 16") for (int k = 0, x = 64 * w; k < 64 / CHUNK && (WORDS || x < width); k++, x += CHUNK)
-// Sweeps over the rows of lanes, one after the other. In strips, a sweep follows the one before it two blocks later: a
-// block is computed from blocks of the sweep before that are next to it, around the edge of the strips, and so finds them
-// in a near cache. Each begins a block further on, and comes around to its first blocks at the end.
-#define EACH_BLOCK(last_part) \
-  for (int blocks = std::max(1, height / c.block), round = 0; round < blocks + (2 * (last_part) & strips); round++) \
-    for (int part = 0; part <= ((last_part) & strips); part++) \
-      if (const int done = round - 2 * part, block = (done + part) % blocks; done >= 0 && done < blocks) \
-        if (const int first = block * c.block, last = block == blocks - 1 ? height : first + c.block; true)
+// The worlds of a group: `rows` of them from line `base` on. Strips are one world. A row that is not there is `nothing`.
+#define EACH_WORLD \
+  if (const int rows = c.g.world_height(); true) \
+    for (int l = 0; l < (strips ? 1 : c.lanes); l++) \
+      if (const float* const nothing = c.zeros + HALO; true) \
+        if (const int base = l * height; true)
 // Chunks of the columns in word w, and which of a chunk's columns lie in the grid.
-#define EACH_CHUNK for (int x = 64 * w; x < 64 * w + 64 && (WORDS || x < width); x += CHUNK)
+#if WORDS
+#define EACH_CHUNK _Pragma("GCC unroll 4") for (int x = 64 * w; x < 64 * w + 64; x += CHUNK)
+#else
+#define EACH_CHUNK for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK)
+#endif
 ALWAYS u32 inside_of(int x, int width) { return WORDS || width - x >= CHUNK ? ALL : (1u << (width - x)) - 1; }
 // The flags of a chunk, into one world's word, which is kept little end first.
 ALWAYS void put_bits(u64* word, int x, u32 bits) {
@@ -110,15 +112,16 @@ template <int FAR = REACH> ALWAYS void finish_row(const Context& c, float* row) 
   }
 }
 
-ALWAYS float* row_of(const Context& c, const Field* f, int lane, int y) {
-  return f->data + ((size_t)lane * c.g.height + y) * c.g.stride + HALO;
+template <int FAR> ALWAYS void bare_row(const Context& c, float* row) {  // zeros instead
+  for (int i = 0; i < FAR; i++) row[c.g.width + i] = row[-1 - i] = 0;
 }
+ALWAYS float* row_of(const Context& c, const Field* f, int line) { return f->data + (size_t)line * c.g.stride + HALO; }
+ALWAYS float* waiting_row(const Context& c, int i) { return c.waiting + (size_t)i * c.g.stride + HALO; }
 static void copy_floats(const Grid& g, float* to, const float* from) {  // a row and its halo
   memcpy(to - REACH, from - REACH, sizeof(float) * (g.width + 2 * REACH));
 }
-ALWAYS bool copy_row(const Context& c, Field* to, const Field* from, int lane, int y) {
-  size_t at = lane * (size_t)c.g.height + y;
-  to->live[at] = from->live[at];
-  if (from->live[at]) copy_floats(c.g, row_of(c, to, lane, y), row_of(c, from, lane, y));
-  return from->live[at];
+ALWAYS bool copy_row(const Context& c, Field* to, const Field* from, int line) {
+  to->live[line] = from->live[line];
+  if (from->live[line]) copy_floats(c.g, row_of(c, to, line), row_of(c, from, line));
+  return from->live[line];
 }

@@ -36,8 +36,6 @@ struct Grid {
 // Everything one thread needs to run groups: buffers, row tables, keys.
 struct Context {
   Grid g;
-  int near_rows;  // of reals, that a near cache holds while several loops pass over them
-  int block;      // rows that one sweep takes before the next
   std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
   std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus
   std::vector<Plane*> planes, all_planes;
@@ -50,6 +48,7 @@ struct Context {
   std::vector<int> moving;  // the rows that a movement changes
   u64* turned;                        // masks of choices, lane by lane, see turn_masks
   static constexpr int masks = TURNED;  // of a word, a multiple of LANES
+  float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
   V* coins[COINS + 1];  // planes, filled row by row when they are asked for
@@ -75,14 +74,7 @@ struct Context {
   int turn(int dx) const { return turns[dx + HALO]; }  // dx mod width, for rotations
 #endif
   int row(int y) const { return wrapped[y + HALO]; }
-  // Rows of a field: the row y of a lane, around the edges of the world; and whether there is such a row.
-  int line(int lane, int y) const {
-    return g.strips ? lines[lane * g.height + y + HALO] : lane * g.height + lines[y + HALO];
-  }
-  bool has_line(int lane, int y) const {
-    return g.strips ? (u32)(lane * g.height + y) < (u32)(LANES * g.height) : (u32)y < (u32)g.height;
-  }
-  int most_rows() const { return std::min(g.height, 2 * block); }  // of a block
+  int around(int y) const { return lines[y + HALO]; }  // the row of a world
 };
 
 template <class T> static T* aligned(size_t count) {

@@ -15,7 +15,7 @@ from powderdsl.system.memory import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
-GENERATOR_VERSION = 7
+GENERATOR_VERSION = 8
 """Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "fields")
@@ -80,6 +80,7 @@ def native_source(program: Program, words: int = 0) -> NativeSource:
         f"#define REALS {len(layout.reals)}",
         f"#define MOVING {layout.moving}",
         f"#define TURNED {layout.turned}",
+        f"#define WAITING {layout.waiting}",
         f"#define REACH {layout.reach}",
         f"#define REAL_ROWS {layout.rows}",
         f"#define HALO {layout.halo}",
