@@ -55,8 +55,6 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
         elif isinstance(statement, Compute) and statement.region is not None:
             statement = _updated(statement, after)
             gone -= {out.into for out in statement.outs if out.into is not None}
-        elif isinstance(statement, Sweeps):
-            gone -= set(statement.passing)
         result.append(statement)
         if gone:
             result.append(Release(tuple(in_order(gone))))
@@ -92,13 +90,14 @@ def _names(statement: Statement) -> set[str]:
 def live_before(statement: Statement, after: set[str]) -> set[str]:
     """The variables that are live before a statement, given those that are live after it."""
     live = after - {var.name for var in defined_by(statement)}
-    passing = set(statement.passing) if isinstance(statement, Sweeps) else set()
-    return live | (reads(statement) - made_in([statement]) - passing)
+    return live | (reads(statement) - made_in([statement]))
 
 
 def reads(statement: Statement) -> set[str]:
     """The variables that a statement reads, including nested statements."""
     found = set(loaded(values_of(statement)))
+    if isinstance(statement, Sweeps):
+        found -= set(statement.passing)
     if isinstance(statement, Guard):
         for inner in statement.body:
             found |= reads(inner)
