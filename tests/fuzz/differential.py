@@ -37,6 +37,9 @@ ORACLE = "reference"
 WIDTHS = (7, 31, 32, 33, 63, 64, 64, 64, 65, 97, 128, 130)
 """Columns of wide worlds: the borders of words of 32 and 64 columns, more words than one, and the width of most worlds."""
 
+STRIPS = 8
+"""The most strips that native code cuts a world into; it does so if they have equally many rows."""
+
 MANY = 9
 """More worlds than native code runs side by side; one seed in eight has so many."""
 
@@ -73,7 +76,8 @@ class Outcome:
 
 
 def seeded_starts(ruleset: Ruleset, seed: int, worlds: int) -> Iterator[Start]:
-    """The start worlds of a seed: all but one of them tiny, one wide; now and then more than a register holds."""
+    """The start worlds of a seed: all but one of them tiny, one wide; now and then more than a register holds, or one
+    that native code cuts into strips."""
     choices = Choices.seeded(seed * 2 + 1)
     batch = max(1, worlds - 1)
     yield random_start(ruleset, choices, (batch, choices.integer(1, 5), choices.integer(1, 5)))
@@ -84,6 +88,8 @@ def seeded_starts(ruleset: Ruleset, seed: int, worlds: int) -> Iterator[Start]:
         yield random_start(
             ruleset, choices, (MANY + choices.below(MANY), choices.integer(1, 3), choices.integer(1, 9))
         )
+    if seed % 8 == 4:
+        yield random_start(ruleset, choices, (1, STRIPS * choices.integer(1, 3), choices.pick(WIDTHS)))
 
 
 def run_seed(seed: int, plan: Plan, tell: Callable[[tuple[str, int]], None] = lambda place: None) -> Outcome:
