@@ -45,8 +45,13 @@ def presence(schedule: Schedule) -> Schedule:
     before `cut`, which takes masks apart.
     """
     bits = _element_bits(schedule)
-    if not bits:
-        return schedule
+    found = {var.name: slot for slot, var in schedule.finds}
+    leaves = [node for slot, node in schedule.leaves if slot.startswith(_ELEMENT)]
+    if not bits or any(
+        found.get(name, f"{_ELEMENT}{bit}") != f"{_ELEMENT}{bit}" for name, bit in bits.items()
+    ):
+        # Constants, or planes of other slots, become the element.
+        return replace(schedule, body=(*schedule.body, Forget())) if leaves else schedule
     body: list[Statement] = []
     times = _times(schedule, bits)
     for i, statement in enumerate(schedule.body):
@@ -67,6 +72,8 @@ def presence(schedule: Schedule) -> Schedule:
                 body += [statement, Forget()]
             case _:
                 body.append(statement)
+    if any(node.op != "load" for node in leaves):
+        body.append(Forget())
     return replace(schedule, body=tuple(body), when=_pass_asks(schedule, bits))
 
 

@@ -8,6 +8,7 @@ import powderdsl
 from powderdsl.compiler import shipped_rules
 from powderdsl.model.types import Ruleset
 from powderdsl.targets.arrays import draws, kernels, program
+from powderdsl.testing.generators.cases import load_text
 from tests.compilers import skip_without_compiler
 
 SIZES = [(1, 1), (1, 7), (5, 1), (2, 2), (3, 33), (7, 64), (4, 65), (9, 130)]
@@ -88,6 +89,30 @@ def test_what_is_skipped_changes_nothing(seed: int, torch, monkeypatch) -> None:
             worlds = [world.sim.step(world, 2) for world in worlds]
             for slot in oracle.slots:
                 assert torch.equal(worlds[0].state[slot.name], worlds[1].state[slot.name]), slot.name
+
+
+def test_elements_that_appear_are_found_by_later_passes(torch) -> None:  # type: ignore[no-untyped-def]
+    rules = load_text(
+        """
+pack: appearing
+elements:
+  zero: {id: 0, color: '#000000'}
+  one: {id: 1, color: '#808080'}
+  two: {id: 2, color: '#F0F0F0'}
+passes:
+  first:
+    do: any -> one
+  second:
+    do: (zero, one) -> zero
+""",
+        "appearing.yaml",
+    )
+    for shape in ((1, 8, 64), (2, 3, 5)):
+        for start in range(3):
+            ids = torch.full(shape, start)
+            for backend in ("reference", "arrays", "native"):
+                sim = compiled(rules, backend)
+                assert not sim.step(sim.world(ids)).ids.any(), (backend, shape, start)
 
 
 def test_native_state_is_unpacked_when_read(torch) -> None:  # type: ignore[no-untyped-def]
