@@ -94,10 +94,8 @@ def _integer_constants(node: Node, build: Builder) -> Node | None:
 
 @FOLD.on("add", "sub", "quotient")
 def _neutral(node: Node, build: Builder) -> Node | None:
-    """a + 0 = a, a - 0 = a, a div 1 = a, for integers."""
+    """a + 0 = a, a - 0 = a, a div 1 = a. Zeros of either sign are alike: clamping makes them one, nothing tells them apart."""
     a, b = node.args
-    if node.type.name != "int":
-        return None
     if b.op == "const" and b.attr == (1 if node.op == "quotient" else 0):
         return a
     return b if node.op == "add" and a.op == "const" and a.attr == 0 else None
