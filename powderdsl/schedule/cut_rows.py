@@ -298,7 +298,7 @@ class _RowCutter(Cutter):
         if laid:
             self.lay(pairs(laid), place)
         if floats := [node for node in floats if node not in laid]:
-            self.kept_cells(pairs(floats), place)
+            self.cells(pairs(floats), place)
         if flags := [node for node in flags if node not in moves]:
             self.words(pairs(flags), place, when)
         for var, node in pairs(moves):
@@ -314,25 +314,6 @@ class _RowCutter(Cutter):
             groups.setdefault(tuple(id(choice.args[0]) for choice in chain), []).append((var, node))
         for group in groups.values():
             self.cells(group, place, "choices")
-
-    def kept_cells(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
-        """A loop over cells, in a guard if it computes only clamped slots, which change nowhere but under choices."""
-        whole = [pair for pair in pairs if _is_kept(pair[1], self.found)]
-        if len(whole) < len(pairs):
-            self.cells(pairs, place)
-            return
-        outer, self.statements = self.statements, []
-        self.cells(pairs, place)
-        inner, self.statements = self.statements, outer
-        keeps, masks = [], []
-        for var, node in pairs:
-            node = node.args[0]
-            while node.op == "select":
-                masks.append(self.variable(node.args[0]))
-                node = node.args[2]
-            keeps.append((var, self.renamed(node)))
-        when = tuple(dict.fromkeys(masks))
-        self.emit(Guard(when, tuple(inner), tuple(keeps), place))
 
 
 def _leaves_simply(node: Node) -> bool:

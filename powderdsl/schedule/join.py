@@ -52,7 +52,7 @@ def join(schedule: Schedule) -> Schedule:
         run: list[Compute] = []
         for statement in (*block, None):
             if isinstance(statement, Compute) and statement.over in ("cells", "choices"):
-                if run and _asks_masks_of(statement, run):
+                if run and (_asks_masks_of(statement, run) or keeps(statement) or keeps(run[-1])):
                     result.append(_joined(run, reads))
                     run = []
                 if run and (one := _continued(run[-1], statement, reads, schedule.graph)):
@@ -68,6 +68,11 @@ def join(schedule: Schedule) -> Schedule:
         return tuple(result)
 
     return replace(schedule, body=map_blocks(schedule.body, change))
+
+
+def keeps(loop: Compute) -> bool:
+    """Whether values outside the region are old ones. Such a loop runs alone, so that rows outside cost nothing."""
+    return any(out.otherwise is not None and out.otherwise.op == "load" for out in loop.outs)
 
 
 def _asks_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
@@ -126,13 +131,7 @@ def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
         for name in loaded(values_of(loop)):
             if written.get(name) == part:
                 inside[name] += 1
-    kept = {
-        out.var.name
-        for loop in run
-        for out in loop.outs
-        if out.otherwise is not None and out.otherwise.op == "load"
-    }
-    passing = (name for name in written if reads.get(name, 0) == inside[name] and name not in kept)
+    passing = (name for name in written if reads.get(name, 0) == inside[name])
     return Sweeps(tuple(run), tuple(parts), tuple(lags), tuple(passing))
 
 

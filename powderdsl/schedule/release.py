@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+from powderdsl.schedule.join import field_reads, keeps
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -52,6 +53,10 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
         elif isinstance(statement, Move):
             statement = _in_place(statement, after)
             gone -= {str(plane.old.attr) for plane in statement.planes if plane.into}
+        elif isinstance(statement, Sweeps) and keeps(statement.loops[0]):
+            loop = _overwriting(statement.loops[0], after)
+            statement = replace(statement, loops=(loop,))
+            gone -= {out.into for out in loop.outs if out.into is not None}
         elif isinstance(statement, Compute) and statement.region is not None:
             statement = _updated(statement, after)
             gone -= {out.into for out in statement.outs if out.into is not None}
@@ -71,6 +76,12 @@ def _in_place(move: Move, after: set[str]) -> Move:
         for plane in move.planes
     )
     return replace(move, planes=tuple(planes))
+
+
+def _overwriting(loop: Compute, after: set[str]) -> Compute:
+    """A loop that changes some rows of fields, in place where nothing reads the old one elsewhere."""
+    far = {read.name for read in field_reads(loop) if (read.dy or read.dx) and not read.live}
+    return _updated(loop, after | far)
 
 
 def _updated(loop: Compute, after: set[str]) -> Compute:

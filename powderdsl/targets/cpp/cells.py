@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from powderdsl.ir.ops import REAL, Node
-from powderdsl.schedule.join import field_reads
+from powderdsl.schedule.join import field_reads, keeps
 from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, ordered, values_of
 from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
@@ -85,6 +86,8 @@ def _waiting(sweeps: Sweeps) -> dict[str, Rows]:
 
 def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
     """The text of one loop over worlds, see EACH_WORLD in fields.hpp."""
+    if keeps(sweeps.loops[0]):
+        return _changed_text(sweeps.loops[0], declared, layout, reaches)
     waiting = _waiting(sweeps)
     layout.waiting = max(layout.waiting, sum(rows.depth for rows in waiting.values()))
     before: list[str] = []
@@ -114,7 +117,9 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
         f"const float* at{name}[{own.depth}]; std::fill_n(at{name}, {own.depth}, nothing);"
         for name, own in waiting.items()
     )
-    loop_text = "\n".join([*before, *turns, f"EACH_WORLD {{ {pointers}", *rows, "} }", *after])
+    # In a function of its own, fewer values compete for registers.
+    start = "[&]() __attribute__((noinline)) {"
+    loop_text = "\n".join([start, *before, *turns, f"EACH_WORLD {{ {pointers}", *rows, "} }", *after, "}();"])
     outs = [out for loop in sweeps.loops for out in loop.outs]
     lasting = [out for out in outs if out.var.name not in waiting]
     declares = " ".join(
@@ -123,7 +128,7 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
         if out.var.name not in declared
     )
     written = {out.var.name for out in outs}
-    if any(loop.region is None or _keeps(loop) for loop in sweeps.loops):
+    if any(loop.region is None for loop in sweeps.loops):
         return f"{declares}\n{{\n{loop_text}\n}}"
     asked = dict.fromkeys(
         question for loop in sweeps.loops for name, question in _asked(loop) if name not in written
@@ -132,9 +137,21 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
     return f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}"
 
 
-def _keeps(loop: Compute) -> bool:
-    """Whether values outside the region are the old ones."""
-    return any(out.otherwise is not None and out.otherwise.op == "load" for out in loop.outs)
+def _changed_text(loop: Compute, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
+    """A loop that changes fields in place, in rows of its region."""
+    olds = {str(out.otherwise.attr): out.var.name for out in loop.outs if out.otherwise is not None}
+    printed = _Loop(loop, layout, 0, reaches, {}, olds)
+    lines = []
+    for old, name in olds.items():
+        into = any(out.into == old for out in loop.outs)
+        lines.append(
+            f"{'' if name in declared else 'Field* '}{name} = {old if into else f'keep({old})'}; bool some{name} = false;"
+        )
+    asked = " || ".join(dict.fromkeys(f"!{question}" for _, question in _asked(loop))) or "false"
+    lines.append(f"if ({asked}) {{ {' '.join(f'own(c, {name});' for name in olds.values())}")
+    lines.append(f"EACH_WORLD for (int y = 0; y < rows; y++) {{\n{printed.text}\n}}")
+    lines.append(" ".join(f"{name}->still = no_rows_left(c, {name});" for name in olds.values()) + " }")
+    return "\n".join(lines)
 
 
 def _parts(region: Node) -> list[Node]:
@@ -170,6 +187,7 @@ class _Loop:
         turned: int,
         reaches: Mapping[str, int],
         waiting: Mapping[str, Rows],
+        places: Mapping[str, str] = MappingProxyType({}),
     ):
         self.loop, self.layout, self.first, self.reaches, self.waiting = (
             loop,
@@ -182,7 +200,9 @@ class _Loop:
         self.flags = [out for out in loop.outs if out.var.type != REAL]
         self.waits = [out.var.name for out in self.floats if out.var.name in waiting]
         self.lasts = [out.var.name for out in self.floats if out.var.name not in waiting]
-        self.values = Chunks(layout, loop.outs, {name: own.at for name, own in waiting.items()}, self.bare)
+        self.values = Chunks(
+            layout, loop.outs, {name: own.at for name, own in waiting.items()}, self.bare, places
+        )
         self.chains: list[list[Node]] = []
         self.masks: list[str] = []
         if loop.over == "choices":
@@ -243,7 +263,7 @@ class _Loop:
             if name in self.waiting:
                 yield f"{self.waiting[name].at(name, 0)} = nothing;"
             elif out.otherwise is not None and out.otherwise.op == "load":
-                yield f"some{name} |= copy_row(c, {name}, {out.otherwise.attr}, base + y);"
+                continue
             elif out.var.type == REAL:
                 yield f"{name}->live[base + y] = 0;"
             else:

@@ -23,8 +23,12 @@ class Chunks(CellValues):
         outs: tuple[Out, ...],
         waiting: Mapping[str, Callable[[str, int], str]],
         bare: frozenset[str],
+        places: Mapping[str, str],
     ):
+        """`waiting`: where the rows of passing fields are; `bare`: those with zeros beyond the edges; `places`: the fields
+        that hold the values of old ones."""
         super().__init__()
+        self.places = places
         self.layout, self.waiting, self.bare = layout, waiting, bare
         self.rows: dict[str, str] = {}
         self.words: dict[str, str] = {}
@@ -41,6 +45,7 @@ class Chunks(CellValues):
     def row(self, field: str, dy: int, *, wraps: bool = True) -> str:
         """The pointer to a field's row, set up once a row."""
         self.layout.rows = max(self.layout.rows, abs(dy))
+        field = self.places.get(field, field)
         if field in self.waiting:
             call = self.waiting[field](field, dy)
         elif wraps or not dy:

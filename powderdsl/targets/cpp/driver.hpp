@@ -116,15 +116,6 @@ static void put_back(Context* c) {
   }
 }
 
-static void own(Context& c, Field*& f) {
-  if (f != c.calm && f->refs == 1) return;
-  Field* copy = take_field(c);
-  if (!f->still) memcpy(copy->data, f->data, field_size(c.g));
-  memcpy(copy->live, f->live, LANES * c.g.height);
-  copy->still = f->still;
-  give(c, f);
-  f = copy;
-}
 static void reset_slots(Context& c) {
   for (const ResetPlane& r : RESET_PLANES) {
     give(c, c.slot[r.slot]);

@@ -120,8 +120,14 @@ ALWAYS float* waiting_row(const Context& c, int i) { return c.waiting + (size_t)
 static void copy_floats(const Grid& g, float* to, const float* from) {  // a row and its halo
   memcpy(to - REACH, from - REACH, sizeof(float) * (g.width + 2 * REACH));
 }
-ALWAYS bool copy_row(const Context& c, Field* to, const Field* from, int line) {
-  to->live[line] = from->live[line];
-  if (from->live[line]) copy_floats(c.g, row_of(c, to, line), row_of(c, from, line));
-  return from->live[line];
+static bool no_rows_left(const Context& c, const Field* f) { return !memchr(f->live, 1, LANES * c.g.height); }
+// A field of this owner alone, to be written over.
+static void own(Context& c, Field*& f) {
+  if (f != c.calm && f->refs == 1) return;
+  Field* copy = take_field(c);
+  if (!f->still) memcpy(copy->data, f->data, field_size(c.g));
+  memcpy(copy->live, f->live, LANES * c.g.height);
+  copy->still = f->still;
+  give(c, f);
+  f = copy;
 }
