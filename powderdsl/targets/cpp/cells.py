@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -119,7 +119,16 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
     )
     # In a function of its own, fewer values compete for registers.
     start = "[&]() __attribute__((noinline)) {"
-    loop_text = "\n".join([start, *before, *turns, f"EACH_WORLD {{ {pointers}", *rows, "} }", *after, "}();"])
+    inside = [
+        *before,
+        *turns,
+        _copies(sweeps.loops, waiting),
+        f"EACH_WORLD {{ {pointers}",
+        *rows,
+        "} }",
+        *after,
+    ]
+    loop_text = "\n".join([start, *inside, "}();"])
     outs = [out for loop in sweeps.loops for out in loop.outs]
     lasting = [out for out in outs if out.var.name not in waiting]
     declares = " ".join(
@@ -137,20 +146,37 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
     return f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}"
 
 
+def _copies(
+    loops: Sequence[Compute], without: Container[str], places: Mapping[str, str] = MappingProxyType({})
+) -> str:
+    """Copies of the addresses that loops need: a compiler knows that what loops store does not change them."""
+    nodes = [node for loop in loops for node in ordered(values_of(loop)) if node.op == "load"]
+    names = [places.get(str(node.attr), str(node.attr)) for node in nodes]
+    types = {name: node.type for name, node in zip(names, nodes, strict=True)}
+    types |= {out.var.name: out.var.type for loop in loops for out in loop.outs}
+    return " ".join(
+        f"const Field v{name} = *{name}; (void)v{name};"
+        if type == REAL
+        else f"V* const v{name} = {name}->data; (void)v{name};"
+        for name, type in types.items()
+        if name not in without
+    )
+
+
 def _changed_text(loop: Compute, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
     """A loop that changes fields in place, in rows of its region."""
-    olds = {str(out.otherwise.attr): out.var.name for out in loop.outs if out.otherwise is not None}
-    printed = _Loop(loop, layout, 0, reaches, {}, olds)
+    olds = {out.var.name: str(out.otherwise.attr) for out in loop.outs if out.otherwise is not None}
+    places = {out.into: out.var.name for out in loop.outs if out.into is not None}
+    printed = _Loop(loop, layout, 0, reaches, {}, places)
     lines = []
-    for old, name in olds.items():
-        into = any(out.into == old for out in loop.outs)
-        lines.append(
-            f"{'' if name in declared else 'Field* '}{name} = {old if into else f'keep({old})'}; bool some{name} = false;"
-        )
+    for name, old in olds.items():
+        value = old if old in places else f"keep({old})"
+        lines.append(f"{'' if name in declared else 'Field* '}{name} = {value}; bool some{name} = false;")
     asked = " || ".join(dict.fromkeys(f"!{question}" for _, question in _asked(loop))) or "false"
-    lines.append(f"if ({asked}) {{ {' '.join(f'own(c, {name});' for name in olds.values())}")
+    lines.append(f"if ({asked}) {{ {' '.join(f'own(c, {name});' for name in olds)}")
+    lines.append(_copies([loop], (), places))
     lines.append(f"EACH_WORLD for (int y = 0; y < rows; y++) {{\n{printed.text}\n}}")
-    lines.append(" ".join(f"{name}->still = no_rows_left(c, {name});" for name in olds.values()) + " }")
+    lines.append(" ".join(f"{name}->still = no_rows_left(c, {name});" for name in olds) + " }")
     return "\n".join(lines)
 
 
@@ -236,14 +262,14 @@ class _Loop:
     def starts(self) -> Iterator[str]:
         """Pointers to the rows that the loop writes."""
         for out in self.flags:
-            yield f"u64* o{out.var.name} = &lane_word({out.var.name}, row * words, lane);"
+            yield f"u64* o{out.var.name} = &lane_word(v{out.var.name}, row * words, lane);"
         for out in self.floats:
             name = out.var.name
             if name in self.waiting:
                 own = self.waiting[name]
                 yield f"float* o{name} = waiting_row(c, {own.first} + (y & {own.depth - 1})); {own.at(name, 0)} = o{name};"
             else:
-                yield f"float* o{name} = row_of(c, {name}, base + y);"
+                yield f"float* o{name} = row_of(c, v{name}, base + y);"
 
     def ends(self) -> Iterator[str]:
         """The columns beyond the edges of what the loop has written."""
@@ -265,10 +291,10 @@ class _Loop:
             elif out.otherwise is not None and out.otherwise.op == "load":
                 continue
             elif out.var.type == REAL:
-                yield f"{name}->live[base + y] = 0;"
+                yield f"v{name}.live[base + y] = 0;"
             else:
                 rest = "c.valid(w)[lane]" if out.otherwise is not None and out.otherwise.attr else "0"
-                yield f"for (int w = 0; w < words; w++) lane_word({name}, row * words + w, lane) = {rest};"
+                yield f"for (int w = 0; w < words; w++) lane_word(v{name}, row * words + w, lane) = {rest};"
 
     # Values, chunk by chunk
 
@@ -287,14 +313,14 @@ class _Loop:
                 counts.append(f"I n{name} = {{}};")
                 stores.append(f"n{name} |= (I)blend(inside, {value}, splatf(0));")
                 lives.append(
-                    f"{{ const bool some = any((V)(n{name} + n{name})); {name}->live[base + y] = some; some{name} |= some; }}"
+                    f"{{ const bool some = any((V)(n{name} + n{name})); v{name}.live[base + y] = some; some{name} |= some; }}"
                 )
         region = self.loop.region
         yield PLACE
         if region is not None:
             parts = _parts(region)
             scans = [
-                f"some |= row_bits({part.attr}, row * words, words, lane);"
+                f"some |= row_bits(v{part.attr}, row * words, words, lane);"
                 for part in parts
                 if part.op == "load"
             ]
@@ -304,7 +330,7 @@ class _Loop:
         yield " ".join([*self.pointers(), *self.starts(), *counts])
         yield from (f"if (!WORDS) o{out.var.name}[(words - 1) * LANES] = 0;" for out in self.flags)
         words = [
-            f"const u64 {name} = lane_word({plane}, row * words + w, lane);"
+            f"const u64 {name} = lane_word(v{plane}, row * words + w, lane);"
             for plane, name in values.words.items()
         ]
         yield f"for (int w = 0; w < words; w++) {{ {' '.join(words)}"
@@ -321,7 +347,7 @@ class _Loop:
         name, dy = str(live.args[0].attr), live.attr[0]
         if name in self.waiting:
             return f"{self.waiting[name].at(name, dy)} != nothing"
-        return f"{name}->live[base + {f'c.around(y + {dy})' if dy else 'y'}]"
+        return f"v{name}.live[base + {f'lines[y + {dy}]' if dy else 'y'}]"
 
     # Chains of choices
 
@@ -354,16 +380,16 @@ class _Loop:
         yield f"const u64* turned = turned_row(c, base + y) + {self.first}; const bool any = any_turned(c, turned, {count});"
         lives = " || ".join(dict.fromkeys(self.alive(base) for base in bases))
         yield f"const bool some = any || {lives};"
-        yield " ".join(f"some{name} |= {name}->live[base + y] = some;" for name in self.lasts)
+        yield " ".join(f"some{name} |= v{name}.live[base + y] = some;" for name in self.lasts)
         gone = " ".join(f"{self.waiting[name].at(name, 0)} = nothing;" for name in self.waits)
         yield f"if (!some) {{ {gone} }} else {{"
         yield " ".join([*self.pointers(), *self.starts()])
-        yield "for (int w = 0; w < words; w++) { const u64* masks = turned + w * c.masks;"
+        yield f"for (int w = 0; w < words; w++) {{ const u64* masks = turned + w * c.masks; const u64 which = which_turned(masks, {count});"
         yield " ".join(f"F {name}[64 / CHUNK];" for name in heads)
         yield f"EACH_REGISTER {{ {' '.join(f'{name}[k] = load({old}, x);' for name, old in zip(heads, olds, strict=True))} }}"
         for begin in range(0, count, AT_ONCE):
-            some = " | ".join(f"masks[{level}]" for level in range(begin, min(count, begin + AT_ONCE)))
-            yield f"if ({some}) {{ {' '.join(levels[begin : begin + AT_ONCE])} }}"
+            asked = f"which & {(1 << AT_ONCE) - 1 << begin % 64:#x}ull" if count <= 64 else "which"
+            yield f"if ({asked}) {{ {' '.join(levels[begin : begin + AT_ONCE])} }}"
         yield f"EACH_REGISTER {{ {ends} }} }}"
         yield f"{' '.join(self.ends())} }}"
 

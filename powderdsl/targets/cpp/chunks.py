@@ -49,9 +49,9 @@ class Chunks(CellValues):
         if field in self.waiting:
             call = self.waiting[field](field, dy)
         elif wraps or not dy:
-            call = f"real_line(c, {field}, base + {f'c.around(y + {dy})' if dy else 'y'})"
+            call = f"real_line(c, v{field}, base + {f'lines[y + {dy}]' if dy else 'y'}, nothing)"
         else:
-            call = f"real_line_or_nothing(c, {field}, base, y + {dy}, rows)"
+            call = f"real_line_or_nothing(c, v{field}, base, y + {dy}, rows, nothing)"
         return self.rows.setdefault(call, f"r{len(self.rows)}")
 
     def word(self, node: Node) -> str:

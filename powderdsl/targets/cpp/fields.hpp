@@ -1,11 +1,11 @@
 // Rows of reals, and the rows of planes that they ask for. Comes after planes.hpp.
 
 // Real rows.
-ALWAYS const float* real_line(const Context& c, const Field* f, int line) {
-  return f->live[line] ? f->data + (size_t)line * c.g.stride + HALO : c.zeros + HALO;
+ALWAYS const float* real_line(const Context& c, const Field& f, int line, const float* nothing) {
+  return f.live[line] ? f.data + (size_t)line * c.g.stride + HALO : nothing;
 }
-ALWAYS const float* real_line_or_nothing(const Context& c, const Field* f, int base, int y, int rows) {
-  return (u32)y < (u32)rows ? real_line(c, f, base + y) : c.zeros + HALO;
+ALWAYS const float* real_line_or_nothing(const Context& c, const Field& f, int base, int y, int rows, const float* nothing) {
+  return (u32)y < (u32)rows ? real_line(c, f, base + y, nothing) : nothing;
 }
 ALWAYS F inside_columns(F value, int x, int dx, int width) {
   if (__builtin_expect(x + dx >= 0 && x + dx + CHUNK <= width, 1)) return value;
@@ -15,8 +15,8 @@ ALWAYS F inside_columns(F value, int x, int dx, int width) {
 }
 ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
 // A word of a lane, and all words of one of its rows together.
-ALWAYS u64& lane_word(const Plane* p, int i, int lane) { return ((u64*)p->data)[i * LANES + lane]; }
-ALWAYS u64 row_bits(const Plane* p, int first, int words, int lane) {
+ALWAYS u64& lane_word(V* plane, int i, int lane) { return ((u64*)plane)[i * LANES + lane]; }
+ALWAYS u64 row_bits(V* p, int first, int words, int lane) {
   u64 some = 0;
   for (int w = 0; w < words; w++) some |= lane_word(p, first + w, lane);
   return some;
@@ -24,7 +24,7 @@ ALWAYS u64 row_bits(const Plane* p, int first, int words, int lane) {
 // Lanes of worlds that are not there hold nothing.
 static void no_words(const Context& c, Plane* p) {
   for (int l = c.lanes; l < LANES; l++)
-    for (int i = 0; i < c.g.cells(); i++) lane_word(p, i, l) = 0;
+    for (int i = 0; i < c.g.cells(); i++) lane_word(p->data, i, l) = 0;
 }
 static void no_rows(const Context& c, Field* f) {
   memset(f->live + c.lanes * c.g.height, 0, (LANES - c.lanes) * c.g.height);
@@ -74,6 +74,12 @@ ALWAYS bool any_turned(const Context& c, const u64* masks, int count) {
     for (int from = 0; from < count; from += LANES) some |= *(const V*)(masks + w * c.masks + from);
   return any(some);
 }
+// Which of up to 64 masks hold anything in a word.
+ALWAYS u64 which_turned(const u64* masks, int count) {
+  u64 which = 0;
+  for (int from = 0; from < count; from += LANES) which |= (u64)lanes_of(*(const V*)(masks + from)) << (from & 63);
+  return which;
+}
 // The chunks of word w, whose values wait in registers.
 #define EACH_REGISTER _Pragma("GCC unroll 16") for (int k = 0, x = 64 * w; k < 64 / CHUNK && (WORDS || x < width); k++, x += CHUNK)
 // The worlds of a group: `rows` of them from line `base` on. Strips are one world. A row that is not there is `nothing`.
@@ -81,7 +87,7 @@ ALWAYS bool any_turned(const Context& c, const u64* masks, int count) {
   if (const int rows = c.g.world_height(); true) \
     for (int l = 0; l < (strips ? 1 : c.lanes); l++) \
       if (const float* const nothing = c.zeros + HALO; true) \
-        if (const int base = l * height; true)
+        if (const int *const lines = c.lines.data() + HALO, base = l * height; true)
 // Chunks of the columns in word w, and which of a chunk's columns lie in the grid.
 #if WORDS
 #define EACH_CHUNK _Pragma("GCC unroll 4") for (int x = 64 * w; x < 64 * w + 64; x += CHUNK)
@@ -115,7 +121,7 @@ template <int FAR = REACH> ALWAYS void finish_row(const Context& c, float* row) 
 template <int FAR> ALWAYS void bare_row(const Context& c, float* row) {  // zeros instead
   for (int i = 0; i < FAR; i++) row[c.g.width + i] = row[-1 - i] = 0;
 }
-ALWAYS float* row_of(const Context& c, const Field* f, int line) { return f->data + (size_t)line * c.g.stride + HALO; }
+ALWAYS float* row_of(const Context& c, const Field& f, int line) { return f.data + (size_t)line * c.g.stride + HALO; }
 ALWAYS float* waiting_row(const Context& c, int i) { return c.waiting + (size_t)i * c.g.stride + HALO; }
 static void copy_floats(const Grid& g, float* to, const float* from) {  // a row and its halo
   memcpy(to - REACH, from - REACH, sizeof(float) * (g.width + 2 * REACH));

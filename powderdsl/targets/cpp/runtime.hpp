@@ -74,7 +74,6 @@ struct Context {
   int turn(int dx) const { return turns[dx + HALO]; }  // dx mod width, for rotations
 #endif
   int row(int y) const { return wrapped[y + HALO]; }
-  int around(int y) const { return lines[y + HALO]; }  // the row of a world
 };
 
 template <class T> static T* aligned(size_t count) {

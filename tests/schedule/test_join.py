@@ -1,0 +1,48 @@
+"""Loops over floats that run together row by row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from powderdsl.compiler import load
+from powderdsl.ir.verify import InvalidIR
+from powderdsl.schedule.stages import CPP, plan
+from powderdsl.schedule.types import Compute, Schedule, Sweeps, flat
+from powderdsl.schedule.verify import verify
+from tests.schedule.test_stages import packed_passes
+
+
+def planned(name: str) -> Schedule:
+    """The pass of that name in powderworld, as native code runs it."""
+    (found,) = (pass_ for _, pass_ in packed_passes(load("powderworld")) if pass_.name == name)
+    return plan(found, CPP)
+
+
+def test_box_sums_follow_choices() -> None:
+    *_, last = (one for one in flat(planned("wind").body) if isinstance(one, Sweeps))
+    # Damped choices; sums of three columns; sums of three rows of these.
+    assert [loop.over for loop in last.loops] == ["choices", "cells", "cells"]
+    assert last.parts == (0, 0, 0)
+    assert last.lags == (0, 1, 2)
+    written = [out.var.name for loop in last.loops for out in loop.outs]
+    assert last.passing == tuple(written[:4])
+
+
+def test_a_row_is_not_read_before_it_is_there() -> None:
+    schedule = planned("wind")
+    early = tuple(
+        replace(one, lags=(0,) * len(one.loops)) if isinstance(one, Sweeps) else one for one in schedule.body
+    )
+    with pytest.raises(InvalidIR, match="is read before it is there"):
+        verify(replace(schedule, body=early), "join")
+
+
+def test_fields_change_in_place() -> None:
+    *_, last = (one for one in flat(planned("fire").body) if isinstance(one, Sweeps))
+    (loop,) = last.loops
+    assert isinstance(loop, Compute)
+    for out in loop.outs:
+        assert out.otherwise is not None
+        assert out.into == out.otherwise.attr
