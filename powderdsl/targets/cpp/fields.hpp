@@ -1,4 +1,4 @@
-// Rows of reals, and the rows of planes that they ask for. Comes after planes.hpp.
+// Rows of reals, and the rows of planes that they ask for. Comes after movements.hpp.
 
 // Real rows.
 ALWAYS const float* real_line(const Context& c, const Field& f, int line, const float* nothing) {

@@ -74,6 +74,7 @@ struct Context {
   int turn(int dx) const { return turns[dx + HALO]; }  // dx mod width, for rotations
 #endif
   int row(int y) const { return wrapped[y + HALO]; }
+  const int* rows() const { return wrapped.data() + HALO; }
 };
 
 template <class T> static T* aligned(size_t count) {

@@ -18,7 +18,7 @@ from powderdsl.targets.layout import Layout, layout_of, literal
 GENERATOR_VERSION = 8
 """Part of every cache key; increase it when generated code changes meaning."""
 
-LIBRARY = ("vectors", "runtime", "planes", "fields")
+LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
 """Headers that come before the generated passes, in this order."""
 DRIVER = ("driver", "views")
 """Headers that come after them."""

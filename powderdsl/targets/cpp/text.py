@@ -27,8 +27,8 @@ def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
     if schedule.when is not None:
         lines.append(f"if (!{answer(schedule.when)}) return;")
     lines.append(
-        "const int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0; "
-        "(void)words; (void)height; (void)width; (void)strips;"
+        "const int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0, "
+        "*rows = c.rows(); (void)words; (void)height; (void)width; (void)strips; (void)rows;"
     )
     for slot, var in schedule.finds:
         place = printer.slot(slot, var)
@@ -166,15 +166,21 @@ class _Printer:
             name = out.var.name
             change = f"own(c, {name}); {name}->zero = false;"
             yield f"if (!{name}->zero) {{ {change} }}" if is_cleared(out, self.graph) else change
-        some = " | ".join(f"{mask}->data[i]" for mask in masks)
-        stores = [f"{out.var.name}->data[i] = {values.clean(out.value)};" for out in loop.outs]
-        yield "\n".join([LOOP, f"if (!any({some})) continue;", *values.lines, *stores, "} }"])
+        some = " | ".join(f"{values.plane(mask)}[i]" for mask in masks)
+        stores = [
+            f"{values.plane(str(out.otherwise.attr))}[i] = {values.clean(out.value)};"
+            for out in loop.outs
+            if out.otherwise
+        ]
+        yield "\n".join(
+            [values.pointers(), LOOP, f"if (!any({some})) continue;", *values.lines, *stores, "} }"]
+        )
 
     def words(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
         names = [out.var.name for out in loop.outs]
         values = _Words(self.layout)
         stores = [
-            f"{{ const V o = {values.clean(out.value)}; {out.var.name}->data[i] = o; a{out.var.name} |= o; }}"
+            f"{{ const V o = {values.clean(out.value)}; d{out.var.name}[i] = o; a{out.var.name} |= o; }}"
             for out in loop.outs
         ]
         new = [name for name in names if name not in declared]
@@ -186,8 +192,10 @@ class _Printer:
         else:
             yield "{"
         yield values.ready()
-        yield " ".join(f"{name} = take(c); V a{name} = splat(0);" for name in names)
-        yield "\n".join([LOOP, *values.lines, *stores, "}"])
+        yield " ".join(
+            f"{name} = take(c); V* const d{name} = {name}->data; V a{name} = splat(0);" for name in names
+        )
+        yield "\n".join([values.pointers(), LOOP, *values.lines, *stores, "}"])
         yield " ".join(f"{name}->zero = !any(a{name});" for name in names) + " }"
 
 
@@ -203,7 +211,7 @@ def _kept(value: Node) -> str:
 
 
 def _leaves(old: Node, rest: Node, movers: str) -> str | None:
-    """What movers leave behind, by its name in planes.hpp; None if it has none there."""
+    """What movers leave behind, by its name in movements.hpp; None if it has none there."""
     if rest is old:
         return "SAME"
     if rest.op not in ("and", "or") or old not in rest.args:
@@ -243,10 +251,25 @@ class _Words(WordValues):
         self.clear: dict[int, bool] = {}
         self.places: dict[str, str] = {}
         """The planes that hold the old values of planes which are changed in place."""
+        self.read: dict[str, str] = {}
+        """The pointers to planes that the loop reads, which would be loaded again after every store, by what they point to."""
 
     def ready(self) -> str:
         """Statements before the loop that prepare the rows of other strips."""
         return " ".join(f"{call}(c, {plane}, {rows});" for (call, plane), rows in self.edges.items())
+
+    def plane(self, name: str) -> str:
+        """The pointer to a plane's words."""
+        return self.pointer(f"{self.places.get(name, name)}->data")
+
+    def pointer(self, words: str) -> str:
+        if words not in self.read:
+            self.read[words] = f"r{len(self.read)}"
+        return self.read[words]
+
+    def pointers(self) -> str:
+        """Statements before the loop that name what it points to."""
+        return " ".join(f"V* const {name} = {words};" for words, name in self.read.items())
 
     def lazy(self, node: Node) -> str:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
@@ -294,7 +317,7 @@ class _Words(WordValues):
             return "y * words"
         self.reads("edges", plane, dy)
         self.layout.around = max(self.layout.around, abs(dy))
-        return f"c.row(y + {dy})"
+        return f"rows[y + {dy}]"
 
     def reads(self, call: str, plane: str, dy: int) -> None:
         if dy:
@@ -311,7 +334,7 @@ class _Words(WordValues):
             return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
         match node.op:
             case "load":
-                return f"{self.places.get(str(attr), attr)}->data[y * words + w]"
+                return f"{self.plane(str(attr))}[i]"
             case "shift":
                 return self.shift(node)
             case "const":
@@ -322,9 +345,10 @@ class _Words(WordValues):
                 axis, modulus, bit = attr
                 if axis == "step":
                     return f"c.step_bits[{self.layout.step_planes[modulus, bit]}]"
-                return f"c.fixed[{self.layout.fixed[0 if axis == 'row' else 1, modulus, bit]}][y * words + w]"
+                fixed = self.layout.fixed[0 if axis == "row" else 1, modulus, bit]
+                return f"{self.pointer(f'c.fixed[{fixed}]')}[i]"
             case "inside":
-                return f"c.fixed[{self.layout.fixed[2, attr[0], attr[1]]}][y * words + w]"
+                return f"{self.pointer(f'c.fixed[{self.layout.fixed[2, attr[0], attr[1]]}]')}[i]"
             case "chance":
                 stream, bits, limit = attr
                 wanted = self.clean(node.args[0]) if args else "valid"
@@ -365,8 +389,8 @@ class _Words(WordValues):
         plane = str(node.args[0].attr)
         if wraps:
             if not dx:
-                return f"{plane}->data[{self.row(plane, dy)} + w]"
-            return f"columns(c, {plane}->data + {self.row(plane, dy)}, w, {dx})"
+                return f"{self.plane(plane)}[{self.row(plane, dy)} + w]"
+            return f"columns(c, {self.plane(plane)} + {self.row(plane, dy)}, w, {dx})"
         self.reads("bare_edges", plane, dy)
         row = f"row_or_nothing(c, {plane}, y + {dy})"
         return f"columns_zero(c, {row}, w, {dx})" if dx else f"{row}[w]"

@@ -65,6 +65,13 @@ ALWAYS bool any_word(const V* row, int words) {
   for (int w = 1; w < words; w++) some |= row[w];
   return any(some);
 }
+ALWAYS V rotated(V x, int by) {  // each word to the right, by less than its width
+#if VECTOR == 64
+  return (V)_mm512_rorv_epi64((__m512i)x, (__m512i)splat(by));
+#else
+  return (x >> by) | (x << (64 - by));
+#endif
+}
 ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }
 
 // The flags of a chunk as bits, and back as a choice between two vectors.

@@ -1,0 +1,342 @@
+// Operations on whole planes: shifts, movements in place, planes cleared and joined. Comes after planes.hpp.
+
+OUTLINE Plane* shifted(Context& c, Plane* p, int dy, int dx) {
+  if (p->zero) return keep(c.nothing);
+  edges(c, p, abs(dy));
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int y = 0; y < c.g.height; y++) {
+    const V* from = p->data + c.row(y + dy);
+    for (int w = 0; w < c.g.words; w++) {
+      V x = dx ? columns(c, from, w, dx) : from[w];
+      some |= x;
+      r->data[y * c.g.words + w] = x;
+    }
+  }
+  r->zero = !any(some);
+  return r;
+}
+// Movers (and `targets`, the same seen from the other side) exchange what they hold.
+OUTLINE Plane* swap_plane(Context& c, Plane* content, const Plane* movers, const Plane* targets, Plane* rest, int dy, int dx) {
+  if (content->zero && rest->zero) return keep(rest);
+  edges(c, content, abs(dy));
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int y = 0; y < c.g.height; y++) {
+    const V *down = content->data + c.row(y + dy), *up = content->data + c.row(y - dy);
+    for (int w = 0; w < c.g.words; w++) {
+      int i = y * c.g.words + w;
+      V there = dx ? columns(c, down, w, dx) : down[w], back = dx ? columns(c, up, w, -dx) : up[w];
+      V x = mux(movers->data[i], there, mux(targets->data[i], back, rest->data[i]));
+      some |= x;
+      r->data[i] = x;
+    }
+  }
+  r->zero = !any(some);
+  return r;
+}
+OUTLINE Plane* arrive_plane(Context& c, Plane* content, const Plane* targets, Plane* rest, int dy, int dx) {
+  if (targets->zero || (content->zero && rest->zero)) return keep(rest);
+  edges(c, content, abs(dy));
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int y = 0; y < c.g.height; y++) {
+    const V* up = content->data + c.row(y - dy);
+    for (int w = 0; w < c.g.words; w++) {
+      int i = y * c.g.words + w;
+      V back = dx ? columns(c, up, w, -dx) : up[w];
+      V x = mux(targets->data[i], back, rest->data[i]);
+      some |= x;
+      r->data[i] = x;
+    }
+  }
+  r->zero = !any(some);
+  return r;
+}
+// A plane of this owner alone, to be written over.
+static void own(Context& c, Plane*& p) {
+  if (p != c.nothing && p != c.everything && p->refs == 1) {
+    p->around = p->beyond = 0;
+    return;
+  }
+  Plane* copy = take(c);
+  if (p->zero) memset(copy->data, 0, sizeof(V) * c.g.cells());
+  else memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
+  copy->zero = p->zero;
+  give(c, p);
+  p = copy;
+}
+// Planes that move together, in place.
+enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
+// Rows of one word, not in strips: every row that changes is read and written once. What leaves it for the next one waits
+// in a register, and a few planes go together, since each waits for what it reads.
+constexpr int TOGETHER = 4;
+#define EACH_PLANE _Pragma("GCC unroll 4") for (int k = 0; k < N; k++)
+ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && !c.g.strips && abs(dy) <= 1; }
+// `by` columns to the left on the torus.
+template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {
+  if (!TURNS) return x;
+  if (WORDS) return rotated(x, by);
+  return ((x >> by) | (x << (c.g.width - by))) & c.valid(0);
+}
+// The rows that movers leave or enter, in the direction in which they move; the one whose movers go around is the last.
+ALWAYS int rows_of(Context& c, const V* m, int dy) {
+  const int height = c.g.height;
+  int* rows = c.moving.data();
+  if (!dy) {
+    for (int y = 0; y < height; y++) *rows = y, rows += any(m[y]);
+    return rows - c.moving.data();
+  }
+  V before = m[dy > 0 ? height - 1 : 0];  // what moves into row y
+  for (int i = 0, y = dy > 0 ? 0 : height - 1; i < height; i++, y += dy) {
+    const V here = m[y];
+    *rows = y, rows += any(before | here);
+    before = here;
+  }
+  return rows - c.moving.data();
+}
+// ROWS: whether they move to another row.
+template <int N, bool TURNS, bool ROWS> OUTLINE void swap_near(const Context& c, V* const* planes, const V* m, int count, int dy, int by) {
+  const int back = c.g.width - by, edge = dy > 0 ? c.g.height - 1 : 0, first = c.g.height - 1 - edge, *rows = c.moving.data();
+  V *data[N], comes[N], last[N];
+  EACH_PLANE data[k] = planes[k];
+  if (ROWS)
+    EACH_PLANE {
+      last[k] = (data[k][edge] ^ around<TURNS>(c, data[k][first], by)) & m[edge];
+      comes[k] = around<TURNS>(c, last[k], back);
+    }
+  const bool wraps = ROWS && count && rows[count - 1] == edge;
+  for (int i = 0; i < count - wraps; i++) {
+    const int y = rows[i];
+    const V gone = m[y];
+    EACH_PLANE {
+      const V a = data[k][y], d = (a ^ around<TURNS>(c, ROWS ? data[k][y + dy] : a, by)) & gone, goes = around<TURNS>(c, d, back);
+      data[k][y] = a ^ d ^ (ROWS ? comes[k] : goes);
+      comes[k] = goes;
+    }
+  }
+  if (wraps) EACH_PLANE data[k][edge] ^= last[k] ^ comes[k];
+}
+template <bool TURNS, bool ROWS> ALWAYS void swap_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int by) {
+  const int rows = rows_of(c, m, dy);
+  int k = 0;
+  for (; k + TOGETHER <= count; k += TOGETHER) swap_near<TOGETHER, TURNS, ROWS>(c, data + k, m, rows, dy, by);
+  for (; k < count; k++) swap_near<1, TURNS, ROWS>(c, data + k, m, rows, dy, by);
+}
+template <int N, Leaves LEAVES, bool TURNS, bool ROWS> OUTLINE void arrive_near(const Context& c, V* const* planes, const V* m, int count, int edge, int back) {
+  const int* rows = c.moving.data();
+  const V* enters = c.entered;
+  V *data[N], comes[N];
+  EACH_PLANE data[k] = planes[k];
+  if (ROWS) EACH_PLANE comes[k] = data[k][edge] & m[edge];
+  for (int i = 0; i < count; i++) {
+    const int y = rows[i];
+    const V gone = m[y], entered = enters[i];
+    EACH_PLANE {
+      const V a = data[k][y], goes = a & gone, left = LEAVES == NOTHING ? a & ~gone : LEAVES == EVERYTHING ? a | gone : a;
+      data[k][y] = mux(entered, around<TURNS>(c, ROWS ? comes[k] : goes, back), left);
+      comes[k] = goes;
+    }
+  }
+}
+template <Leaves LEAVES, bool TURNS, bool ROWS> ALWAYS void arrive_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int back) {
+  const int rows = rows_of(c, m, dy), edge = dy > 0 ? c.g.height - 1 : 0;
+  for (int i = 0; i < rows; i++) {
+    const int y = c.moving[i], from = !ROWS ? y : y == c.g.height - 1 - edge ? edge : y - dy;
+    c.entered[i] = around<TURNS>(c, m[from], back);
+  }
+  int k = 0;
+  for (; k + TOGETHER <= count; k += TOGETHER) arrive_near<TOGETHER, LEAVES, TURNS, ROWS>(c, data + k, m, rows, edge, back);
+  for (; k < count; k++) arrive_near<1, LEAVES, TURNS, ROWS>(c, data + k, m, rows, edge, back);
+}
+// A row that exchanges with one of other strips, `by` of them on.
+OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int by, int dx) {
+  const int words = c.g.words;
+  V* seen = c.change + words;
+  for (int k = 0; k < n; k++) {
+    V *here = data[k] + here_row * words, *there = data[k] + there_row * words;
+    for (int w = 0; w < words; w++) seen[w] = turned(there[w], by);
+    for (int w = 0; w < words; w++) c.change[w] = (here[w] ^ (dx ? columns(c, seen, w, dx) : seen[w])) & m[w];
+    for (int w = 0; w < words; w++) here[w] ^= c.change[w];
+    for (int w = 0; w < words; w++) there[w] ^= turned(dx ? columns(c, c.change, w, -dx) : c.change[w], -by);
+  }
+}
+// A word's columns, moved by dx: those that stay in the word, and those that come into the next.
+ALWAYS V moved_within(const Context& c, V d, int w, int dx) { return (dx > 0 ? d << dx : d >> -dx) & c.valid(w); }
+ALWAYS V moved_over(const Context& c, V d, int w, int next, int dx) {
+  return (dx > 0 ? d >> (columns_in(c, w) - dx) : d << (columns_in(c, next) + dx)) & c.valid(next);
+}
+// A row of several words that exchanges with one some columns on. No two movers have a cell in common, so words may
+// take turns.
+OUTLINE void swap_words(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int dx) {
+  for (int w = 0; w < c.g.words; w++) {
+    if (!any(m[w])) continue;
+    const int next = next_word(c, w, dx);
+    for (int k = 0; k < n; k++) {
+      V *here = data[k] + here_row, *there = data[k] + there_row;
+      const V d = (here[w] ^ columns(c, there, w, dx)) & m[w];
+      here[w] ^= d;
+      there[w] ^= moved_within(c, d, w, dx);
+      there[next] ^= moved_over(c, d, w, next, dx);
+    }
+  }
+}
+// Movers exchange what they hold with their targets. No cell is both.
+OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
+  if (movers->zero) return;
+  V* data[MOVING + 1];
+  int n = 0;
+  for (int k = 0; k < count; k++) {
+    Plane*& p = *planes[k];
+    if (p->zero) continue;
+    own(c, p);
+    data[n++] = p->data;
+  }
+  const int words = c.g.words, by = c.turn(dx), back = c.g.width - by;
+  if (!dy && !by) return;  // around the whole world, to itself
+  if (near_rows(c, dy)) {
+    if (!by) swap_near_rows<false, true>(c, data, n, movers->data, dy, by);
+    else if (dy) swap_near_rows<true, true>(c, data, n, movers->data, dy, by);
+    else swap_near_rows<true, false>(c, data, n, movers->data, dy, by);
+    return;
+  }
+  for (int y = 0; y < c.g.height; y++) {
+    const V* m = movers->data + y * words;
+    if (c.g.strips && (u32)(y + dy) >= (u32)c.g.height) {
+      const int by = strips_on(c, y + dy);
+      if (any_word(m, words)) swap_strips(c, m, data, n, y, y + dy - by * c.g.height, by, dx);
+      continue;
+    }
+    if (words > 1 && dx) {
+      if (abs(dx) <= c.rest) {
+        swap_words(c, m, data, n, y * words, c.row(y + dy), dx);
+        continue;
+      }
+      if (!any_word(m, words)) continue;
+      for (int k = 0; k < n; k++) {
+        V *here = data[k] + y * words, *there = data[k] + c.row(y + dy);
+        for (int w = 0; w < words; w++) c.change[w] = (here[w] ^ columns(c, there, w, dx)) & m[w];
+        for (int w = 0; w < words; w++) here[w] ^= c.change[w];
+        for (int w = 0; w < words; w++) there[w] ^= columns(c, c.change, w, -dx);
+      }
+      continue;
+    }
+    for (int w = 0; w < words; w++) {
+      if (!any(m[w])) continue;
+      const int here = y * words + w, there = c.row(y + dy) + w;
+      for (int k = 0; k < n; k++) {
+        const V a = data[k][here], b = data[k][there];
+        const V d = (a ^ (by ? (b >> by) | (b << back) : b)) & m[w];
+        data[k][here] = a ^ d;
+        data[k][there] ^= by ? ((d << by) | (d >> back)) & c.valid(0) : d;  // read again: it may be the same row
+      }
+    }
+  }
+}
+// Movers go to their targets, at most a row away. A cell that is both holds what arrives: each row is read before
+// anything arrives there, and what goes around the edge arrives last.
+template <Leaves LEAVES, bool AROUND>
+ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, int there, const V* m, const V* targets, int dx) {
+  const int words = c.g.words, by = c.turn(-dx), back = c.g.width - by;
+  if (__builtin_expect(words == 1, 1)) {
+    const V gone = m[0], keeps = ~targets[0], valid = c.valid(0);
+    for (int k = 0; k < count; k++) {
+      const V a = data[k][here], moving = a & gone;
+      const V arriving = by ? ((moving >> by) | (moving << back)) & valid : moving;
+      if (LEAVES == NOTHING) data[k][here] = a & ~gone;
+      if (LEAVES == EVERYTHING) data[k][here] = a | gone;
+      if (AROUND) c.late[k] = arriving;
+      else data[k][there] = (data[k][there] & keeps) | arriving;
+    }
+    return;
+  }
+  if (here != there && abs(dx) <= c.rest) {
+    if (AROUND) memset(c.late, 0, sizeof(V) * count * words);
+    for (int w = 0; w < words && !AROUND; w++) {
+      if (!any(targets[w])) continue;
+      for (int k = 0; k < count; k++) data[k][there + w] &= ~targets[w];
+    }
+    for (int w = 0; w < words; w++) {
+      if (!any(m[w])) continue;
+      const int next = next_word(c, w, dx);
+      for (int k = 0; k < count; k++) {
+        V *from = data[k] + here + w, *to = AROUND ? c.late + k * words : data[k] + there;
+        const V moving = *from & m[w];
+        if (LEAVES == NOTHING) *from &= ~m[w];
+        if (LEAVES == EVERYTHING) *from |= m[w];
+        to[w] |= moved_within(c, moving, w, dx);
+        if (dx) to[next] |= moved_over(c, moving, w, next, dx);
+      }
+    }
+    return;
+  }
+  V* moving = c.change + words;
+  for (int k = 0; k < count; k++) {
+    V *from = data[k] + here, *to = AROUND ? c.late + k * words : data[k] + there;
+    for (int w = 0; w < words; w++) {
+      moving[w] = splat(0);
+      if (!any(m[w])) continue;
+      moving[w] = from[w] & m[w];
+      if (LEAVES == NOTHING) from[w] &= ~m[w];
+      if (LEAVES == EVERYTHING) from[w] |= m[w];
+    }
+    for (int w = 0; w < words; w++) {
+      if (!AROUND && !any(targets[w])) continue;
+      const V arriving = dx ? columns(c, moving, w, -dx) : moving[w];
+      to[w] = AROUND ? arriving : (to[w] & ~targets[w]) | arriving;
+    }
+  }
+}
+template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
+  if (movers->zero || (!dy && !c.turn(dx))) return;
+  V* data[MOVING + 1];
+  int n = 0;
+  for (int k = 0; k < count; k++) {
+    Plane*& p = *planes[k];
+    if (p->zero && LEAVES != EVERYTHING) continue;
+    own(c, p);
+    p->zero = false;
+    data[n++] = p->data;
+  }
+  if (near_rows(c, dy)) {
+    const int back = c.turn(-dx);
+    if (!back) arrive_near_rows<LEAVES, false, true>(c, data, n, movers->data, dy, back);
+    else if (dy) arrive_near_rows<LEAVES, true, true>(c, data, n, movers->data, dy, back);
+    else arrive_near_rows<LEAVES, true, false>(c, data, n, movers->data, dy, back);
+    return;
+  }
+  const int words = c.g.words, height = c.g.height;
+  V* targets = c.change;
+  for (int i = 0, y = dy > 0 ? height - 1 : 0; i < height; i++, y += dy > 0 ? -1 : 1) {
+    const V* m = movers->data + y * words;
+    if (!any_word(m, words)) continue;
+    for (int w = 0; w < words; w++) targets[w] = dx ? columns(c, m, w, -dx) : m[w];
+    if (y + dy < 0 || y + dy >= height) arrive_row<LEAVES, true>(c, data, n, y * words, 0, m, targets, dx);
+    else arrive_row<LEAVES, false>(c, data, n, y * words, (y + dy) * words, m, targets, dx);
+  }
+  const int edge = dy > 0 ? height - 1 : 0;
+  const V* m = movers->data + edge * words;
+  if (!dy || !any_word(m, words)) return;
+  const int lanes_back = c.g.strips ? -dy : 0;
+  for (int w = 0; w < words; w++) targets[w] = turned(dx ? columns(c, m, w, -dx) : m[w], lanes_back);
+  for (int k = 0; k < n; k++) {
+    V* there = data[k] + (dy > 0 ? 0 : height - 1) * words;
+    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c.late[k * words + w], lanes_back);
+  }
+}
+OUTLINE Plane* cleared(Context& c, Plane* old, const Plane* where) {  // old and not where
+  if (old->zero || where->zero) return keep(old);
+  Plane* r = take(c);
+  V some = splat(0);
+  for (int i = 0, n = c.g.cells(); i < n; i++) some |= r->data[i] = old->data[i] & ~where->data[i];
+  r->zero = !any(some);
+  return r;
+}
+OUTLINE Plane* joined(Context& c, Plane* old, Plane* where) {  // old or where
+  if (where->zero) return keep(old);
+  if (old->zero) return keep(where);
+  Plane* r = take(c);
+  for (int i = 0, n = c.g.cells(); i < n; i++) r->data[i] = old->data[i] | where->data[i];
+  r->zero = false;
+  return r;
+}
