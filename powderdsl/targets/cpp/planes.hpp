@@ -86,12 +86,15 @@ static u32 key(u64 seed, u64 index, u64 step, u32 stream, u32 start) {
   return k;
 }
 
-// Draws: bit j of 32 columns is one hash; two make a word.
-ALWAYS V draw_plane(const Context& c, int stream, int y, int w, int j) {
-  u32 across = (c.g.width + 31) / 32;
-  u32 n = ((u32)y * across + 2 * w) * 32 + j;
+// Draws: bit j of 32 columns is one hash; two make a word. A plane's hashes start a constant after those of the plane before.
+constexpr u32 APART = 0x9E3779B1u;
+ALWAYS U draw_start(const Context& c, int stream, int y, int w) {
+  const u32 across = (c.g.width + 31) / 32, n = ((u32)y * across + 2 * w) * 32;
   const I number = NUMBERS;
-  U h = (splatu(n) + (U)(number & 1) * 32) * 0x9E3779B1u + c.k0[stream];
+  return splatu(n * APART) + (U)(number & 1) * (32 * APART) + c.k0[stream];
+}
+ALWAYS V draw_plane(const Context& c, int stream, U start, int j) {
+  U h = start + splatu((u32)j * APART);
   h ^= h >> 16;
   h *= 0x7FEB352Du;
   h ^= h >> 15;
@@ -103,9 +106,9 @@ ALWAYS V draw_plane(const Context& c, int stream, int y, int w, int j) {
 constexpr int AHEAD = 4;
 #define EACH_AHEAD _Pragma("GCC unroll 4") for (int i = 0; i < AHEAD; i++)
 struct Drawn { V plane[AHEAD]; };
-ALWAYS Drawn draw_planes(const Context& c, int stream, int y, int w, int first) {
+ALWAYS Drawn draw_planes(const Context& c, int stream, U start, int first) {
   Drawn d;
-  EACH_AHEAD d.plane[i] = draw_plane(c, stream, y, w, first + i);
+  EACH_AHEAD d.plane[i] = draw_plane(c, stream, start, first + i);
   return d;
 }
 // Of the cells still open, those whose draw has a 0 where the limit has a 1 are below it; equal bits leave a cell open.
@@ -116,25 +119,27 @@ ALWAYS void compare_bit(V& below, V& open, V drawn, V limit) {
 ALWAYS V limit_bit(u64 limit, int bits, int j) { return splat(0 - (limit >> (bits - 1 - j) & 1)); }
 // Which of the wanted cells draw below a constant; stops when all are decided.
 OUTLINE V draw_below(const Context& c, int stream, int y, int w, V wanted, int bits, u64 limit) {
+  const U start = draw_start(c, stream, y, w);
   V below = splat(0), open = wanted;
   int j = 0;
   const int last = bits - __builtin_ctzll(limit);
   for (; j + AHEAD <= last && any(open); j += AHEAD) {
-    const Drawn d = draw_planes(c, stream, y, w, j);
+    const Drawn d = draw_planes(c, stream, start, j);
     EACH_AHEAD compare_bit(below, open, d.plane[i], limit_bit(limit, bits, j + i));
   }
-  for (; j < last && any(open); j++) compare_bit(below, open, draw_plane(c, stream, y, w, j), limit_bit(limit, bits, j));
+  for (; j < last && any(open); j++) compare_bit(below, open, draw_plane(c, stream, start, j), limit_bit(limit, bits, j));
   return below;
 }
 // The same with a limit given plane by plane, most significant (the carry) first.
 OUTLINE V draw_below_planes(const Context& c, int stream, int y, int w, V wanted, int bits, const V* limit) {
+  const U start = draw_start(c, stream, y, w);
   V below = wanted & limit[0], open = wanted & ~limit[0];
   int j = 0;
   for (; j + AHEAD <= bits && any(open); j += AHEAD) {
-    const Drawn d = draw_planes(c, stream, y, w, j);
+    const Drawn d = draw_planes(c, stream, start, j);
     EACH_AHEAD compare_bit(below, open, d.plane[i], limit[1 + j + i]);
   }
-  for (; j < bits && any(open); j++) compare_bit(below, open, draw_plane(c, stream, y, w, j), limit[1 + j]);
+  for (; j < bits && any(open); j++) compare_bit(below, open, draw_plane(c, stream, start, j), limit[1 + j]);
   return below;
 }
 // A row of the highest bit of a draw. Many masks ask for it, in several passes: it is made once a step.
@@ -142,15 +147,16 @@ ALWAYS const V* coin_row(Context& c, int coin, int stream, int y) {
   V* row = c.coins[coin] + y * c.g.words;
   if (!c.tossed[coin][y]) {
     c.tossed[coin][y] = 1;
-    for (int w = 0; w < c.g.words; w++) row[w] = draw_plane(c, stream, y, w, 0);
+    for (int w = 0; w < c.g.words; w++) row[w] = draw_plane(c, stream, draw_start(c, stream, y, w), 0);
   }
   return row;
 }
 // A draw of one world's cell as float32.
 OUTLINE float draw_cell(const Context& c, int stream, int lane, int y, int x, int bits) {
   double value = 0;
+  const U start = draw_start(c, stream, y, x / 64);
   for (int j = 0; j < bits; j++) {
-    V p = draw_plane(c, stream, y, x / 64, j);
+    V p = draw_plane(c, stream, start, j);
     value = 2 * value + (double)(p[lane] >> (x % 64) & 1);
   }
   double scale = 1;
