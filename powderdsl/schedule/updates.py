@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node
@@ -40,13 +40,14 @@ def updates(schedule: Schedule) -> Schedule:
     return replace(schedule, body=map_blocks(schedule.body, change))
 
 
-def _taken_out(guard: Guard, graph: Graph) -> list[Statement]:
+def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Statement]:
+    """The loops that leave a guard, and what remains of it. `near`: also loops that read other planes at neighbors."""
     if not all(node.op == "load" for node in guard.when) or guard.otherwise:
         return [guard]
     masks = {str(node.attr) for node in guard.when}
     inside, olds = made_in(guard.body), {var.name: value for var, value in guard.keeps}
     body: list[Statement] = []
-    found: list[Out] = []
+    found: tuple[list[Out], list[Out]] = [], []  # those that read neighbors come first, before these change
     for statement in guard.body:
         if not isinstance(statement, Compute) or statement.over != "words" or statement.when is not None:
             body.append(statement)
@@ -54,36 +55,50 @@ def _taken_out(guard: Guard, graph: Graph) -> list[Statement]:
         rest = []
         for out in statement.outs:
             old = olds.get(out.var.name)
+            elsewhere = read_elsewhere([out.value])
             if (
                 old is None
+                or (elsewhere and not near)
                 or inside & set(loaded([out.value]))
                 or not _is_update(out.value, masks, old, graph)
             ):
                 rest.append(out)
             else:
-                found.append(replace(out, otherwise=old))
+                found[not elsewhere].append(replace(out, otherwise=old))
         if rest:
             body.append(replace(statement, outs=tuple(rest)))
-    if not found:
-        return [guard]
+    elsewhere = read_elsewhere(out.value for out in found[0])
+    if any(out.otherwise is not None and out.otherwise.attr in elsewhere for out in found[0]):
+        return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
     region = combined("or", guard.when, graph)
-    loop = Compute(tuple(found), guard.place, "words", region)
-    names = {out.var.name for out in found}
+    loops = [Compute(tuple(outs), guard.place, "words", region) for outs in found if outs]
+    names = {out.var.name for outs in found for out in outs}
     keeps = tuple((var, value) for var, value in guard.keeps if var.name not in names)
-    if not body:
-        return [loop]
+    if not body or not loops:
+        return [*loops] or [guard]
     left = replace(guard, body=tuple(body), keeps=keeps)
     first = any(names & reads(statement) for statement in body)
-    return [loop, left] if first else [left, loop]
+    return [*loops, left] if first else [left, *loops]
 
 
 def _is_update(value: Node, masks: set[str], old: Node, graph: Graph) -> bool:
-    """Whether a flag is read and computed in the word itself, and is the old one where no mask holds."""
+    """Whether a flag is computed from stored planes, and is the old one where no mask holds."""
     if value.type != FLAG or old.op != "load" or old.attr in masks:
         return False
-    if any(node.op not in IN_A_WORD for node in ordered([value])):
+    if any(node.op not in IN_A_WORD and not _is_neighbor(node) for node in ordered([value])):
         return False
     return without(value, masks, graph) is old
+
+
+def _is_neighbor(node: Node) -> bool:
+    return node.op == "shift" and node.args[0].op == "load" and node.attr[2]
+
+
+def read_elsewhere(values: Iterable[Node]) -> set[str]:
+    """The planes that values read at neighbors."""
+    return {
+        str(name) for node in ordered(values) if node.op == "shift" for name in loaded(node.args)
+    }
 
 
 def is_cleared(out: Out, graph: Graph) -> bool:

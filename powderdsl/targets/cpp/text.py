@@ -162,19 +162,21 @@ class _Printer:
             yield f"{'' if name in declared else 'Plane* '}{name} = {old if out.into else f'keep({old})'};"
         masks = [str(node.attr) for node in asked(loop)]
         yield f"if ({' || '.join(f'!{mask}->zero' for mask in masks)}) {{"
+        before, stores, after = [], [], []
         for out in loop.outs:
-            name = out.var.name
-            change = f"own(c, {name}); {name}->zero = false;"
-            yield f"if (!{name}->zero) {{ {change} }}" if is_cleared(out, self.graph) else change
+            assert out.otherwise is not None
+            name, value = out.var.name, values.clean(out.value)
+            words = values.plane(str(out.otherwise.attr))
+            if is_cleared(out, self.graph):
+                before.append(f"if (!{name}->zero) own(c, {name});")
+                stores.append(f"{words}[i] = {value};")
+            else:  # one that was empty may stay so
+                before.append(f"V a{name} = splat(0); const bool e{name} = {name}->zero; own(c, {name});")
+                stores.append(f"{{ const V o = {value}; {words}[i] = o; a{name} |= o; }}")
+                after.append(f"{name}->zero = e{name} && !any(a{name});")
         some = " | ".join(f"{values.plane(mask)}[i]" for mask in masks)
-        stores = [
-            f"{values.plane(str(out.otherwise.attr))}[i] = {values.clean(out.value)};"
-            for out in loop.outs
-            if out.otherwise
-        ]
-        yield "\n".join(
-            [values.pointers(), LOOP, f"if (!any({some})) continue;", *values.lines, *stores, "} }"]
-        )
+        yield "\n".join([*before, values.ready(), values.pointers(), LOOP, f"if (!any({some})) continue;"])
+        yield "\n".join([*values.lines, *stores, "}", *after, "}"])
 
     def words(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
         names = [out.var.name for out in loop.outs]
