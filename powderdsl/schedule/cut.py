@@ -133,12 +133,12 @@ class Cutter:
             match statement:
                 case Compute(outs, place):
                     guard = body[i + 1] if i + 1 < len(body) else None
+                    if top and (isinstance(guard, Guard) or all(out.var.type == FLAG for out in outs)):
+                        self.hoist_comparisons([out.value for out in outs], place)
                     if isinstance(guard, Guard):
-                        if top:
-                            self.hoist_comparisons([out.value for out in outs], place)
                         self.guarded(statement, guard)
                     else:
-                        self.compute(outs, place, kept)
+                        self.compute(outs, place, kept, statement.when)
                 case Guard() if not (i and isinstance(body[i - 1], Compute)):
                     self.ask([], statement)
                 case Guard():
@@ -152,10 +152,16 @@ class Cutter:
             self.known, self.there = scope
         return found
 
-    def compute(self, outs: Iterable[Out], place: str, kept: frozenset[str] = frozenset()) -> None:
-        """Store values under the names of their variables."""
+    def compute(
+        self,
+        outs: Iterable[Out],
+        place: str,
+        kept: frozenset[str] = frozenset(),
+        when: Node | None = None,
+    ) -> None:
+        """Store values under the names of their variables. `when`: see `Compute`."""
         named = {id(out.value): out.var for out in reversed(list(outs)) if not self.have(out.value)}
-        self.ensure([out.value for out in outs], place, named)
+        self.ensure([out.value for out in outs], place, named, when)
         for out in outs:
             if named.get(id(out.value)) is out.var:
                 continue

@@ -18,6 +18,9 @@ from powderdsl.schedule.types import (
     ordered,
 )
 
+MAX_CONDITIONS = 4
+"""More sets of planes than this are not worth testing."""
+
 
 def empty(schedule: Schedule) -> Schedule:
     """Loops over words get a condition without which all their values are 0; operations on whole planes stand alone.
@@ -58,25 +61,23 @@ def is_whole(value: Node) -> bool:
 def _asked(loop: Compute, graph: Graph) -> Compute:
     memo: dict[int, frozenset[str] | None] = {}
     loads = {str(node.attr): node for node in ordered(out.value for out in loop.outs) if node.op == "load"}
-    ways: dict[int, Node] = {}
+    ways: list[list[frozenset[str]]] = []
     for out in loop.outs:
-        conditions = [_any(names, loads, graph) for names in _conditions(out.value, memo)]
+        conditions = _conditions(out.value, memo)
         if not conditions:
             return loop
-        way = combined("and", conditions, graph)
-        ways[id(way)] = way
-    asked = combined("or", ways.values(), graph)
+        if not any(set(way) <= set(conditions) for way in ways):
+            ways = [*(way for way in ways if not set(conditions) < set(way)), conditions]
+    found = [combined("and", [_any(names, loads, graph) for names in way], graph) for way in ways]
+    asked = combined("or", found, graph)
     return replace(loop, when=asked if loop.when is None else combined("and", [loop.when, asked], graph))
 
 
 def _conditions(value: Node, memo: dict[int, frozenset[str] | None]) -> list[frozenset[str]]:
     """Sets of planes; of each set one plane must be non-empty for the value to hold anywhere."""
-    if value.op == "when":
-        candidates, rest = value.args
-        parts = [candidates, *conjuncts(rest)]
-    else:
-        parts = [value]
-    return list(dict.fromkeys(found for part in parts if (found := holders(part, memo)) is not None))
+    parts = [value.args[0], *conjuncts(value.args[1])] if value.op == "when" else conjuncts(value)
+    found = dict.fromkeys(found for part in parts if (found := holders(part, memo)) is not None)
+    return sorted(found, key=len)[:MAX_CONDITIONS]
 
 
 def _any(names: Iterable[str], loads: dict[str, Node], graph: Graph) -> Node:

@@ -13,6 +13,7 @@ from powderdsl.schedule.costs import Costs
 from powderdsl.schedule.cut import cut
 from powderdsl.schedule.cut_rows import cut_rows
 from powderdsl.schedule.draws import cheap_questions, conditions, thresholds
+from powderdsl.schedule.early import early
 from powderdsl.schedule.empty import empty
 from powderdsl.schedule.exact import exact
 from powderdsl.schedule.flatten import flatten
@@ -95,6 +96,11 @@ CPP = (
         "presence",
         presence,
         "which elements must be present for work to be done; before `cut`, which takes masks apart",
+    ),
+    Stage(
+        "early",
+        early,
+        "which parts of masks are computed once for several; after `presence`, which reads whole masks",
     ),
     Stage(
         "cut",

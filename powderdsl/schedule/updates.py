@@ -96,9 +96,7 @@ def _is_neighbor(node: Node) -> bool:
 
 def read_elsewhere(values: Iterable[Node]) -> set[str]:
     """The planes that values read at neighbors."""
-    return {
-        str(name) for node in ordered(values) if node.op == "shift" for name in loaded(node.args)
-    }
+    return {str(name) for node in ordered(values) if node.op == "shift" for name in loaded(node.args)}
 
 
 def is_cleared(out: Out, graph: Graph) -> bool:
