@@ -70,12 +70,14 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
     elsewhere = read_elsewhere(out.value for out in found[0])
     if any(out.otherwise is not None and out.otherwise.attr in elsewhere for out in found[0]):
         return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
+    if not found[0] and not found[1]:
+        return [guard]
     region = combined("or", guard.when, graph)
     loops = [Compute(tuple(outs), guard.place, "words", region) for outs in found if outs]
     names = {out.var.name for outs in found for out in outs}
     keeps = tuple((var, value) for var, value in guard.keeps if var.name not in names)
-    if not body or not loops:
-        return [*loops] or [guard]
+    if not body:
+        return [*loops]
     left = replace(guard, body=tuple(body), keeps=keeps)
     first = any(names & reads(statement) for statement in body)
     return [*loops, left] if first else [left, *loops]
