@@ -60,8 +60,8 @@ static Context* new_context(const Grid& g) {
   c->nothing_row = aligned<V>(g.words);
   c->change = aligned<V>(2 * g.words);
   c->late = aligned<V>((MOVING + 1) * g.words);
-  c->entered = aligned<V>(g.height);
-  c->moving.resize(g.height + 1);
+  c->entered = aligned<V>(g.height + 1);
+  c->moving = aligned<int>(g.height + 1);
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
   c->turned = aligned<u64>((size_t)LANES * g.height * g.words * TURNED);
   c->waiting = aligned<float>((size_t)WAITING * g.stride + HALO + CHUNK);
@@ -85,6 +85,7 @@ static void free_context(Context* c) {
   free(c->change);
   free(c->late);
   free(c->entered);
+  free(c->moving);
   free(c->zeros);
   free(c->turned);
   free(c->waiting);

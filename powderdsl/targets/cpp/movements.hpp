@@ -79,25 +79,24 @@ template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {
   if (WORDS) return rotated(x, by);
   return ((x >> by) | (x << (c.g.width - by))) & c.valid(0);
 }
-// The rows that movers leave or enter, in the direction in which they move; the one whose movers go around is the last.
-ALWAYS int rows_of(Context& c, const V* m, int dy) {
+// The rows that movers leave or enter, in the direction in which they move, and if they are asked for the cells that they
+// enter there. The row whose movers go around is the last.
+template <bool ENTERED, bool TURNS> ALWAYS int rows_of(const Context& c, const V* m, int dy, int back) {
   const int height = c.g.height;
-  int* rows = c.moving.data();
-  if (!dy) {
-    for (int y = 0; y < height; y++) *rows = y, rows += any(m[y]);
-    return rows - c.moving.data();
-  }
+  int *rows = c.moving, count = 0;
   V before = m[dy > 0 ? height - 1 : 0];  // what moves into row y
-  for (int i = 0, y = dy > 0 ? 0 : height - 1; i < height; i++, y += dy) {
-    const V here = m[y];
-    *rows = y, rows += any(before | here);
+  for (int i = 0, y = dy < 0 ? height - 1 : 0; i < height; i++, y += dy < 0 ? -1 : 1) {
+    const V here = m[y], from = dy ? before : here;
+    rows[count] = y;
+    if (ENTERED) c.entered[count] = around<TURNS>(c, from, back);
+    count += any(from | here);
     before = here;
   }
-  return rows - c.moving.data();
+  return count;
 }
 // ROWS: whether they move to another row.
 template <int N, bool TURNS, bool ROWS> OUTLINE void swap_near(const Context& c, V* const* planes, const V* m, int count, int dy, int by) {
-  const int back = c.g.width - by, edge = dy > 0 ? c.g.height - 1 : 0, first = c.g.height - 1 - edge, *rows = c.moving.data();
+  const int back = c.g.width - by, edge = dy > 0 ? c.g.height - 1 : 0, first = c.g.height - 1 - edge, *rows = c.moving;
   V *data[N], comes[N], last[N];
   EACH_PLANE data[k] = planes[k];
   if (ROWS)
@@ -106,45 +105,47 @@ template <int N, bool TURNS, bool ROWS> OUTLINE void swap_near(const Context& c,
       comes[k] = around<TURNS>(c, last[k], back);
     }
   const bool wraps = ROWS && count && rows[count - 1] == edge;
+  V ahead[N];  // the row after the one that is written
+  int loaded = -1;
   for (int i = 0; i < count - wraps; i++) {
     const int y = rows[i];
     const V gone = m[y];
+    if (!ROWS || y != loaded) EACH_PLANE ahead[k] = data[k][y];
     EACH_PLANE {
-      const V a = data[k][y], d = (a ^ around<TURNS>(c, ROWS ? data[k][y + dy] : a, by)) & gone, goes = around<TURNS>(c, d, back);
+      const V a = ahead[k];
+      if (ROWS) ahead[k] = data[k][y + dy];
+      const V d = (a ^ around<TURNS>(c, ahead[k], by)) & gone, goes = around<TURNS>(c, d, back);
       data[k][y] = a ^ d ^ (ROWS ? comes[k] : goes);
       comes[k] = goes;
     }
+    loaded = y + dy;
   }
   if (wraps) EACH_PLANE data[k][edge] ^= last[k] ^ comes[k];
 }
 template <bool TURNS, bool ROWS> ALWAYS void swap_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int by) {
-  const int rows = rows_of(c, m, dy);
+  const int rows = rows_of<false, TURNS>(c, m, dy, by);
   int k = 0;
   for (; k + TOGETHER <= count; k += TOGETHER) swap_near<TOGETHER, TURNS, ROWS>(c, data + k, m, rows, dy, by);
   for (; k < count; k++) swap_near<1, TURNS, ROWS>(c, data + k, m, rows, dy, by);
 }
 template <int N, Leaves LEAVES, bool TURNS, bool ROWS> OUTLINE void arrive_near(const Context& c, V* const* planes, const V* m, int count, int edge, int back) {
-  const int* rows = c.moving.data();
-  const V* enters = c.entered;
+  const int* rows = c.moving;
+  const V* entered = c.entered;
   V *data[N], comes[N];
   EACH_PLANE data[k] = planes[k];
   if (ROWS) EACH_PLANE comes[k] = data[k][edge] & m[edge];
   for (int i = 0; i < count; i++) {
     const int y = rows[i];
-    const V gone = m[y], entered = enters[i];
+    const V gone = m[y], keeps = LEAVES == NOTHING ? ~(gone | entered[i]) : ~entered[i], sets = gone & keeps;
     EACH_PLANE {
-      const V a = data[k][y], goes = a & gone, left = LEAVES == NOTHING ? a & ~gone : LEAVES == EVERYTHING ? a | gone : a;
-      data[k][y] = mux(entered, around<TURNS>(c, ROWS ? comes[k] : goes, back), left);
+      const V a = data[k][y], goes = a & gone, in = around<TURNS>(c, ROWS ? comes[k] : goes, back);
+      data[k][y] = LEAVES == EVERYTHING ? (a & keeps) | in | sets : (a & keeps) | in;
       comes[k] = goes;
     }
   }
 }
 template <Leaves LEAVES, bool TURNS, bool ROWS> ALWAYS void arrive_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int back) {
-  const int rows = rows_of(c, m, dy), edge = dy > 0 ? c.g.height - 1 : 0;
-  for (int i = 0; i < rows; i++) {
-    const int y = c.moving[i], from = !ROWS ? y : y == c.g.height - 1 - edge ? edge : y - dy;
-    c.entered[i] = around<TURNS>(c, m[from], back);
-  }
+  const int rows = rows_of<true, TURNS>(c, m, dy, back), edge = dy > 0 ? c.g.height - 1 : 0;
   int k = 0;
   for (; k + TOGETHER <= count; k += TOGETHER) arrive_near<TOGETHER, LEAVES, TURNS, ROWS>(c, data + k, m, rows, edge, back);
   for (; k < count; k++) arrive_near<1, LEAVES, TURNS, ROWS>(c, data + k, m, rows, edge, back);

@@ -44,8 +44,8 @@ struct Context {
   Field* calm;  // no row of it is live
   V* nothing_row;
   V *change, *late;  // two rows of words; a row for each plane that moves
-  V* entered;               // [height]: the cells that movers enter
-  std::vector<int> moving;  // the rows that a movement changes
+  V* entered;   // [height + 1]: the cells that movers enter, in the rows that a movement changes
+  int* moving;  // [height + 1]: these rows
   u64* turned;                        // masks of choices, lane by lane, see turn_masks
   static constexpr int masks = TURNED;  // of a word, a multiple of LANES
   float* waiting;  // rows of reals that loops some rows behind read
