@@ -143,6 +143,12 @@ class _RowCutter(Cutter):
     ) -> None:
         """Candidates first; the rest, and what it needs, only if there are any."""
         graph, place = self.graph, masks.place
+        whole = [replace(out, value=self.lazily(*split[id(out)])) for out in outs]
+        if not any(self.needs(out.value) for out in whole):
+            words = tuple(replace(out, value=self.word(out.value)) for out in whole)
+            self.emit(Compute(words, place, "words", when=masks.when))
+            self.known |= {id(out.value): out.var for out in outs}
+            return
         candidates = []
         for out in outs:
             cheap, rest = split[id(out)]
