@@ -250,10 +250,14 @@ class Cutter:
         cheap: list[Node] = []
         rest: list[Node] = []
         for part in conjuncts(mask):
-            draws = any(node.op in DRAWS for node in walk(part)) and not self.have(part)
+            draws = any(self.is_costly(node) for node in walk(part)) and not self.have(part)
             more = (of_floats(part) and not self.have(part)) or self.needs(part)
             (rest if draws or more else cheap).append(part)
         return cheap, rest
+
+    def is_costly(self, node: Node) -> bool:
+        """Whether a draw is made only where a mask's other parts hold."""
+        return node.op in DRAWS
 
     def lazily(self, cheap: list[Node], rest: list[Node]) -> Node:
         """The conjunction; the rest is computed only in words where the cheap parts hold somewhere."""

@@ -13,7 +13,7 @@ from dataclasses import replace
 from powderdsl.ir.ops import FLAG, REAL, Node, walk
 from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant
 from powderdsl.schedule.cut import Cutter, Pairs
-from powderdsl.schedule.draws import DRAWS
+from powderdsl.schedule.draws import DRAWS, is_coin
 from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.moves import is_movement
 from powderdsl.schedule.types import (
@@ -133,6 +133,9 @@ class _RowCutter(Cutter):
             named = {id(out.value): out.var for out in reversed(outs)}
             self.ensure([out.value for out in outs], place, named, masks.when)
         self.then(guard)
+
+    def is_costly(self, node: Node) -> bool:
+        return node.op in DRAWS and not is_coin(node)  # coins are tossed once a step for all masks
 
     def in_two(
         self,

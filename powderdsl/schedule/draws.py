@@ -141,6 +141,11 @@ def asked_for(draw: Node, where: Node, graph: Graph) -> Node:
     return graph.node(draw.op, FLAG, (*draw.args[:count], where), draw.attr, draw.places)
 
 
+def is_coin(node: Node) -> bool:
+    """Whether a node is a draw that its highest bit decides."""
+    return node.op == "chance" and node.attr[2] == 1 << node.attr[1] - 1
+
+
 def takes_bits(node: Node) -> bool:
     """Whether a node is a draw of more than FEW_BITS random bits."""
     if node.op == "chance":

@@ -65,7 +65,7 @@ static Context* new_context(const Grid& g) {
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
   c->turned = aligned<u64>((size_t)LANES * g.height * g.words * TURNED);
   c->waiting = aligned<float>((size_t)WAITING * g.stride + HALO + CHUNK);
-  for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells()), c->tossed[i].resize(g.height);
+  for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells());
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
     for (int y = 0; y < g.height; y++)
@@ -152,7 +152,7 @@ static void begin_step(Context& c, const Clocks& k, int number, long done) {
       c.k0[s][2 * l] = c.k0[s][2 * l + 1] = a + l * strip * 0x9E3779B1u;  // as draw_plane multiplies
       c.k1[s][2 * l] = c.k1[s][2 * l + 1] = b;
     }
-  for (int i = 0; i < COINS; i++) std::fill(c.tossed[i].begin(), c.tossed[i].end(), 0);
+  std::fill_n(c.tossed, COINS, false);
   for (int i = 0; i < STEP_PLANES; i++)
     for (int l = 0; l < LANES; l++) {
       u64 step = k.step[world_of(c, number, l)] + done;

@@ -142,14 +142,14 @@ OUTLINE V draw_below_planes(const Context& c, int stream, int y, int w, V wanted
   for (; j < bits && any(open); j++) compare_bit(below, open, draw_plane(c, stream, start, j), limit[1 + j]);
   return below;
 }
-// A row of the highest bit of a draw. Many masks ask for it, in several passes: it is made once a step.
-ALWAYS const V* coin_row(Context& c, int coin, int stream, int y) {
-  V* row = c.coins[coin] + y * c.g.words;
-  if (!c.tossed[coin][y]) {
-    c.tossed[coin][y] = 1;
-    for (int w = 0; w < c.g.words; w++) row[w] = draw_plane(c, stream, draw_start(c, stream, y, w), 0);
-  }
-  return row;
+// The highest bit of a draw. Many masks ask for it, in several passes: it is made once a step.
+static V* coin_plane(Context& c, int coin, int stream) {
+  V* plane = c.coins[coin];
+  if (!c.tossed[coin])
+    for (int y = 0; y < c.g.height; y++)
+      for (int w = 0; w < c.g.words; w++) plane[y * c.g.words + w] = draw_plane(c, stream, draw_start(c, stream, y, w), 0);
+  c.tossed[coin] = true;
+  return plane;
 }
 // A draw of one world's cell as float32.
 OUTLINE float draw_cell(const Context& c, int stream, int lane, int y, int x, int bits) {

@@ -51,8 +51,8 @@ struct Context {
   float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];
-  V* coins[COINS + 1];  // planes, filled row by row when they are asked for
-  std::vector<uint8_t> tossed[COINS + 1];  // the rows that this step has filled
+  V* coins[COINS + 1];      // planes
+  bool tossed[COINS + 1];  // whether this step has filled them
   V step_bits[STEP_PLANES + 1];
   V param_bits[PARAM_PLANES + 1];
   float param_real[PARAM_REALS + 1][LANES];

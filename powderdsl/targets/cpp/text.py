@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node
+from powderdsl.schedule.draws import is_coin
 from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import Compute, Forget, Guard, Move, Release, Schedule, Statement, Sweeps, Var
 from powderdsl.schedule.updates import asked, is_cleared
@@ -354,9 +355,10 @@ class _Words(WordValues):
             case "chance":
                 stream, bits, limit = attr
                 wanted = self.clean(node.args[0]) if args else "valid"
-                if limit == 1 << bits - 1:
+                if is_coin(node):
                     coin = number(self.layout.coins, self.layout.streams[stream])
-                    return f"{wanted} & ~coin_row(c, {coin}, {self.layout.streams[stream]}, y)[w]"
+                    plane = self.pointer(f"coin_plane(c, {coin}, {self.layout.streams[stream]})")
+                    return f"{wanted} & ~{plane}[i]"
                 return f"draw_below(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, {limit}ull)"
             case "below_planes":
                 bits = attr[1]
