@@ -26,6 +26,7 @@ from powderdsl.schedule.types import (
     ordered,
     values_of,
 )
+from powderdsl.schedule.updates import read_elsewhere
 
 _KINDS = ("flag", "real", ANSWER.name, BLOCK.name, CELLS.name, PLACES.name)
 
@@ -75,8 +76,12 @@ class _Checker:
                     continue
                 case Compute(outs):
                     _demand(_is_region(statement.region), "a region is made of stored flags and live fields")
+                    elsewhere = read_elsewhere(values_of(statement)) if statement.over == "words" else set()
                     for out in outs:
                         _demand(out.var.type == out.value.type, f"{out.var.name} gets a {out.value.type}")
+                        _demand(
+                            out.into not in elsewhere, f"{out.into} is overwritten, but read at neighbors"
+                        )
                         if out.into is not None:
                             _demand(out.into in live, f"{out.into} is overwritten, but not there")
                             live.discard(out.into)

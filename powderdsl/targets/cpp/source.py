@@ -15,7 +15,7 @@ from powderdsl.system.memory import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
-GENERATOR_VERSION = 8
+GENERATOR_VERSION = 9
 """Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
