@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+from powderdsl.ir.ops import REAL
 from powderdsl.schedule.join import field_reads, keeps
 from powderdsl.schedule.types import (
     ANSWER,
@@ -57,6 +58,9 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
             loop = _overwriting(statement.loops[0], after)
             statement = replace(statement, loops=(loop,))
             gone -= {out.into for out in loop.outs if out.into is not None}
+        elif isinstance(statement, Sweeps):
+            statement = _overtaken(statement, after)
+            gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
         elif isinstance(statement, Compute) and statement.region is not None:
             statement = _updated(statement, after)
             gone -= {out.into for out in statement.outs if out.into is not None}
@@ -82,6 +86,35 @@ def _overwriting(loop: Compute, after: set[str]) -> Compute:
     """A loop that changes some rows of fields, in place where nothing reads the old one elsewhere."""
     far = {read.name for read in field_reads(loop) if (read.dy or read.dx) and not read.live}
     return _updated(loop, after | far)
+
+
+def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
+    """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
+    made = {var.name for loop in sweeps.loops for var in defined_by(loop)}
+    first: dict[str, int] = {}
+    """By field: the least lag with which a row of it may be written over."""
+    readers: dict[str, int] = {}
+    for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
+        for read in field_reads(loop):
+            far = part > 0 or (read.live and read.dy != 0)
+            least = NEVER if far or read.name in after or read.name in made else lag - read.dy + 1
+            first[read.name] = max(first.get(read.name, 0), least)
+            readers[read.name] = number
+    loops = []
+    for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
+        free = [name for name in first if first[name] <= lag and readers[name] < number and part == 0]
+        outs = []
+        for out in loop.outs:
+            lasts = out.var.type == REAL and out.var.name not in sweeps.passing
+            into = free.pop(0) if lasts and free else None
+            if into is not None:
+                first[into] = NEVER
+            outs.append(replace(out, into=into))
+        loops.append(replace(loop, outs=tuple(outs)))
+    return replace(sweeps, loops=tuple(loops))
+
+
+NEVER = 1 << 30
 
 
 def _updated(loop: Compute, after: set[str]) -> Compute:

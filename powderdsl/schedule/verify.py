@@ -119,6 +119,7 @@ def _check_order(sweeps: Sweeps) -> None:
     """A row is computed before loops that run together read it, or hold masks of choices; none reads it around the edge."""
     made: dict[str, tuple[int, int]] = {}
     types: dict[str, Type] = {}
+    seen: list[tuple[str, int]] = []
     for loop, part, lag in zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True):
         for read in field_reads(loop):
             if made.get(read.name, (part - 1,))[0] == part:
@@ -132,6 +133,10 @@ def _check_order(sweeps: Sweeps) -> None:
         if loop.over == "choices":
             early = [name for name in loaded(values_of(loop)) if name in made and types[name] == FLAG]
             _demand(not early, f"choices are made by {early}, which are not there in all rows")
+        for out in loop.outs:  # a row is written over after all rows around it have been computed
+            late = any(name == out.into and lag <= least for name, least in seen)
+            _demand(not late, f"{out.into} is written over before it is read")
+        seen += [(read.name, lag - read.dy) for read in field_reads(loop)]
         made |= {out.var.name: (part, lag) for out in loop.outs}
         types |= {out.var.name: out.var.type for out in loop.outs}
 

@@ -8,6 +8,7 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.ir.verify import InvalidIR
+from powderdsl.schedule.join import field_reads
 from powderdsl.schedule.stages import CPP, plan
 from powderdsl.schedule.types import Compute, Schedule, Sweeps, flat
 from powderdsl.schedule.verify import verify
@@ -28,6 +29,10 @@ def test_box_sums_follow_choices() -> None:
     assert last.lags == (0, 1, 2)
     written = [out.var.name for loop in last.loops for out in loop.outs]
     assert last.passing == tuple(written[:4])
+    # Two rows behind, the result takes the place of what the choices read up to a row below and above.
+    read = {read.name for read in field_reads(last.loops[0])}
+    assert {out.into for out in last.loops[2].outs} == read
+    assert not any(out.into for loop in last.loops[:2] for out in loop.outs)
 
 
 def test_a_row_is_not_read_before_it_is_there() -> None:

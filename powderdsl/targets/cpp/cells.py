@@ -84,19 +84,30 @@ def _waiting(sweeps: Sweeps) -> dict[str, Rows]:
     return found
 
 
+def _ahead(sweeps: Sweeps) -> dict[str, int]:
+    """How many rows of each field that is written over are read below the last row, around the edge."""
+    found = {out.into: 0 for loop in sweeps.loops for out in loop.outs if out.into is not None}
+    for loop in sweeps.loops:
+        for read in field_reads(loop):
+            if read.name in found and read.wraps:
+                found[read.name] = max(found[read.name], read.dy)
+    return {name: count for name, count in found.items() if count}
+
+
 def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
     """The text of one loop over worlds, see EACH_WORLD in fields.hpp."""
     if keeps(sweeps.loops[0]):
         return _changed_text(sweeps.loops[0], declared, layout, reaches)
     waiting = _waiting(sweeps)
-    layout.waiting = max(layout.waiting, sum(rows.depth for rows in waiting.values()))
+    waits = sum(rows.depth for rows in waiting.values())
     before: list[str] = []
     rows: list[str] = []
     turns, after = [], []
+    ahead = _ahead(sweeps)
     turned, part = 0, -1
     last = {part: lag for lag, part in sorted(zip(sweeps.lags, sweeps.parts, strict=True))}
     for number, loop in enumerate(sweeps.loops):
-        printed = _Loop(loop, layout, turned, reaches, waiting)
+        printed = _Loop(loop, layout, turned, reaches, waiting, ahead=ahead)
         before += printed.before()
         if loop.over == "choices":
             turns.append(printed.turns())
@@ -117,6 +128,10 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
         f"const float* at{name}[{own.depth}]; std::fill_n(at{name}, {own.depth}, nothing);"
         for name, own in waiting.items()
     )
+    for name, count in ahead.items():
+        pointers += f" KEEP_FIRST({name}, {count}, {waits})"
+        waits += count
+    layout.waiting = max(layout.waiting, waits)
     # In a function of its own, fewer values compete for registers.
     start = "[&]() __attribute__((noinline)) {"
     inside = [
@@ -143,6 +158,7 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
         question for loop in sweeps.loops for name, question in _asked(loop) if name not in written
     )
     quiet = " ".join(f"{out.var.name} = keep({_quiet(out)});" for out in lasting)
+    quiet += " ".join(f" give(c, {out.into});" for out in lasting if out.into is not None)
     return f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}"
 
 
@@ -214,6 +230,7 @@ class _Loop:
         reaches: Mapping[str, int],
         waiting: Mapping[str, Rows],
         places: Mapping[str, str] = MappingProxyType({}),
+        ahead: Mapping[str, int] = MappingProxyType({}),
     ):
         self.loop, self.layout, self.first, self.reaches, self.waiting = (
             loop,
@@ -227,7 +244,7 @@ class _Loop:
         self.waits = [out.var.name for out in self.floats if out.var.name in waiting]
         self.lasts = [out.var.name for out in self.floats if out.var.name not in waiting]
         self.values = Chunks(
-            layout, loop.outs, {name: own.at for name, own in waiting.items()}, self.bare, places
+            layout, loop.outs, {name: own.at for name, own in waiting.items()}, self.bare, places, ahead
         )
         self.chains: list[list[Node]] = []
         self.masks: list[str] = []
@@ -242,8 +259,10 @@ class _Loop:
         return frozenset(name for name, own in self.waiting.items() if own.bare is not None)
 
     def before(self) -> Iterator[str]:
-        for name in self.lasts:
-            yield f"{name} = take_field(c); bool some{name} = false; no_rows(c, {name});"
+        for out in self.floats:
+            if (name := out.var.name) in self.lasts:
+                field = f"overtaken(c, {out.into})" if out.into else "take_field(c)"
+                yield f"{name} = {field}; bool some{name} = false; no_rows(c, {name});"
         for out in self.flags:
             yield f"{out.var.name} = take(c); no_words(c, {out.var.name});"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 
 import numpy as np
 
@@ -24,11 +24,12 @@ class Chunks(CellValues):
         waiting: Mapping[str, Callable[[str, int], str]],
         bare: frozenset[str],
         places: Mapping[str, str],
+        ahead: Container[str],
     ):
         """`waiting`: where the rows of passing fields are; `bare`: those with zeros beyond the edges; `places`: the fields
-        that hold the values of old ones."""
+        that hold the values of old ones; `ahead`: fields whose first rows are kept, since they are written over."""
         super().__init__()
-        self.places = places
+        self.places, self.ahead = places, ahead
         self.layout, self.waiting, self.bare = layout, waiting, bare
         self.rows: dict[str, str] = {}
         self.words: dict[str, str] = {}
@@ -48,6 +49,8 @@ class Chunks(CellValues):
         field = self.places.get(field, field)
         if field in self.waiting:
             call = self.waiting[field](field, dy)
+        elif wraps and dy > 0 and field in self.ahead:
+            call = f"(y + {dy} < rows ? real_line(c, v{field}, base + y + {dy}, nothing) : first{field}[y + {dy} - rows])"
         elif wraps or not dy:
             call = f"real_line(c, v{field}, base + {f'lines[y + {dy}]' if dy else 'y'}, nothing)"
         else:

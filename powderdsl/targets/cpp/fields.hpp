@@ -137,3 +137,18 @@ static void own(Context& c, Field*& f) {
   give(c, f);
   f = copy;
 }
+// The memory of a field that nothing else needs, or other memory.
+static Field* overtaken(Context& c, Field* f) {
+  if (f != c.calm && f->refs == 1) return f;
+  give(c, f);
+  return take_field(c);
+}
+// Copies of a field's first rows, which are read around the edge after they have been written over. They wait from row
+// `place` on.
+#define KEEP_FIRST(f, count, place) \
+  const float* first##f[count]; \
+  for (int i = 0; i < (count); i++) { \
+    float* const to = waiting_row(c, (place) + i); \
+    first##f[i] = v##f.live[base + lines[i]] ? to : nothing; \
+    if (first##f[i] == to) copy_floats(c.g, to, row_of(c, v##f, base + lines[i])); \
+  }
