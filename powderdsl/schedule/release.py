@@ -6,19 +6,24 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
-from powderdsl.ir.ops import REAL
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node
 from powderdsl.schedule.join import field_reads, keeps
+from powderdsl.schedule.rewrite import with_values
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
     Guard,
     Move,
+    Namer,
+    Out,
     Release,
     Schedule,
     Statement,
     Sweeps,
+    combined,
     defined_by,
     in_order,
+    load,
     loaded,
     values_of,
 )
@@ -30,11 +35,13 @@ def release(schedule: Schedule) -> Schedule:
     `swap by m: b = a`, where `a` is not read again → `b = a into a`; the same where a loop over words changes some words.
     """
     live = set(loaded(node for _, node in schedule.leaves))
-    body = _block(schedule.body, live)
+    body = _block(schedule.body, live, Namer(schedule), schedule.graph)
     return replace(schedule, body=body)
 
 
-def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ...]:
+def _block(
+    body: Sequence[Statement], live_end: set[str], namer: Namer, graph: Graph
+) -> tuple[Statement, ...]:
     lives: list[set[str]] = []
     live = set(live_end)
     for statement in reversed(body):
@@ -48,7 +55,7 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
             outside = reads(statement) - made_in(statement.body)
             kept = {var.name for var, _ in statement.keeps}
             # Outer variables are released after the guard, whether its body runs or not.
-            inner = _block(statement.body, after | kept | outside)
+            inner = _block(statement.body, after | kept | outside, namer, graph)
             statement = replace(statement, body=inner)
             gone = (outside | kept) - after
         elif isinstance(statement, Move):
@@ -59,7 +66,7 @@ def _block(body: Sequence[Statement], live_end: set[str]) -> tuple[Statement, ..
             statement = replace(statement, loops=(loop,))
             gone -= {out.into for out in loop.outs if out.into is not None}
         elif isinstance(statement, Sweeps):
-            statement = _overtaken(statement, after)
+            statement = _overtaken(_put_off(statement, after, namer, graph), after)
             gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
         elif isinstance(statement, Compute) and statement.region is not None:
             statement = _updated(statement, after)
@@ -88,11 +95,46 @@ def _overwriting(loop: Compute, after: set[str]) -> Compute:
     return _updated(loop, after | far)
 
 
-def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
-    """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
-    made = {var.name for loop in sweeps.loops for var in defined_by(loop)}
+def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Sweeps:
+    """Choices whose result waits for a loop that stores it over their old fields, when no row is missing any more.
+
+    `loop choices: b = m ? f(a[-1,0]) : a` → `b'` in its place, and `loop cells, 2 behind: b = b' into a`.
+    """
+    loop = sweeps.loops[0]
+    lasting = [out for out in loop.outs if out.var.name not in sweeps.passing]
+    first, readers = _last_reads(sweeps, after)
+    free = [name for name in first if first[name] < NEVER and readers[name] == 0]
+    if (
+        loop.over != "choices"
+        or loop.region is None
+        or any(sweeps.parts)
+        or not lasting
+        or len(free) < len(lasting)
+    ):
+        return sweeps
+    waiting = {out.var.name: namer.var(REAL) for out in lasting}
+
+    def rule(node: Node) -> Node | None:
+        return load(graph, waiting[str(node.attr)]) if node.op == "load" and node.attr in waiting else None
+
+    loops = [with_values(one, graph, rule) for one in sweeps.loops]
+    outs = tuple(replace(out, var=waiting.get(out.var.name, out.var)) for out in loop.outs)
+    zero = graph.node("const", REAL, (), 0.0)
+    olds = [load(graph, waiting[out.var.name]) for out in lasting]
+    region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds], graph)
+    stored = tuple(Out(out.var, old, None, zero) for out, old in zip(lasting, olds, strict=True))
+    return Sweeps(
+        (replace(loop, outs=outs), *(one for one in loops[1:] if isinstance(one, Compute)), Compute(stored, loop.place, "cells", region)),
+        (*sweeps.parts, 0),
+        (*sweeps.lags, max(first[name] for name in free)),
+        (*sweeps.passing, *(var.name for var in waiting.values())),
+    )  # fmt: skip
+
+
+def _last_reads(sweeps: Sweeps, after: set[str]) -> tuple[dict[str, int], dict[str, int]]:
+    """By field that loops read: the least lag with which a row of it may be written over, and the last loop that reads it."""
+    made = {out.var.name for loop in sweeps.loops for out in loop.outs}
     first: dict[str, int] = {}
-    """By field: the least lag with which a row of it may be written over."""
     readers: dict[str, int] = {}
     for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
         for read in field_reads(loop):
@@ -100,6 +142,12 @@ def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
             least = NEVER if far or read.name in after or read.name in made else lag - read.dy + 1
             first[read.name] = max(first.get(read.name, 0), least)
             readers[read.name] = number
+    return first, readers
+
+
+def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
+    """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
+    first, readers = _last_reads(sweeps, after)
     loops = []
     for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
         free = [name for name in first if first[name] <= lag and readers[name] < number and part == 0]

@@ -8,7 +8,7 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.ir.verify import InvalidIR
-from powderdsl.schedule.join import field_reads
+from powderdsl.schedule.join import Read, field_reads
 from powderdsl.schedule.stages import CPP, plan
 from powderdsl.schedule.types import Compute, Schedule, Sweeps, flat
 from powderdsl.schedule.verify import verify
@@ -35,12 +35,27 @@ def test_box_sums_follow_choices() -> None:
     assert not any(out.into for loop in last.loops[:2] for out in loop.outs)
 
 
+def test_no_field_is_there_twice() -> None:
+    """Also where choices read the rows around: their result waits until these rows are no longer read."""
+    *_, first, last = (one for one in flat(planned("wind").body) if isinstance(one, Sweeps))
+    assert first.loops[0].over == "choices"
+    assert first.lags[0] == 0
+    assert first.lags[-1] == 2
+    assert [out.into for out in first.loops[-1].outs] == [read.name for read in _old(first)]
+    assert {out.into for out in last.loops[-1].outs} == {out.var.name for out in first.loops[-1].outs}
+
+
+def _old(sweeps: Sweeps) -> list[Read]:
+    reads = {read.name: read for read in field_reads(sweeps.loops[0])}
+    return list(reads.values())
+
+
 def test_a_row_is_not_read_before_it_is_there() -> None:
     schedule = planned("wind")
     early = tuple(
         replace(one, lags=(0,) * len(one.loops)) if isinstance(one, Sweeps) else one for one in schedule.body
     )
-    with pytest.raises(InvalidIR, match="is read before it is there"):
+    with pytest.raises(InvalidIR, match="before it is"):
         verify(replace(schedule, body=early), "join")
 
 
