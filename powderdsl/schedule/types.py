@@ -294,7 +294,8 @@ def variables(schedule: Schedule) -> dict[str, Var]:
     """All variables by name."""
     found = {var.name: var for _, var in schedule.finds}
     for statement in flat(schedule.body):
-        found |= {var.name: var for var in defined_by(statement)}
+        loops = statement.loops if isinstance(statement, Sweeps) else (statement,)  # with what only passes
+        found |= {var.name: var for one in loops for var in defined_by(one)}
     return found
 
 
