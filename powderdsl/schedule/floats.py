@@ -23,6 +23,7 @@ from powderdsl.schedule.types import (
 )
 
 COMPARISONS = ("eq", "lt", "le")
+AT_NEIGHBORS = ("shift", "swap", "arrive")
 
 
 def late(schedule: Schedule) -> Schedule:
@@ -139,7 +140,8 @@ def of_floats(node: Node) -> bool:
 def _conjoined(roots: list[Node], comparisons: list[Node]) -> dict[int, int]:
     """For each node, by id, the comparisons that every path from a root to it goes through a conjunction with, as bits.
 
-    From a conjunction, paths lead to its conjuncts at once. The path to a conjunct is not one with itself.
+    From a conjunction, paths lead to its conjuncts at once. The path to a conjunct is not one with itself. What holds in
+    a cell need not hold at the neighbors that it reads.
     """
     bit = {id(node): 1 << number for number, node in enumerate(comparisons)}
     found: dict[int, int] = {id(root): 0 for root in roots}
@@ -149,7 +151,7 @@ def _conjoined(roots: list[Node], comparisons: list[Node]) -> dict[int, int]:
         below = conjuncts(node) if node.op == "and" else node.args
         others = sum(bit.get(id(part), 0) for part in below) if node.op == "and" else 0
         for part in below:
-            paths = found[id(node)] | (others & ~bit.get(id(part), 0))
+            paths = 0 if node.op in AT_NEIGHBORS else found[id(node)] | (others & ~bit.get(id(part), 0))
             found[id(part)] = found.get(id(part), paths) & paths
     return found
 
