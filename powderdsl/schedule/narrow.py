@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -29,11 +29,12 @@ def narrow(schedule: Schedule) -> Schedule:
 
     `v' = settle(m ? a : v)`, where v was clamped → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
     """
-    found = {var.name for _, var in schedule.finds}
+    found = {slot: var.name for slot, var in schedule.finds}
+    olds = {str(node.attr): found[slot] for slot, node in schedule.leaves if slot in found}
 
     def change(loop: Compute) -> list[Statement]:
         cells = loop.over in ("cells", "choices")
-        return [_narrowed(loop, schedule.graph, found) if cells else loop]
+        return [_narrowed(loop, schedule.graph, olds) if cells else loop]
 
     return map_computes(schedule, change)
 
@@ -56,10 +57,15 @@ def ask_regions(schedule: Schedule) -> Schedule:
     return map_computes(schedule, change)
 
 
-def _narrowed(loop: Compute, graph: Graph, found: set[str]) -> Compute:
-    """A loop with its region, if it has one."""
+def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, str]) -> Compute:
+    """A loop with its region, if it has one. `slots`: the variable that a slot's new value replaces, by the new one's name.
+
+    Only a slot's own old value has been clamped to the bounds of that slot.
+    """
     values = [out.value for out in loop.outs]
-    kept = [unchanged(value, found) for value in values]
+    kept = [
+        unchanged(out.value, {slots[out.var.name]}) if out.var.name in slots else None for out in loop.outs
+    ]
     if all(kept):
         olds = [old for old, _ in kept if old is not None]  # type: ignore[misc]
         masks = [mask for _, chosen in kept for mask in chosen]  # type: ignore[misc]
