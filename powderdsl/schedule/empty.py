@@ -76,7 +76,7 @@ def _asked(loop: Compute, graph: Graph) -> Compute:
 def _conditions(value: Node, memo: dict[int, frozenset[str] | None]) -> list[frozenset[str]]:
     """Sets of planes; of each set one plane must be non-empty for the value to hold anywhere."""
     parts = [value.args[0], *conjuncts(value.args[1])] if value.op == "when" else conjuncts(value)
-    found = dict.fromkeys(found for part in parts if (found := holders(part, memo)) is not None)
+    found = dict.fromkeys(names for part in parts if (names := holders(part, memo)) is not None)
     return sorted(found, key=len)[:MAX_CONDITIONS]
 
 
