@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from powderdsl.ir.ops import Node
 from powderdsl.schedule.types import ordered
 
@@ -13,6 +15,29 @@ class Values:
         self.lines: list[str] = []
         self.known: dict[int, str] = {}
         self.count = 0
+
+    def needed(self, node: Node) -> Sequence[Node]:
+        """The arguments that get names before a node does."""
+        raise NotImplementedError
+
+    def made(self, node: Node) -> None:
+        """Name a node, by adding it to `known`."""
+        raise NotImplementedError
+
+    def of(self, root: Node) -> str:
+        """The name of a value."""
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            needed = () if ready else self.needed(node)
+            if needed:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(needed))
+            else:
+                self.made(node)
+        return self.known[id(root)]
 
 
 class WordValues(Values):
@@ -29,21 +54,12 @@ class WordValues(Values):
         """The name of a `when`; its second argument is computed only where the first holds."""
         raise NotImplementedError
 
-    def of(self, root: Node) -> str:
-        """The name of a value."""
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if not ready:
-                stack.append((node, True))
-                below = node.args[:1] if node.op == "when" else () if node.op == self.leaf else node.args
-                stack.extend((arg, False) for arg in reversed(below))
-                continue
-            text = self.lazy(node) if node.op == "when" else self.node(node)
-            self.known[id(node)] = text if text.isidentifier() else self.name(text)
-        return self.known[id(root)]
+    def needed(self, node: Node) -> Sequence[Node]:
+        return node.args[:1] if node.op == "when" else () if node.op == self.leaf else node.args
+
+    def made(self, node: Node) -> None:
+        text = self.lazy(node) if node.op == "when" else self.node(node)
+        self.known[id(node)] = text if text.isidentifier() else self.name(text)
 
     def name(self, text: str) -> str:
         self.count += 1
@@ -68,23 +84,14 @@ class CellValues(Values):
         """Name a chain of choices."""
         raise NotImplementedError
 
-    def of(self, root: Node) -> str:
-        """The name of a value."""
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if node.op == "select":
-                self.choice(node)
-            elif node.op == "led":
-                self.known[id(node)] = self.led(node)
-            elif ready or not node.args or node.op == "shift":
-                self.known[id(node)] = self.node(node)
-            else:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-        return self.known[id(root)]
+    def needed(self, node: Node) -> Sequence[Node]:
+        return () if node.op in ("select", "led", "shift") else node.args
+
+    def made(self, node: Node) -> None:
+        if node.op == "select":
+            self.choice(node)
+        else:
+            self.known[id(node)] = self.led(node) if node.op == "led" else self.node(node)
 
     def chain(self, node: Node) -> list[Node]:
         """A choice and those below it in its third argument, the outermost first."""

@@ -189,7 +189,7 @@ class _ProgramRun:
                 run(self.steps)
 
     def costs(self) -> tuple[tuple[str, float], ...]:
-        """Nobody knows a program's passes."""
+        """Empty: the passes of another program are unknown."""
         return ()
 
 
