@@ -40,6 +40,7 @@ BACKENDS = {
     "torch": "torch tensors with one element a cell, on any device: the readable one",
     "arrays": "bit planes in NumPy arrays, on the CPU: starts at once, needs no compiler",
     "native": "generated C++ for the CPU; compiled once, then kept",
+    "wasm": "generated WebAssembly, run by wasmtime on the CPU: needs no compiler",
     "cuda": "generated CUDA C++ for a GPU: whole worlds on the chip, all steps of a call in one launch",
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }

@@ -126,7 +126,11 @@ CPP = (
 """For a thread that processes eight worlds side by side, plane by plane."""
 
 
-PLANNERS = {"arrays": ARRAYS, "native": CPP, "cuda": CUDA}
+WASM = CPP
+"""For WebAssembly: as for C++; a product that is fused is exact, so that two operations give the same."""
+
+
+PLANNERS = {"arrays": ARRAYS, "native": CPP, "wasm": WASM, "cuda": CUDA}
 """The stages of each backend that prints schedules."""
 
 

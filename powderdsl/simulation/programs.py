@@ -87,6 +87,8 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         return _torch_program(lowered(), device)
     if backend == "arrays":
         return _array_program(lowered(), device)
+    if backend == "wasm":
+        return CompiledProgram(_wasm_program(lowered(), device), starting, "wasm")
     if backend == "native":
         return CompiledProgram(_native(ruleset, lowered, device, threads), starting)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
@@ -129,6 +131,16 @@ def _array_program(program: Program, device: torch.device) -> Runnable:
         problem = "NumPy's arrays are in the memory of the CPU"
         raise _refusal("arrays", problem, _ELSEWHERE.format(device))
     return packed_program(program, device, ArrayProgram)
+
+
+def _wasm_program(program: Program, device: torch.device) -> Runnable:
+    """On the CPU only; passes that do not fit bit planes run on torch tensors."""
+    from powderdsl.targets.torch.mixed import packed_program
+    from powderdsl.targets.wasm.program import WasmProgram
+
+    if device.type != "cpu":
+        raise _refusal("wasm", "wasmtime runs on the CPU", _ELSEWHERE.format(device))
+    return packed_program(program, device, WasmProgram)
 
 
 def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:

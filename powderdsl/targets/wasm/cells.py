@@ -1,0 +1,424 @@
+"""Loops over cells: line by line, four floats at a time. Lines outside the region are skipped."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
+
+from powderdsl.ir.ops import REAL, SNAP, Node
+from powderdsl.schedule.types import Compute, loaded, ordered
+from powderdsl.targets.layout import param_key
+from powderdsl.targets.values import CellValues
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, floats, load, op, vector
+from powderdsl.targets.wasm.library import ZERO, Library, choose, either, some, splat
+from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
+
+if TYPE_CHECKING:
+    from powderdsl.targets.wasm.passes import Pass
+
+CHUNK = 4
+BITS = struct.pack("<4I", 1, 2, 4, 8)
+_ARITHMETIC = {"add", "sub", "mul", "neg", "abs", "sqrt", "eq", "lt", "le"}
+
+
+def parts_of(region: Node) -> list[Node]:
+    """The flags of which one must hold."""
+    if region.op == "or":
+        return [part for arg in region.args for part in parts_of(arg)]
+    return [] if region.op == "const" else [region]
+
+
+def sweep(within: Pass, loop: Compute) -> None:
+    """The statements of a pass for a loop over cells."""
+    f, library = within.f, within.library
+    for out in loop.outs:
+        within.declare(out.var)
+    with ExitStack() as asked:
+        if loop.region is not None:
+            condition = ZERO
+            for part in parts_of(loop.region):
+                condition = condition | library.some(within.of(part.args[0] if part.op == "live" else part))
+            asked.enter_context(f.when(condition))
+        for out in loop.outs:
+            within.define(out.var, (library.take_field if out.var.type == REAL else library.take)())
+        made = CellLoop(library, loop)
+        outs = [within.vars[out.var.name] for out in loop.outs]
+        f.do(made.made()(*(within.read(name) for name in made.reads), *outs))
+        if loop.region is not None:
+            f.otherwise()
+            for out in loop.outs:
+                assert out.otherwise is not None
+                within.define(out.var, within.kept(out.otherwise))
+    for out in loop.outs:
+        if out.into is not None:
+            f.do(library.give_field(within.vars[out.into]))
+
+
+class CellLoop:
+    """A function with one loop over cells. Its parameters are planes and fields: those read, and those written."""
+
+    def __init__(self, library: Library, loop: Compute):
+        self.library, self.loop, self.memory = library, loop, library.memory
+        roots = [out.value for out in loop.outs]
+        region = [] if loop.region is None else [loop.region]
+        keeps = [out.otherwise for out in loop.outs if out.otherwise is not None and out.otherwise.op == "load"]
+        self.keeps = bool(keeps)
+        self.reads = list(dict.fromkeys(loaded([*roots, *region, *keeps])))
+        self.f = f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
+        self.held = {name: f.param(i) for i, name in enumerate(self.reads)}
+        self.outs = [f.param(len(self.reads) + i) for i in range(len(loop.outs))]
+        self.nodes = ordered(roots)
+        self.starts: dict[tuple[str, int, bool], Local] = {}
+        self.choices = loop.over == "choices"
+
+    def made(self) -> Callee:
+        """The function."""
+        f, library, memory = self.f, self.library, self.memory
+        line = self.line = f.let(ZERO)
+        self.somewhere = [f.let(ZERO) for _ in self.outs]
+        with f.each(ZERO, const("i32", 16), 8) as lane:
+            self.lane = lane
+            with f.each(lane, lane + library.cells.value, memory.row) as row:
+                self.row = row
+                with f.scope(), f.block() as skip:
+                    self.skip = skip
+                    self.starts = {}
+                    self.lay() if self.choices else self.body()
+                f.set(line, line + 1)
+        for out, place, found in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
+            f.store("i32.store", place, found, SOME)
+            if out.var.type != REAL:
+                f.store("i32.store", place, ZERO, HALOED)
+        return library.module.add(f, f"cells_{self.loop.place.rpartition('/')[2]}")
+
+    # Lines
+
+    def start(self, field: str, dy: int = 0, *, wraps: bool = True) -> Local:
+        """Where a line of a field begins; made before the loop over its cells."""
+        return self.starts[field, dy, wraps]
+
+    def find_starts(self) -> None:
+        for node in self.nodes:
+            if node.type != REAL or node.op not in ("load", "shift"):
+                continue
+            dy, _, wraps = node.attr if node.op == "shift" else (0, 0, True)
+            name = str(node.args[0].attr if node.op == "shift" else node.attr)
+            key = (name, dy, wraps or not dy)
+            if key not in self.starts:
+                line = self.library.other_line(self.line, dy, wraps=key[2])
+                line = line if isinstance(line, Local) else self.f.let(line)
+                self.starts[key] = self.f.let(self.library.line(self.held[name], line))
+
+    def live(self, field: Value, line: Value | None = None) -> Value:
+        return load("i32.load8_u", field + (self.line if line is None else line), HEADER)
+
+    def set_live(self, place: int, value: Value) -> None:
+        f = self.f
+        value = f.let(value)
+        f.store("i32.store8", self.outs[place] + self.line, value, HEADER)
+        f.set(self.somewhere[place], self.somewhere[place] | value)
+
+    def flags(self, plane: Value, at: Value) -> Value:
+        """The word of a plane for this lane; `at`: bytes from its first word."""
+        return load("i64.load", plane + at, self.memory.base)
+
+    def row_flags(self, planes: Sequence[str]) -> Value:
+        """Whether planes hold a flag in this row of the lane."""
+        found = const("i64", 0)
+        if self.memory.words <= 4:
+            for name in planes:
+                for at in range(0, self.memory.row, 16):
+                    found = found | load("i64.load", self.held[name] + self.row, self.memory.base + at)
+            return op("i64.ne", found, const("i64", 0))
+        f = self.f
+        total = f.let(found)
+        for name in planes:
+            with f.each(ZERO, const("i32", self.memory.row), 16) as at:
+                f.set(total, total | self.flags(self.held[name], self.row + at))
+        return op("i64.ne", total, const("i64", 0))
+
+    def copy(self, place: int, source: Local) -> None:
+        """A line as it is in another field."""
+        f, memory = self.f, self.memory
+        self.set_live(place, self.live(source))
+        with f.when(self.live(source)):
+            self.copy_cells(self.library.line_start(self.outs[place], self.line), self.library.line_start(source, self.line))
+
+    def copy_cells(self, to: Value, source: Value) -> None:
+        self.f.do(self.library.lazily("copy_line", self._copy_line)(to, source))
+
+    def _copy_line(self) -> Callee:
+        f, memory = Function(["i32", "i32"]), self.memory
+        begin = -4 * memory.halo
+        with f.each(ZERO, const("i32", 4 * memory.stride - 16), 16) as at:
+            f.store("v128.store", (f.param(0) + begin) + at, load("v128.load", (f.param(1) + begin) + at))
+        return self.library.module.add(f, "copy_line")
+
+    # Values, chunk by chunk
+
+    def skipped(self) -> None:
+        """Skip a line outside the region."""
+        f, loop = self.f, self.loop
+        if loop.region is None:
+            return
+        parts = parts_of(loop.region)
+        busy = ZERO
+        for part in parts:
+            if part.op == "live":
+                line = self.library.other_line(self.line, part.attr[0], wraps=True)
+                busy = busy | self.live(self.held[str(part.args[0].attr)], line)
+        planes = [str(part.attr) for part in parts if part.op == "load"]
+        busy = busy | self.row_flags(planes) if planes else busy
+        with f.when(op("i32.eqz", busy)):
+            for i, out in enumerate(loop.outs):
+                assert out.otherwise is not None
+                if out.otherwise.op == "load":
+                    self.copy(i, self.held[str(out.otherwise.attr)])
+                elif out.var.type == REAL:
+                    self.set_live(i, ZERO)
+                else:
+                    if out.otherwise.attr:
+                        f.set(self.somewhere[i], const("i32", 1))
+                    for w in range(self.memory.words):
+                        value = const("i64", self.valid(w) if out.otherwise.attr else 0)
+                        f.store("i64.store", self.outs[i] + self.row, value, self.memory.base + 16 * w)
+            f.jump(self.skip)
+
+    def valid(self, w: int) -> int:
+        """The columns of a word that lie in the grid."""
+        return (1 << min(WORD, self.memory.width - WORD * w)) - 1
+
+    def body(self) -> None:
+        f, memory, library = self.f, self.memory, self.library
+        self.skipped()
+        self.find_starts()
+        width = memory.width
+        fields = [(i, out) for i, out in enumerate(self.loop.outs) if out.var.type == REAL]
+        flags = [(i, out) for i, out in enumerate(self.loop.outs) if out.var.type != REAL]
+        lines = {i: f.let(library.line_start(self.outs[i], self.line)) for i, _ in fields}
+        alive = {i: f.let(const("v128", 0)) for i, _ in fields}
+        with self.each_word() as (at, x, stop):
+            bits = {i: f.let(const("i64", 0)) for i, _ in flags}
+            words = {name: f.let(self.flags(self.held[name], at)) for name in self.plane_names()}
+            with f.each(x, stop, CHUNK) as column, f.scope():
+                self.column, self.at = column, at
+                values = Chunks(self, words)
+                found = [values.of(out.value) for out in self.loop.outs]
+                found = [v if isinstance(v, Local) else f.let(v) for v in found]
+                for i, _ in fields:
+                    f.store("v128.store", lines[i] + (column << 2), found[i])
+                    kept = found[i]
+                    if width % CHUNK:
+                        kept = kept & load("v128.load", column << 2, memory.at("columns") + 4 * memory.halo)
+                    f.set(alive[i], alive[i] | kept)
+                for i, _ in flags:
+                    four = op("i64.extend_i32_u", op("i32x4.bitmask", found[i]))
+                    f.set(bits[i], bits[i] | (four << op("i64.extend_i32_u", column)))
+            for i, _ in flags:
+                value: Value = bits[i]
+                if not memory.whole:
+                    value = value & self.valid_word(at)
+                    f.set(bits[i], value)
+                f.set(self.somewhere[i], self.somewhere[i] | op("i64.ne", bits[i], const("i64", 0)))
+                f.store("i64.store", self.outs[i] + at, bits[i], memory.base)
+        for i, _ in fields:
+            self.set_live(i, some(op("i32x4.shl", alive[i], const("i32", 1))))
+            library.finish_line(f, lines[i])
+
+    def valid_word(self, at: Value) -> Value:
+        return load("i64.load", self.library.everything.value + at, self.memory.base)
+
+    @contextmanager
+    def each_word(self):  # type: ignore[no-untyped-def]
+        """The words of a row: bytes from the plane's first word, the first column, the column after the last."""
+        f, memory = self.f, self.memory
+        if memory.words == 1:
+            yield self.row, ZERO, const("i32", memory.width)
+            return
+        at, x = f.let(self.row), f.let(ZERO)
+        with f.loop() as again:
+            stop = x + WORD
+            if not memory.whole:
+                stop = f.let(stop)
+                f.set(stop, either(stop < memory.width, stop, const("i32", memory.width)))
+            yield at, x, stop
+            f.set(at, at + 16)
+            f.set(x, x + WORD)
+            f.jump(again, x < memory.width)
+
+    def plane_names(self) -> list[str]:
+        """The planes that values read."""
+        return list(dict.fromkeys(str(n.attr) for n in self.nodes if n.op == "load" and n.type != REAL))
+
+    # Chains of choices
+
+    def lay(self) -> None:
+        """A line of all choices: chunk by chunk in which a choice holds, one choice after the other."""
+        f, library, memory = self.f, self.library, self.memory
+        chains = []
+        for out in self.loop.outs:
+            chain, node = [], out.value
+            while node.op == "select":
+                chain.append(node)
+                node = node.args[2]
+            chains.append((list(reversed(chain)), node))
+        masks = [str(choice.args[0].attr) for choice in chains[0][0]]
+        bases = [self.held[str(base.attr)] for _, base in chains]
+        any_flag = f.let(self.row_flags(list(dict.fromkeys(masks))))
+        with f.when(op("i32.eqz", any_flag)):
+            for i, base in enumerate(bases):
+                self.copy(i, base)
+            f.jump(self.skip)
+        self.find_starts()
+        lines = []
+        for i, (_, base) in enumerate(chains):
+            self.set_live(i, const("i32", 1))
+            lines.append(f.let(library.line_start(self.outs[i], self.line)))
+            self.copy_cells(lines[i], self.start(str(base.attr)))
+        with self.each_word() as (at, x, _):
+            for level, mask in enumerate(masks):
+                with f.scope():
+                    left = f.let(self.flags(self.held[mask], at))
+                    with f.block() as out, f.loop() as again:
+                        f.jump(out, op("i64.eqz", left))
+                        nibble = f.let(op("i64.ctz", left) & (WORD - CHUNK))
+                        self.column, self.at = f.let(x + op("i32.wrap_i64", nibble)), at
+                        four = splat(op("i32.wrap_i64", left >> nibble))
+                        chosen = f.let(op("i32x4.eq", four & vector(BITS), vector(BITS)))
+                        f.set(left, op("i64.and", left, const("i64", -1) ^ (const("i64", 15) << nibble)))
+                        values = Chunks(self, {})
+                        for i, (chain, _) in enumerate(chains):
+                            place = lines[i] + (self.column << 2)
+                            running = f.let(load("v128.load", place))
+                            values.known[id(chain[level].args[2])] = running
+                        for i, (chain, _) in enumerate(chains):
+                            value = choose(chosen, values.of(chain[level].args[1]), values.known[id(chain[level].args[2])])
+                            f.store("v128.store", lines[i] + (self.column << 2), value)
+                        f.jump(again)
+        for start in lines:
+            library.finish_line(f, start)
+
+
+class Chunks(CellValues):
+    """Values of four cells: floats, or flags as lanes of ones."""
+
+    def __init__(self, loop: CellLoop, words: dict[str, Local]):
+        super().__init__()
+        self.loop, self.f, self.library, self.words = loop, loop.f, loop.library, words
+        self.memory = loop.memory
+        self.choices = [node for node in loop.nodes if node.op == "select"]
+        self.uses = Counter(id(arg) for node in loop.nodes for arg in node.args)
+        self.leaders: dict[int, Local] = {}
+
+    def nibble(self, node: Node) -> Value:
+        """The bits of a flag's plane from this column on: i32."""
+        if node.op == "param":
+            number = self.memory.layout.param_planes[param_key(node)]
+            return op("i32.wrap_i64", load("i64.load", self.loop.lane, self.memory.at("params", number)))
+        return op("i32.wrap_i64", self.words[str(node.attr)] >> op("i64.extend_i32_u", self.loop.column))
+
+    def spread(self, bits: Value) -> Value:
+        """Four bits as lanes."""
+        return op("i32x4.eq", splat(bits) & vector(BITS), vector(BITS))
+
+    def node(self, node: Node) -> Value:
+        value = self._node(node)
+        return value if isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2 else self.f.let(value)
+
+    def _node(self, node: Node) -> Value:
+        attr, args = node.attr, [self.known[id(arg)] for arg in node.args if id(arg) in self.known]
+        memory, loop = self.memory, self.loop
+        match node.op:
+            case "const":
+                return floats(float(attr))
+            case "load" if node.type != REAL:
+                return self.spread(self.nibble(node))
+            case "load":
+                return load("v128.load", loop.start(str(attr)) + (loop.column << 2))
+            case "param":
+                if node.type != REAL:
+                    return self.spread(self.nibble(node))
+                number = memory.layout.param_reals[attr[0]]
+                return load("v128.load32_splat", loop.lane >> 1, memory.at("reals", number, 8))
+            case "draw":
+                return self.draw(node)
+            case "shift":
+                dy, dx, wraps = attr
+                start = loop.start(str(node.args[0].attr), dy, wraps=wraps or not dy)
+                value = self.beside(start, dx)
+                if wraps or not dx:
+                    return value
+                return value & self.beside(const("i32", memory.at("columns") + 4 * memory.halo), dx)
+            case "fused":
+                return op("f32x4.add", args[0], op("f32x4.mul", args[1], floats(float(node.args[2].attr))))
+            case "ratio":
+                return op("f32x4.div", *args)
+            case "div":
+                return op("v128.andnot", op("f32x4.div", *args), op("f32x4.eq", args[1], floats(0)))
+            case "min" | "max":
+                a, b = (arg if isinstance(arg, Local) else self.f.let(arg) for arg in args)
+                best = op("f32x4.pmin" if node.op == "min" else "f32x4.pmax", b, a)
+                return choose(op("f32x4.ne", a, a), a, best)
+            case "settle":
+                lo, hi = attr
+                x = self.f.let(args[0])
+                self.f.set(x, x & op("f32x4.eq", x, x))
+                self.f.set(x, op("f32x4.pmin", op("f32x4.pmax", x, floats(lo)), floats(hi)))
+                return x & op("f32x4.ge", op("f32x4.abs", x), floats(SNAP))
+        if node.op in _ARITHMETIC:
+            return op(f"f32x4.{node.op}", *args)
+        raise AssertionError(f"no function for {node.op} of floats")
+
+    def beside(self, start: Value, dx: int) -> Value:
+        return load("v128.load", (start + (self.loop.column << 2)) + 4 * dx)
+
+    def draw(self, node: Node) -> Value:
+        stream, bits = node.attr
+        keys = self.memory.at("keys", self.memory.layout.streams[stream], 32)
+        loop, f = self.loop, self.f
+        row = op("i32.sub", loop.row, loop.lane)
+        y = f.let(row // self.memory.row)
+        at = f.let(self.library.word_number(loop.at - loop.lane, y))
+        found = f.let(const("v128", 0))
+        for i in range(CHUNK):
+            within = (loop.column + i) & (WORD - 1)
+            number = self.library.draw_float()(at, loop.lane, within, const("i32", keys), const("i32", bits))
+            f.set(found, op("f32x4.replace_lane", found, number, tail=bytes([i])))
+        return found
+
+    def led(self, node: Node) -> Value:
+        """A comparison, computed only where its leader holds somewhere in the chunk."""
+        leader, comparison = node.args
+        first = self.of(leader)
+        first = first if isinstance(first, Local) else self.f.let(first)
+        self.known[id(leader)] = first
+        found = self.f.let(const("v128", 0))
+        with self.f.when(some(first)):
+            known = dict(self.known)
+            self.f.set(found, self.of(comparison) & first)
+            self.known = known
+        return found
+
+    def choice(self, node: Node) -> None:
+        """A chain of choices. A choice is computed only if it chooses some cell of the chunk."""
+        f = self.f
+        chains = self.alike(node)
+        masks = [choice.args[0] for choice in chains[0]]
+        names = [f.let(self.of(one[-1].args[2])) for one in chains]
+        for level in reversed(range(len(masks))):
+            before = self.known
+            running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
+            self.known = before | running  # valid only here, since the variables change
+            bits = f.let(self.nibble(masks[level]) & 15)
+            with f.when(bits):
+                mask = f.let(self.spread(bits))
+                chosen = [self.of(one[level].args[1]) for one in chains]
+                chosen = [value if len(chains) == 1 else f.let(value) for value in chosen]
+                for name, value in zip(names, chosen, strict=True):
+                    f.set(name, choose(mask, value, name))
+            self.known = before
+        for one, name in zip(chains, names, strict=True):
+            self.known[id(one[0])] = name

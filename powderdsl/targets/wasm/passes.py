@@ -1,0 +1,285 @@
+"""Schedules → functions: one for each pass, which calls those of its loops and movements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from powderdsl.ir.ops import FLAG, REAL, Node
+from powderdsl.schedule.empty import is_whole
+from powderdsl.schedule.types import Carried, Compute, Forget, Guard, Move, Out, Release, Schedule, Statement, Sweeps, Var
+from powderdsl.schedule.updates import is_cleared
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
+from powderdsl.targets.wasm.cells import sweep
+from powderdsl.targets.wasm.library import ZERO, Library, word
+from powderdsl.targets.wasm.memory import SOME
+from powderdsl.targets.wasm.words import WordLoop
+
+ONE = const("i32", 1)
+
+
+def pass_function(schedule: Schedule, library: Library) -> Callee:
+    """The function of a pass."""
+    printer = Pass(schedule, library)
+    return library.module.add(printer.made(), f"pass_{schedule.name}")
+
+
+class Pass:
+    """Variables are locals that hold the addresses of planes and fields."""
+
+    def __init__(self, schedule: Schedule, library: Library):
+        self.schedule, self.library, self.f = schedule, library, Function()
+        self.vars: dict[str, Local] = {}
+        self.types: dict[str, bool] = {}
+
+    def made(self) -> Function:
+        f, library, schedule = self.f, self.library, self.schedule
+        memory, group = library.memory, library.group.value
+        changed = {slot for slot, _ in schedule.leaves}
+        if schedule.when is not None:
+            with f.when(op("i32.eqz", self.answer(schedule.when))):
+                f.leave()
+        for slot, var in schedule.finds:
+            at = memory.slot(slot, var.type)
+            if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
+                self.define(var, word(group, at))
+                f.store("i32.store", group, ZERO, at)
+            else:
+                self.define(var, library.keep(word(group, at)))
+        self.block(schedule.body)
+        left = []
+        for slot, node in schedule.leaves:
+            left.append((memory.slot(slot, node.type), f.let(self.kept(node)), node))
+        for at, value, node in left:
+            old = f.let(word(group, at))
+            with f.when(old):
+                f.do(self.giver(node.type == REAL)(old))
+            f.store("i32.store", group, value, at)
+        names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
+        self.release(names)
+        return f
+
+    # Variables
+
+    def define(self, var: Var, value: Value) -> Local:
+        self.declare(var)
+        self.f.set(self.vars[var.name], value)
+        return self.vars[var.name]
+
+    def declare(self, var: Var) -> None:
+        """A variable that is set later."""
+        if var.name not in self.vars:
+            self.vars[var.name] = self.f.local("i32")
+        self.types[var.name] = var.type == REAL
+
+    def of(self, node: Node) -> Local:
+        return self.vars[str(node.attr)]
+
+    def giver(self, real: bool) -> Callee:
+        return self.library.give_field if real else self.library.give
+
+    def release(self, names: Iterable[str]) -> None:
+        for name in names:
+            self.f.do(self.giver(self.types[name])(self.vars[name]))
+
+    def held(self, node: Node) -> Value:
+        """The plane or field of a load or a constant."""
+        if node.op == "load":
+            return self.of(node)
+        if node.type == REAL:
+            return self.library.calm.value
+        return (self.library.everything if node.attr else self.library.nothing).value
+
+    def kept(self, node: Node) -> Value:
+        return self.library.keep(self.held(node))
+
+    # Answers
+
+    def answer(self, node: Node) -> Value:
+        """A condition: i32, not zero if it holds."""
+        match node.op:
+            case "any":
+                return self.library.some(self.of(node.args[0]))
+            case "present":
+                return op("i64.ne", self.library.present.value & node.attr, const("i64", 0))
+            case "const":
+                return const("i32", bool(node.attr))
+        first, second = (self.answer(arg) for arg in node.args)
+        return self.both(first, second) if node.op == "and" else first | second
+
+    def both(self, first: Value, second: Value) -> Value:
+        return op("i32.ne", first, ZERO) & op("i32.ne", second, ZERO)
+
+    # Statements
+
+    def block(self, body: Sequence[Statement]) -> None:
+        for statement in body:
+            match statement:
+                case Compute((out,), _, "words") if is_whole(out.value):
+                    self.whole(out)
+                case Compute() if statement.region is not None:
+                    self.update(statement)
+                case Compute():
+                    self.words(statement)
+                case Sweeps():
+                    for loop in statement.loops:
+                        sweep(self, loop)
+                case Move():
+                    self.move(statement)
+                case Guard():
+                    self.guard(statement)
+                case Release(names):
+                    self.release(names)
+                case Forget():
+                    self.f.set(self.library.present, const("i64", -1))
+                case _:
+                    raise AssertionError("no such statement on words")
+
+    def guard(self, guard: Guard) -> None:
+        f = self.f
+        asked = ZERO
+        for node in guard.when:
+            asked = self.library.some(self.of(node)) if asked is ZERO else asked | self.library.some(self.of(node))
+        for var, _ in guard.keeps:
+            self.declare(var)
+        with f.when(asked):
+            self.block(guard.body)
+            if guard.keeps:
+                f.otherwise()
+                for var, value in guard.keeps:
+                    self.define(var, self.kept(value))
+
+    def words(self, loop: Compute) -> None:
+        f, library = self.f, self.library
+        if loop.when is None:
+            return self.loop(loop)
+        for out in loop.outs:
+            self.declare(out.var)
+        with f.when(self.answer(loop.when)):
+            self.loop(loop)
+            f.otherwise()
+            for out in loop.outs:
+                self.define(out.var, library.keep(library.nothing.value))
+
+    def loop(self, loop: Compute) -> None:
+        """Planes that are all computed anew."""
+        for out in loop.outs:
+            self.define(out.var, self.library.take())
+        self.call(loop, [self.vars[out.var.name] for out in loop.outs])
+
+    def call(self, loop: Compute, outs: Sequence[Value]) -> None:
+        made = WordLoop(self.library, loop)
+        for name in made.haloed:
+            self.f.do(self.library.edges(self.vars[name]))
+        self.f.do(made.made()(*(self.read(name) for name in made.reads), *outs))
+
+    def read(self, name: str | tuple[str, int]) -> Value:
+        if isinstance(name, str):
+            return self.vars[name]
+        memory, (table, number) = self.library.memory, name
+        place = memory.at(table, number, 4)
+        if table == "fixed":
+            return word(ZERO, place)
+        return self.library.coin(const("i32", place), const("i32", memory.at("keys", number, 32)))
+
+    def update(self, loop: Compute) -> None:
+        """Planes that change only in words where a mask holds."""
+        f, library = self.f, self.library
+        assert loop.region is not None
+        for out in loop.outs:
+            assert out.otherwise is not None
+            self.define(out.var, self.of(out.otherwise) if out.into else self.kept(out.otherwise))
+        made = WordLoop(library, loop)
+        asked = ZERO
+        for name in made.mask_names:
+            asked = asked | library.some(self.vars[name])
+        with f.when(asked):
+            for out in loop.outs:
+                plane = self.vars[out.var.name]
+                needed = library.some(plane) if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
+                with f.when(needed):
+                    f.set(plane, library.own(plane))
+                    f.store("i32.store", plane, ONE, SOME)
+            for name in made.haloed:
+                f.do(library.edges(self.vars[name]))
+            function = made.made()
+            f.do(function(*(self.read(name) for name in made.reads), *(self.vars[o.var.name] for o in loop.outs)))
+
+    def whole(self, out: Out) -> None:
+        """An operation on whole planes that tests for empty ones first."""
+        f, library, value = self.f, self.library, out.value
+        if value.op in ("load", "const"):
+            self.define(out.var, self.kept(value))
+            return
+        args = value.args
+        if value.op == "and":  # kept and not gone
+            kept, gone = (self.of(args[0]), args[1].args[0]) if args[1].op == "not" else (self.of(args[1]), args[0].args[0])
+            tests = [(kept, kept), (self.of(gone), kept)]
+        elif value.op == "or":
+            first, second = map(self.of, args)
+            tests = [(second, first), (first, second)]
+        else:
+            tests = [(self.of(args[0]), library.nothing.value)]
+        self.declare(out.var)
+        self._tested(tests, out)
+
+    def _tested(self, tests: Sequence[tuple[Value, Value]], out: Out) -> None:
+        if not tests:
+            self.loop(Compute((out,), "", "words"))
+            return
+        (plane, rest), *others = tests
+        with self.f.when(self.library.some(plane)):
+            self._tested(others, out)
+            self.f.otherwise()
+            self.define(out.var, self.library.keep(rest))
+
+    def move(self, move: Move) -> None:
+        """Planes that move; those that nothing moves stay as they are."""
+        f, library = self.f, self.library
+        movers = self.of(move.movers)
+        unmoved = [plane for plane in move.planes if leaves(plane, move.movers) is None]
+        if unmoved:
+            self.loop(self.moved(move, move.planes))
+            self.give_old(move)
+            return
+        for plane in move.planes:
+            self.declare(plane.new)
+        with f.when(library.some(movers)):
+            self.loop(self.moved(move, move.planes))
+            self.give_old(move)
+            f.otherwise()
+            for plane in move.planes:
+                self.define(plane.new, self.of(plane.old) if plane.into else self.kept(plane.old))
+
+    def give_old(self, move: Move) -> None:
+        for plane in move.planes:
+            if plane.into:
+                self.f.do(self.library.give(self.of(plane.old)))
+
+    def moved(self, move: Move, planes: Sequence[Carried]) -> Compute:
+        """A movement as a loop over words."""
+        graph, (dy, dx) = self.schedule.graph, move.offset
+
+        def seen(node: Node, dy: int, dx: int) -> Node:
+            return graph.node("shift", FLAG, (node,), (dy, dx, True))
+
+        outs = []
+        targets = seen(move.movers, -dy, -dx)
+        for plane in planes:
+            value = graph.node("select", FLAG, (targets, seen(plane.old, -dy, -dx), plane.leaves))
+            if move.op == "swap":
+                value = graph.node("select", FLAG, (move.movers, seen(plane.old, dy, dx), value))
+            outs.append(Out(plane.new, value))
+        return Compute(tuple(outs), move.place, "words")
+
+
+def leaves(plane: Carried, movers: Node) -> str | None:
+    """What movers leave behind: nothing, everything, or the same; None if it is something else."""
+    old, rest = plane.old, plane.leaves
+    if rest is old:
+        return "same"
+    if rest.op not in ("and", "or") or old not in rest.args:
+        return None
+    (other,) = (arg for arg in rest.args if arg is not old)
+    if rest.op == "or":
+        return "everything" if other is movers else None
+    return "nothing" if other.op == "not" and other.args[0] is movers else None

@@ -1,0 +1,47 @@
+"""A program on bit planes → a module for grids of one width."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from operator import or_
+
+from powderdsl.ir.ops import Program
+from powderdsl.schedule.presence import asked_ids
+from powderdsl.schedule.stages import WASM, plan
+from powderdsl.system.memory import collection_paused
+from powderdsl.targets.layout import Layout, layout_of
+from powderdsl.targets.wasm.binary import Module
+from powderdsl.targets.wasm.driver import Driver
+from powderdsl.targets.wasm.library import PAGE, Library
+from powderdsl.targets.wasm.memory import Memory, extent_of
+from powderdsl.targets.wasm.passes import pass_function
+
+PAGES = 1 << 14
+"""The most pages of 64 KiB that a module's memory has: 1 GiB."""
+
+
+@dataclass(frozen=True)
+class WasmModule:
+    """A module with the numbers of its slots and parameters."""
+
+    module: Module
+    layout: Layout
+    width: int
+
+    @property
+    def code(self) -> bytes:
+        return self.module.code()
+
+
+@collection_paused()
+def wasm_module(program: Program, width: int) -> WasmModule:
+    """The module of a program on planes, for grids of this width."""
+    layout = layout_of(program)
+    schedules = [plan(pass_, WASM) for pass_ in program.passes]
+    memory = Memory(width, extent_of(schedules), layout)
+    module = Module(memory.top // PAGE + 1, PAGES)
+    library = Library(memory, module)
+    passes = [pass_function(schedule, library) for schedule in schedules]
+    Driver(library, program, passes, reduce(or_, map(asked_ids, schedules), 0)).add()
+    return WasmModule(module, layout, width)
