@@ -390,17 +390,19 @@ class Chunks(CellValues):
         return found
 
     def led(self, node: Node) -> Value:
-        """A comparison, computed only where its leader holds somewhere in the chunk."""
-        leader, comparison = node.args
+        """A comparison, computed only where its leader holds somewhere in the chunk, together with others it leads."""
+        leader = node.args[0]
         first = self.of(leader)
-        first = first if isinstance(first, Local) else self.f.let(first)
-        self.known[id(leader)] = first
-        found = self.f.let(const("v128", 0))
+        first = self.known[id(leader)] = first if isinstance(first, Local) else self.f.let(first)
+        led = [one for one in self.loop.nodes if one.op == "led" and one.args[0] is leader]
+        found = [self.f.let(const("v128", 0)) for _ in led]
         with self.f.when(some(first)):
             known = dict(self.known)
-            self.f.set(found, self.of(comparison) & first)
+            for one, local in zip(led, found, strict=True):
+                self.f.set(local, self.of(one.args[1]) & first)
             self.known = known
-        return found
+        self.known |= {id(one): local for one, local in zip(led, found, strict=True)}
+        return self.known[id(node)]
 
     def choice(self, node: Node) -> None:
         """A chain of choices. A choice is computed only if it chooses some cell of the chunk."""
