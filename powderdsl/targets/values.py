@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Generic, TypeVar
 
 from powderdsl.ir.ops import Node
 from powderdsl.schedule.types import ordered
 
+Named = TypeVar("Named")
+"""What stands for a value in the text of a target: its name, or its code."""
 
-class Values:
+
+class Values(Generic[Named]):
     """Statements of a block, and the names of the values that they compute, by id."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
-        self.known: dict[int, str] = {}
+        self.known: dict[int, Named] = {}
         self.count = 0
 
     def needed(self, node: Node) -> Sequence[Node]:
@@ -24,7 +28,7 @@ class Values:
         """Name a node, by adding it to `known`."""
         raise NotImplementedError
 
-    def of(self, root: Node) -> str:
+    def of(self, root: Node) -> Named:
         """The name of a value."""
         stack = [(root, False)]
         while stack:
@@ -40,7 +44,7 @@ class Values:
         return self.known[id(root)]
 
 
-class WordValues(Values):
+class WordValues(Values[str]):
     """Flags, a word at a time. `type` is the type of a word; `leaf` is the operation whose arguments are read directly."""
 
     type: str
@@ -67,16 +71,16 @@ class WordValues(Values):
         return f"t{self.count}"
 
 
-class CellValues(Values):
+class CellValues(Values[Named]):
     """Floats, and flags that compare them. `choices` are all choices that the block computes."""
 
     choices: list[Node]
 
-    def node(self, node: Node) -> str:
+    def node(self, node: Node) -> Named:
         """The name or expression of a node whose arguments have names; a shift reads its argument directly."""
         raise NotImplementedError
 
-    def led(self, node: Node) -> str:
+    def led(self, node: Node) -> Named:
         """The name of a comparison that is computed only where its leader holds."""
         raise NotImplementedError
 

@@ -14,7 +14,7 @@ from powderdsl.targets.values import CellValues
 _INFIX = {"add": "+", "sub": "-", "mul": "*"}
 
 
-class Chunks(CellValues):
+class Chunks(CellValues[str]):
     """Values of the cells of a chunk, in one world: floats, or flags as bits."""
 
     def __init__(

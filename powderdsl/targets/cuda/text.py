@@ -201,7 +201,7 @@ class _Words(WordValues):
         return f"draw_below_planes({self.layout.streams[stream]}, l, y, w, {wanted}, {bits}, {name})"
 
 
-class _Cells(CellValues):
+class _Cells(CellValues[str]):
     """Values of one cell, which a warp computes for the 32 cells of a word; masks are tested by word."""
 
     def __init__(self, printer: _Printer, outs: Sequence[Out]):

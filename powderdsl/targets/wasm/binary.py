@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
 TYPES = {"i32": 0x7F, "i64": 0x7E, "f32": 0x7D, "f64": 0x7C, "v128": 0x7B}
@@ -305,11 +305,11 @@ class Function:
         self._depth -= 1
         self.body += OPCODES["end"]
 
-    def block(self):  # type: ignore[no-untyped-def]
+    def block(self) -> AbstractContextManager[int]:
         """A block, by its label; jumping to it leaves it."""
         return self._nested("block")
 
-    def loop(self):  # type: ignore[no-untyped-def]
+    def loop(self) -> AbstractContextManager[int]:
         """A loop, by its label; jumping to it begins it again."""
         return self._nested("loop")
 
@@ -364,7 +364,7 @@ class Module:
         self._functions: dict[tuple[int, bytes], Callee] = {}
         self._names: list[str] = []
         self._globals: list[tuple[str, int]] = []
-        self._exports: list[bytes] = [_name("memory") + b"\x02\x00"]
+        self._exports: list[bytes] = [_text("memory") + b"\x02\x00"]
 
     def add(self, function: Function, name: str, *, export: bool = False) -> Callee:
         kind = b"\x60" + _vector([bytes([TYPES[t]]) for t in function.params])
@@ -374,7 +374,7 @@ class Module:
         if found.index == len(self._names):
             self._names.append(name)
         if export:
-            self._exports.append(_name(name) + b"\x00" + unsigned(found.index))
+            self._exports.append(_text(name) + b"\x00" + unsigned(found.index))
         return found
 
     def variable(self, type: str, start: int = 0) -> Global:
@@ -400,7 +400,7 @@ class Module:
             found.append(bytes([number]) + unsigned(len(inner)) + inner)
         return b"".join(found)
 
-    def text(self, only: str | None = None) -> str:
+    def listing(self, only: str | None = None) -> str:
         """The functions in the notation of the text format, with what their names begin with, if that is given."""
         functions = [
             f"(func ${name} ;; {i}, {len(code)} bytes\n{_listing(code, self._names)})"
@@ -414,7 +414,7 @@ def _vector(items: Sequence[bytes]) -> bytes:
     return unsigned(len(items)) + b"".join(items)
 
 
-def _name(text: str) -> bytes:
+def _text(text: str) -> bytes:
     return unsigned(len(text.encode())) + text.encode()
 
 
@@ -446,7 +446,7 @@ def _listing(code: bytes, names: Sequence[str]) -> str:
     lines = [f"  (local {kind}) ;; {count}" for count, kind in declared]
     depth = 1
     while read.at < len(code) - 1:
-        number = read.number() if False else read.octets(1)[0]
+        number = read.octets(1)[0]
         if number in (0xFC, 0xFD):
             number = number << 8 | read.number()
         name = NAMES[number]

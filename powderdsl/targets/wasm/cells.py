@@ -13,7 +13,7 @@ from powderdsl.schedule.types import Compute, loaded, ordered
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.values import CellValues
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, floats, load, op, vector
-from powderdsl.targets.wasm.library import ZERO, Library, choose, either, some, splat
+from powderdsl.targets.wasm.library import ZERO, Library, choose, counted, either, some, splat
 from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
 
 if TYPE_CHECKING:
@@ -64,7 +64,9 @@ class CellLoop:
         self.library, self.loop, self.memory = library, loop, library.memory
         roots = [out.value for out in loop.outs]
         region = [] if loop.region is None else [loop.region]
-        keeps = [out.otherwise for out in loop.outs if out.otherwise is not None and out.otherwise.op == "load"]
+        keeps = [
+            out.otherwise for out in loop.outs if out.otherwise is not None and out.otherwise.op == "load"
+        ]
         self.keeps = bool(keeps)
         self.reads = list(dict.fromkeys(loaded([*roots, *region, *keeps])))
         self.f = f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
@@ -130,8 +132,8 @@ class CellLoop:
         found = const("i64", 0)
         if self.memory.words <= 4:
             for name in planes:
-                for at in range(0, self.memory.row, 16):
-                    found = found | load("i64.load", self.held[name] + self.row, self.memory.base + at)
+                for w in range(self.memory.words):
+                    found = found | load("i64.load", self.held[name] + self.row, self.memory.base + 16 * w)
             return op("i64.ne", found, const("i64", 0))
         f = self.f
         total = f.let(found)
@@ -142,10 +144,13 @@ class CellLoop:
 
     def copy(self, place: int, source: Local) -> None:
         """A line as it is in another field."""
-        f, memory = self.f, self.memory
+        f = self.f
         self.set_live(place, self.live(source))
         with f.when(self.live(source)):
-            self.copy_cells(self.library.line_start(self.outs[place], self.line), self.library.line_start(source, self.line))
+            self.copy_cells(
+                self.library.line_start(self.outs[place], self.line),
+                self.library.line_start(source, self.line),
+            )
 
     def copy_cells(self, to: Value, source: Value) -> None:
         self.f.do(self.library.lazily("copy_line", self._copy_line)(to, source))
@@ -216,7 +221,7 @@ class CellLoop:
                     f.set(alive[i], alive[i] | kept)
                 for i, _ in flags:
                     four = op("i64.extend_i32_u", op("i32x4.bitmask", found[i]))
-                    f.set(bits[i], bits[i] | (four << op("i64.extend_i32_u", column)))
+                    f.set(bits[i], bits[i] | (four << counted(column)))
             for i, _ in flags:
                 value: Value = bits[i]
                 if not memory.whole:
@@ -257,7 +262,7 @@ class CellLoop:
 
     def lay(self) -> None:
         """A line of all choices: chunk by chunk in which a choice holds, one choice after the other."""
-        f, library, memory = self.f, self.library, self.memory
+        f, library = self.f, self.library
         chains = []
         for out in self.loop.outs:
             chain, node = [], out.value
@@ -282,8 +287,8 @@ class CellLoop:
             for level, mask in enumerate(masks):
                 with f.scope():
                     left = f.let(self.flags(self.held[mask], at))
-                    with f.block() as out, f.loop() as again:
-                        f.jump(out, op("i64.eqz", left))
+                    with f.block() as done, f.loop() as again:
+                        f.jump(done, op("i64.eqz", left))
                         nibble = f.let(op("i64.ctz", left) & (WORD - CHUNK))
                         self.column, self.at = f.let(x + op("i32.wrap_i64", nibble)), at
                         four = splat(op("i32.wrap_i64", left >> nibble))
@@ -295,14 +300,18 @@ class CellLoop:
                             running = f.let(load("v128.load", place))
                             values.known[id(chain[level].args[2])] = running
                         for i, (chain, _) in enumerate(chains):
-                            value = choose(chosen, values.of(chain[level].args[1]), values.known[id(chain[level].args[2])])
+                            value = choose(
+                                chosen,
+                                values.of(chain[level].args[1]),
+                                values.known[id(chain[level].args[2])],
+                            )
                             f.store("v128.store", lines[i] + (self.column << 2), value)
                         f.jump(again)
         for start in lines:
             library.finish_line(f, start)
 
 
-class Chunks(CellValues):
+class Chunks(CellValues[Value]):
     """Values of four cells: floats, or flags as lanes of ones."""
 
     def __init__(self, loop: CellLoop, words: dict[str, Local]):
@@ -318,7 +327,7 @@ class Chunks(CellValues):
         if node.op == "param":
             number = self.memory.layout.param_planes[param_key(node)]
             return op("i32.wrap_i64", load("i64.load", self.loop.lane, self.memory.at("params", number)))
-        return op("i32.wrap_i64", self.words[str(node.attr)] >> op("i64.extend_i32_u", self.loop.column))
+        return op("i32.wrap_i64", self.words[str(node.attr)] >> counted(self.loop.column))
 
     def spread(self, bits: Value) -> Value:
         """Four bits as lanes."""
@@ -326,7 +335,11 @@ class Chunks(CellValues):
 
     def node(self, node: Node) -> Value:
         value = self._node(node)
-        return value if isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2 else self.f.let(value)
+        return (
+            value
+            if isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2
+            else self.f.let(value)
+        )
 
     def _node(self, node: Node) -> Value:
         attr, args = node.attr, [self.known[id(arg)] for arg in node.args if id(arg) in self.known]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from powderdsl.system.random import MASK, START_0, START_1
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Module, Value, const, load, op, vector
-from powderdsl.targets.wasm.memory import HALOED, HEADER, NEXT, REFS, SOME, WORD, Memory, aligned
+from powderdsl.targets.wasm.memory import HALOED, HEADER, NEXT, REFS, SOME, WORD, Memory
 
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B
@@ -45,6 +45,11 @@ def word(address: Value, offset: int = 0) -> Value:
     return load("i32.load", address, offset)
 
 
+def counted(value: Value) -> Value:
+    """An i32 as i64, unsigned."""
+    return op("i64.extend_i32_u", value)
+
+
 ZERO = const("i32", 0)
 
 
@@ -67,6 +72,9 @@ class Library:
         self.calm, self.zeros, self.group = variable("i32"), variable("i32"), variable("i32")
         """A field without a live line; a line of zeros; the group that runs."""
         self.present = variable("i64")
+        self.world_rows = variable("i32")
+        """Rows of a world; 0 before the first batch."""
+        self.scratch, self.scratch_end = variable("i32"), variable("i32")
         self.bump = self._bump()
         self.take = self._take("take", self.planes, self.plane_size.value)
         self.take_field = self._take("take_field", self.fields, self.field_size.value)
@@ -303,10 +311,10 @@ class Library:
         with f.each(ZERO, bits):
             (drawn,) = self.ahead(f, number, keys, 1)
             f.store("v128.store", scratch, drawn)
-            bit = (load("i64.load", scratch + lane) >> op("i64.extend_i32_u", column)) & 1
+            bit = (load("i64.load", scratch + lane) >> counted(column)) & 1
             f.set(total, (total << 1) + bit)
         half = op("f64.add", op("f64.convert_i64_u", total), const("f64", 0.5))
-        count = op("f64.convert_i64_u", const("i64", 1) << op("i64.extend_i32_u", bits))
+        count = op("f64.convert_i64_u", const("i64", 1) << counted(bits))
         f.give(op("f32.demote_f64", op("f64.div", half, count)))
         return self.module.add(f, "draw_float")
 
@@ -401,10 +409,16 @@ class Library:
     def line(self, field: Value, line: Value) -> Value:
         """The first column of a line, or of zeros."""
         start = field + self.live_size.value + line * (4 * self.memory.stride)
-        return either(load("i32.load8_u", field + line, HEADER), start + (HEADER + 4 * self.memory.halo), self.zeros.value)
+        return either(
+            load("i32.load8_u", field + line, HEADER),
+            start + (HEADER + 4 * self.memory.halo),
+            self.zeros.value,
+        )
 
     def line_start(self, field: Value, line: Value) -> Value:
-        return field + self.live_size.value + line * (4 * self.memory.stride) + (HEADER + 4 * self.memory.halo)
+        return (
+            field + self.live_size.value + line * (4 * self.memory.stride) + (HEADER + 4 * self.memory.halo)
+        )
 
     def other_line(self, line: Value, dy: int, *, wraps: bool) -> Value:
         """The line `dy` below; outside the world, one that is never live."""
@@ -419,6 +433,3 @@ class Library:
         for i in range(reach):
             for at, source in ((width + i, i % width), (-1 - i, (width - 1 - i) % width)):
                 f.store("i32.store", before, word(before, 4 * (halo + source)), 4 * (halo + at))
-
-
-__all__ = ["Library", "aligned", "choose", "either", "some", "splat", "word"]

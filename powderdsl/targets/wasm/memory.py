@@ -135,5 +135,3 @@ class Memory:
     def table(self, dy: int, *, wraps: bool) -> int:
         """Where the pointer to a table of lines lies: for each line, the one `dy` below it in its world."""
         return self.at("lines", 2 * (dy + self.extent.lines) + (not wraps), 4)
-
-

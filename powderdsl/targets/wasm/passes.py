@@ -6,7 +6,19 @@ from collections.abc import Iterable, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node
 from powderdsl.schedule.empty import is_whole
-from powderdsl.schedule.types import Carried, Compute, Forget, Guard, Move, Out, Release, Schedule, Statement, Sweeps, Var
+from powderdsl.schedule.types import (
+    Carried,
+    Compute,
+    Forget,
+    Guard,
+    Move,
+    Out,
+    Release,
+    Schedule,
+    Statement,
+    Sweeps,
+    Var,
+)
 from powderdsl.schedule.updates import is_cleared
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
 from powderdsl.targets.wasm.cells import sweep
@@ -138,7 +150,11 @@ class Pass:
         f = self.f
         asked = ZERO
         for node in guard.when:
-            asked = self.library.some(self.of(node)) if asked is ZERO else asked | self.library.some(self.of(node))
+            asked = (
+                self.library.some(self.of(node))
+                if asked is ZERO
+                else asked | self.library.some(self.of(node))
+            )
         for var, _ in guard.keeps:
             self.declare(var)
         with f.when(asked):
@@ -202,17 +218,26 @@ class Pass:
             for name in made.haloed:
                 f.do(library.edges(self.vars[name]))
             function = made.made()
-            f.do(function(*(self.read(name) for name in made.reads), *(self.vars[o.var.name] for o in loop.outs)))
+            f.do(
+                function(
+                    *(self.read(name) for name in made.reads), *(self.vars[o.var.name] for o in loop.outs)
+                )
+            )
 
     def whole(self, out: Out) -> None:
         """An operation on whole planes that tests for empty ones first."""
-        f, library, value = self.f, self.library, out.value
+        library, value = self.library, out.value
         if value.op in ("load", "const"):
             self.define(out.var, self.kept(value))
             return
         args = value.args
+        tests: list[tuple[Value, Value]]
         if value.op == "and":  # kept and not gone
-            kept, gone = (self.of(args[0]), args[1].args[0]) if args[1].op == "not" else (self.of(args[1]), args[0].args[0])
+            kept, gone = (
+                (self.of(args[0]), args[1].args[0])
+                if args[1].op == "not"
+                else (self.of(args[1]), args[0].args[0])
+            )
             tests = [(kept, kept), (self.of(gone), kept)]
         elif value.op == "or":
             first, second = map(self.of, args)

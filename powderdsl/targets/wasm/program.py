@@ -55,8 +55,8 @@ class _Instance:
         self.module = module
         self.store = wasmtime.Store(module.engine)
         exports = wasmtime.Instance(self.store, module.module, []).exports(self.store)
-        self.functions = {name: exports[name] for name in exports if name != "memory"}
-        self.memory: wasmtime.Memory = exports["memory"]
+        self.functions: dict[str, Any] = {name: exports[name] for name in exports}
+        self.memory: Any = self.functions["memory"]
 
     def call(self, name: str, *args: float) -> Any:
         return self.functions[name](self.store, *args)

@@ -12,7 +12,7 @@ from powderdsl.schedule.stages import WASM, plan
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.layout import Layout, layout_of
 from powderdsl.targets.wasm.binary import Module
-from powderdsl.targets.wasm.driver import Driver
+from powderdsl.targets.wasm.driver import add_driver
 from powderdsl.targets.wasm.library import PAGE, Library
 from powderdsl.targets.wasm.memory import Memory, extent_of
 from powderdsl.targets.wasm.passes import pass_function
@@ -43,5 +43,5 @@ def wasm_module(program: Program, width: int) -> WasmModule:
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
-    Driver(library, program, passes, reduce(or_, map(asked_ids, schedules), 0)).add()
+    add_driver(library, program, passes, reduce(or_, map(asked_ids, schedules), 0))
     return WasmModule(module, layout, width)

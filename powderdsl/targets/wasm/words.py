@@ -46,7 +46,9 @@ class WordLoop:
         self.reads: list[str | tuple[str, int]] = [*names, *dict.fromkeys(made)]
         masks = self.mask_names = [str(node.attr) for node in asked(loop)] if self.updates else []
         self.reads += [name for name in masks if name not in self.reads]
-        self.haloed = list(dict.fromkeys(str(n.args[0].attr) for n in self.nodes if n.op == "shift" and n.attr[0]))
+        self.haloed = list(
+            dict.fromkeys(str(n.args[0].attr) for n in self.nodes if n.op == "shift" and n.attr[0])
+        )
         """The planes of which other rows are read."""
         count = len(self.reads) + len(loop.outs)
         self.f = Function(["i32"] * count)
