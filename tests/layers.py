@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 _FRONT = ("diagnostics", "system", "syntax", "model")
 _COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
-_TARGETS = ("targets", "targets.torch", "targets.arrays", "targets.cpp", "targets.cuda")
+_TARGETS = ("targets", "targets.torch", "targets.arrays", "targets.cpp", "targets.wasm", "targets.cuda")
 _BACK = (*_COMPILER, "model.reference", *_TARGETS)
 _STEPS = (
     "simulation.draw",
@@ -54,6 +54,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.torch"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch"),
+    "targets.wasm": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch", "targets.cpp"),
     "compiler": _COMPILER[:-1],
     "simulation": (),
@@ -165,6 +166,7 @@ THIRD_PARTIES: dict[str, Home] = {
     "minari": Home(("datasets.minari",), ()),
     "h5py": Home(("datasets.minari",), ()),
     "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
+    "wasmtime": Home(("targets.wasm.program",), ("targets.wasm.program",)),
     "click": Home(("cli",), ("cli",)),
     "matplotlib": Home(("experiments.bench", "experiments.studies", "cli"), ()),
     "ray": Home(("experiments.studies.cluster",), ()),

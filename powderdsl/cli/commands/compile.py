@@ -113,6 +113,9 @@ def _schedules(
 SHOWN_SHARED = 227 << 10
 """Bytes of shared memory of the GPU for which kernels are shown, on a grid of 64 × 64."""
 
+SHOWN_WIDTH = 64
+"""Columns of the grid for which WebAssembly is shown."""
+
 
 def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[str]:
     """The generated source of a backend: part by part, where planes cannot carry all passes."""
@@ -133,6 +136,10 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
             from powderdsl.targets.cpp.source import native_source
 
             yield native_source(part.planes).text
+        elif backend == "wasm":
+            from powderdsl.targets.wasm.source import wasm_module
+
+            yield wasm_module(part.planes, SHOWN_WIDTH).module.listing(pass_name)
         elif backend == "cuda":
             from powderdsl.targets.cuda.source import cuda_source
 

@@ -274,8 +274,8 @@ class CellLoop:
         bases = [self.held[str(base.attr)] for _, base in chains]
         any_flag = f.let(self.row_flags(list(dict.fromkeys(masks))))
         with f.when(op("i32.eqz", any_flag)):
-            for i, base in enumerate(bases):
-                self.copy(i, base)
+            for i, field in enumerate(bases):
+                self.copy(i, field)
             f.jump(self.skip)
         self.find_starts()
         lines = []
