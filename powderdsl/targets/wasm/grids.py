@@ -41,6 +41,7 @@ class Grid:
         f.store("i32.store", library.everything.value, const("i32", 1), SOME)
         f.set(library.calm, library.take_field())
         f.set(library.zeros, library.bump(const("i32", 4 * memory.stride + 64 & ~15)) + 4 * memory.halo)
+        f.store("i32.store", const("i32", memory.at("rows")), library.bump((rows << 2) + 31 & ~15))
         columns = const("i32", memory.at("columns") + 4 * memory.halo)
         with f.each(ZERO, const("i32", 4 * memory.width), 4) as at:
             f.store("i32.store", columns + at, const("i32", -1))

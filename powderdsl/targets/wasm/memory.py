@@ -76,6 +76,7 @@ class Memory:
             ("fixed", 4 * len(layout.fixed)),
             ("lines", 4 * 2 * (2 * self.extent.lines + 1)),
             ("moving", 4 * (len(layout.planes) + 1)),
+            ("rows", 4),
             ("change", 2 * self.row),
             ("columns", 4 * self.stride),
         ):

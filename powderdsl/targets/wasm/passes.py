@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from powderdsl.ir.ops import FLAG, REAL, Node
+from powderdsl.ir.ops import FLAG, REAL, Node, Offset
 from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import (
-    Carried,
     Compute,
     Forget,
     Guard,
@@ -24,6 +23,8 @@ from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const,
 from powderdsl.targets.wasm.cells import sweep
 from powderdsl.targets.wasm.library import ZERO, Library, word
 from powderdsl.targets.wasm.memory import SOME
+from powderdsl.targets.wasm.moves import move as in_place
+from powderdsl.targets.wasm.moves import moves_in_place
 from powderdsl.targets.wasm.words import WordLoop
 
 ONE = const("i32", 1)
@@ -261,50 +262,36 @@ class Pass:
         """Planes that move; those that nothing moves stay as they are."""
         f, library = self.f, self.library
         movers = self.of(move.movers)
-        unmoved = [plane for plane in move.planes if leaves(plane, move.movers) is None]
-        if unmoved:
-            self.loop(self.moved(move, move.planes))
-            self.give_old(move)
+        if not moves_in_place(move):
+            self.loop(self.moved(move))
+            for plane in move.planes:
+                if plane.into:
+                    f.do(library.give(self.of(plane.old)))
             return
         for plane in move.planes:
-            self.declare(plane.new)
-        with f.when(library.some(movers)):
-            self.loop(self.moved(move, move.planes))
-            self.give_old(move)
-            f.otherwise()
-            for plane in move.planes:
-                self.define(plane.new, self.of(plane.old) if plane.into else self.kept(plane.old))
+            self.define(plane.new, self.of(plane.old) if plane.into else self.kept(plane.old))
+        with f.when(library.some(movers)), f.scope():
+            targets = self.shifted(move.movers, move.offset)
+            in_place(library, f, move, movers, [self.vars[plane.new.name] for plane in move.planes], targets)
 
-    def give_old(self, move: Move) -> None:
-        for plane in move.planes:
-            if plane.into:
-                self.f.do(self.library.give(self.of(plane.old)))
+    def shifted(self, movers: Node, offset: Offset) -> Callee:
+        """A function that makes the plane of targets: movers, it."""
+        value = self.seen(movers, -offset[0], -offset[1])
+        loop = Compute((Out(Var("targets", FLAG), value),), "", "words")
+        return WordLoop(self.library, loop).made()
 
-    def moved(self, move: Move, planes: Sequence[Carried]) -> Compute:
+    def seen(self, node: Node, dy: int, dx: int) -> Node:
+        """A plane at a neighbor."""
+        return self.schedule.graph.node("shift", FLAG, (node,), (dy, dx, True))
+
+    def moved(self, move: Move) -> Compute:
         """A movement as a loop over words."""
         graph, (dy, dx) = self.schedule.graph, move.offset
-
-        def seen(node: Node, dy: int, dx: int) -> Node:
-            return graph.node("shift", FLAG, (node,), (dy, dx, True))
-
         outs = []
-        targets = seen(move.movers, -dy, -dx)
-        for plane in planes:
-            value = graph.node("select", FLAG, (targets, seen(plane.old, -dy, -dx), plane.leaves))
+        targets = self.seen(move.movers, -dy, -dx)
+        for plane in move.planes:
+            value = graph.node("select", FLAG, (targets, self.seen(plane.old, -dy, -dx), plane.leaves))
             if move.op == "swap":
-                value = graph.node("select", FLAG, (move.movers, seen(plane.old, dy, dx), value))
+                value = graph.node("select", FLAG, (move.movers, self.seen(plane.old, dy, dx), value))
             outs.append(Out(plane.new, value))
         return Compute(tuple(outs), move.place, "words")
-
-
-def leaves(plane: Carried, movers: Node) -> str | None:
-    """What movers leave behind: nothing, everything, or the same; None if it is something else."""
-    old, rest = plane.old, plane.leaves
-    if rest is old:
-        return "same"
-    if rest.op not in ("and", "or") or old not in rest.args:
-        return None
-    (other,) = (arg for arg in rest.args if arg is not old)
-    if rest.op == "or":
-        return "everything" if other is movers else None
-    return "nothing" if other.op == "not" and other.args[0] is movers else None

@@ -1,0 +1,193 @@
+"""Movements in place: planes change only in rows that movers leave or enter.
+
+Rows are visited so that the row which movers enter comes before theirs. Then a row's old flags are still there when the
+movers that it holds arrive elsewhere; those of the row before wait in a register, or in a row beside the planes. What
+comes around the edge waits in the planes' halos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+from powderdsl.ir.ops import Node
+from powderdsl.schedule.types import Carried, Move
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.library import ZERO, Library, choose, some, word
+from powderdsl.targets.wasm.memory import HALOED, SOME
+
+Leaves = Literal["same", "nothing", "everything"]
+TOGETHER = 4
+"""Planes that a loop over rows of one word changes, since each waits for what it reads."""
+
+
+def leaves_of(plane: Carried, movers: Node) -> Leaves | None:
+    """What movers leave behind, if it is one of these."""
+    old, rest = plane.old, plane.leaves
+    if rest is old:
+        return "same"
+    if rest.op not in ("and", "or") or old not in rest.args:
+        return None
+    (other,) = (arg for arg in rest.args if arg is not old)
+    if rest.op == "or":
+        return "everything" if other is movers else None
+    return "nothing" if other.op == "not" and other.args[0] is movers else None
+
+
+def moves_in_place(move: Move) -> bool:
+    """Whether a movement needs no copies: swaps reach the next row only."""
+    near = move.op == "arrive" or abs(move.offset[0]) <= 1
+    kinds = {leaves_of(plane, move.movers) for plane in move.planes}
+    return near and None not in kinds and (move.op == "arrive" or kinds == {"same"})
+
+
+def rows_that_move(library: Library, downwards: bool) -> Callee:
+    """Lists the rows that movers leave or enter, if they move downwards from the bottom: planes of movers and of their
+    targets → the end of the list.
+    """
+    return library.lazily(("rows", downwards), lambda: _rows_that_move(library, downwards))
+
+
+def _rows_that_move(library: Library, downwards: bool) -> Callee:
+    f, memory = library.function("i32 i32", "i32"), library.memory
+    movers, targets = f.param(0), f.param(1)
+    end = f.let(word(ZERO, memory.at("rows")))
+    cells = library.cells.value
+    at = f.let(cells - memory.row if downwards else ZERO)
+    with f.each(ZERO, cells, memory.row), f.scope():
+        found = const("v128", 0)
+        if memory.words <= 4:
+            for w in range(memory.words):
+                for plane in (movers, targets):
+                    found = found | load("v128.load", plane + at, memory.base + 16 * w)
+        else:
+            total = f.let(found)
+            with f.each(at, at + memory.row, 16) as one:
+                for plane in (movers, targets):
+                    f.set(total, total | load("v128.load", plane + one, memory.base))
+            found = total
+        f.store("i32.store", end, at)
+        f.set(end, end + (some(found) << 2))
+        f.set(at, at - memory.row if downwards else at + memory.row)
+    f.give(end)
+    return library.module.add(f, "rows_that_move")
+
+
+def mover(library: Library, kind: str, offset: tuple[int, int], leaves: Leaves) -> Callee:
+    """Moves planes: those of movers and targets, the end of the list of rows, the end of the table of planes."""
+    key = ("mover", kind, offset, leaves)
+    return library.lazily(key, lambda: _Mover(library, kind, offset, leaves).made())
+
+
+class _Mover:
+    def __init__(self, library: Library, kind: str, offset: tuple[int, int], leaves: Leaves):
+        self.library, self.memory, self.kind, self.leaves = library, library.memory, kind, leaves
+        self.dy, self.dx = offset
+        self.f = library.function("i32 i32 i32 i32")
+        self.movers, self.targets, self.rows_end, self.end = (self.f.param(i) for i in range(4))
+
+    def made(self) -> Callee:
+        f, memory = self.f, self.memory
+        place = f.let(const("i32", memory.at("moving")))
+        for count in (TOGETHER, 1) if memory.words == 1 else (1,):
+            with f.block() as out, f.loop() as again, f.scope():
+                f.jump(out, self.end < place + 4 * count)
+                planes = [f.let(word(place, 4 * i)) for i in range(count)]
+                self.rows(planes)
+                for plane in planes:
+                    f.store("i32.store", plane, ZERO, HALOED)
+                f.set(place, place + 4 * count)
+                f.jump(again)
+        name = f"{self.kind}_{self.dy}_{self.dx}_{self.leaves}"
+        return self.library.module.add(f, name)
+
+    def rows(self, planes: Sequence[Local]) -> None:
+        f, memory = self.f, self.memory
+        carries = self.kind == "swap" and self.dy != 0
+        edge = self.library.cells.value if self.dy > 0 else const("i32", -memory.row)
+        edges = [plane + edge + memory.base for plane in planes]
+        if memory.words == 1:
+            before = [f.let(load("v128.load", edge)) for edge in edges] if carries else []
+        else:
+            before = [f.let(edges[0])]
+            self.here = f.let(const("i32", memory.at("change")))
+        entry = f.let(word(ZERO, memory.at("rows")))
+        with f.each(entry, self.rows_end, 4) as listed, f.scope():
+            at = f.let(word(listed))
+            if memory.words == 1:
+                self.row(planes, before if carries else [], at)
+            else:
+                self.long_row(planes[0], before[0], at)
+
+    def row(self, planes: Sequence[Local], before: Sequence[Local], at: Local) -> None:
+        """A row of one word, in several planes."""
+        f, memory, dx = self.f, self.memory, self.dx
+        m, t = (f.let(load("v128.load", plane + at, memory.base)) for plane in (self.movers, self.targets))
+        olds = [f.let(load("v128.load", plane + at, memory.base)) for plane in planes]
+        for i, (plane, old) in enumerate(zip(planes, olds, strict=True)):
+            source = old
+            if self.dy:
+                source = f.let(load("v128.load", plane + at, memory.base - self.dy * memory.row))
+            back = self.library.rotated(f, source, -dx, wraps=True)
+            there = self.library.rotated(f, before[i] if before else old, dx, wraps=True)
+            f.store("v128.store", plane + at, self.moved(m, t, old, there, back), memory.base)
+            if before:
+                f.set(before[i], old)
+
+    def long_row(self, plane: Local, before: Local, at: Local) -> None:
+        """A row of several words, of which the old ones are kept beside the planes."""
+        f, memory, library, dx = self.f, self.memory, self.library, self.dx
+        start = f.let(plane + at + memory.base)
+        with f.each(ZERO, const("i32", memory.row), 16) as w:
+            f.store("v128.store", self.here + w, load("v128.load", start + w))
+        source = f.let(start - self.dy * memory.row) if self.dy else self.here
+        other = before if self.dy else self.here
+        with f.each(ZERO, const("i32", memory.row), 16) as w, f.scope():
+            m, t = (f.let(load("v128.load", p + at + w, memory.base)) for p in (self.movers, self.targets))
+            old = f.let(load("v128.load", self.here + w))
+            x = f.let(w << 2)
+
+            def seen(row: Local, dx: int) -> Value:
+                if not dx:
+                    return load("v128.load", row + w)
+                return library.columns(f, row, w, x, dx, wraps=True)
+
+            there = f.let(seen(other, dx)) if self.kind == "swap" else old
+            back = f.let(seen(source, -dx))
+            f.store("v128.store", start + w, self.moved(m, t, old, there, back))
+        f.set(before, self.here)
+        f.set(self.here, self.here ^ (memory.at("change") ^ memory.at("change") + memory.row))
+
+    def moved(self, m: Value, t: Value, old: Value, there: Value, back: Value) -> Value:
+        if self.kind == "swap":
+            return choose(m, there, choose(t, back, old))
+        left = {"same": old, "nothing": op("v128.andnot", old, m), "everything": old | m}[self.leaves]
+        return choose(t, back, left)
+
+
+def move(
+    library: Library, f: Function, moved: Move, movers: Local, planes: Sequence[Local], targets: Callee
+) -> None:
+    """Move planes, of which there is one owner, in place. `targets` makes the plane of targets: movers, it."""
+    memory, (dy, _) = library.memory, moved.offset
+    entered = f.let(library.take())
+    f.do(library.edges(movers))
+    f.do(targets(movers, entered))
+    rows = f.let(rows_that_move(library, dy > 0)(movers, entered))
+    by_kind: dict[Leaves, list[Local]] = {}
+    for plane, local in zip(moved.planes, planes, strict=True):
+        kind = leaves_of(plane, moved.movers)
+        assert kind is not None
+        by_kind.setdefault(kind, []).append(local)
+    for kind, several in by_kind.items():
+        end = f.let(const("i32", memory.at("moving")))
+        for held in several:
+            with f.when(const("i32", 1) if kind == "everything" else library.some(held)):
+                f.set(held, library.own(held))
+                f.do(library.edges(held))
+                f.store("i32.store", end, held)
+                f.set(end, end + 4)
+                if kind == "everything":
+                    f.store("i32.store", held, const("i32", 1), SOME)
+        f.do(mover(library, moved.op, moved.offset, kind)(movers, entered, rows, end))
+    f.do(library.give(entered))
