@@ -137,9 +137,11 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
 
             yield native_source(part.planes).text
         elif backend == "wasm":
+            from powderdsl.targets.wasm.passes import pass_function_name
             from powderdsl.targets.wasm.source import wasm_module
 
-            yield wasm_module(part.planes, SHOWN_WIDTH).module.listing(pass_name)
+            chosen = None if pass_name is None else pass_function_name(pass_name)
+            yield wasm_module(part.planes, SHOWN_WIDTH).module.listing(chosen)
         elif backend == "cuda":
             from powderdsl.targets.cuda.source import cuda_source
 

@@ -374,8 +374,11 @@ class Module:
         if found.index == len(self._names):
             self._names.append(name)
         if export:
-            self._exports.append(_text(name) + b"\x00" + unsigned(found.index))
+            self.export(found, name)
         return found
+
+    def export(self, function: Callee, name: str) -> None:
+        self._exports.append(_text(name) + b"\x00" + unsigned(function.index))
 
     def variable(self, type: str, start: int = 0) -> Global:
         self._globals.append((type, start))
@@ -401,13 +404,14 @@ class Module:
         return b"".join(found)
 
     def listing(self, only: str | None = None) -> str:
-        """The functions in the notation of the text format, with what their names begin with, if that is given."""
-        functions = [
-            f"(func ${name} ;; {i}, {len(code)} bytes\n{_listing(code, self._names)})"
-            for i, ((_, code), name) in enumerate(zip(self._functions, self._names, strict=True))
-            if only is None or name.startswith(only)
-        ]
-        return "\n".join(functions)
+        """The functions in the notation of the text format; with `only`, one and those that it calls."""
+        names = [f"{name}_{i}" for i, name in enumerate(self._names)]
+        bodies = [_listing(code, names) for _, code in self._functions]
+        wanted = [i for i, name in enumerate(self._names) if only in (None, name)]
+        for i in wanted:  # grows
+            called = {int(line.rpartition("_")[2]) for line in bodies[i].splitlines() if " call $" in line}
+            wanted += sorted(called - set(wanted))
+        return "\n".join(f"(func ${names[i]}\n{bodies[i]})" for i in sorted(set(wanted)))
 
 
 def _vector(items: Sequence[bytes]) -> bytes:

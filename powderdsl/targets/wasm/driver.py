@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 from powderdsl.ir.ops import REAL, Program
 from powderdsl.system.random import MASK
-from powderdsl.targets.wasm.batches import WORLDS, Batches
+from powderdsl.targets.wasm.batches import GROUPS, WORLDS, Batches
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.grids import Grid
 from powderdsl.targets.wasm.library import GOLDEN, ZERO, Library, counted, either, word
@@ -31,12 +31,15 @@ from powderdsl.targets.wasm.memory import HEADER, LANES, SOME
 from powderdsl.targets.wasm.transfer import Transfer
 
 
-def add_driver(library: Library, program: Program, passes: Sequence[Callee], asked: int) -> None:
+def add_driver(
+    library: Library, program: Program, passes: Sequence[Callee], asked: int, *, apart: bool
+) -> None:
     """Add the functions that a host calls.
 
     Args:
         program: on bit planes.
         asked: the ids whose presence passes ask for.
+        apart: export passes too, by their numbers, and what comes before and after them.
     """
     module, batches, cells = library.module, Batches(library), Transfer(library)
     allocate = module.add(batches.allocate(Grid(library).setup()), "allocate", export=True)
@@ -45,7 +48,7 @@ def add_driver(library: Library, program: Program, passes: Sequence[Callee], ask
         (batches.release(), "release"),
         (batches.scratch(), "scratch"),
         (batches.inputs(), "inputs"),
-        (Steps(library, program, passes, asked).run(), "run"),
+        (Steps(library, program, passes, asked).run(apart=apart), "run"),
         (cells.load(), "load"),
         (cells.store(), "store"),
         (cells.load_real(), "load_real"),
@@ -63,31 +66,45 @@ class Steps(Batches):
         super().__init__(library)
         self.program, self.passes, self.asked = program, passes, asked
 
-    def run(self) -> Function:
-        f, library, memory = self.library.function("i32 i32"), self.library, self.memory
+    def run(self, *, apart: bool) -> Function:
+        """Runs a batch. `apart`: what it calls is exported too, so that a host can measure the time of passes."""
+        f, module = self.library.function("i32 i32"), self.library.module
         batch, steps = f.param(0), f.param(1)
-        begin = self._begin()
-        number = f.let(ZERO)
+        enter = module.add(self._enter(), "enter", export=apart)
+        begin = module.add(self._begin(), "begin", export=apart)
+        leave = module.add(self._leave(), "leave", export=apart)
+        if apart:
+            count = self.library.function("i32", "i32")
+            count.give(word(count.param(0), GROUPS))
+            module.add(count, "groups", export=True)
+            for number, one in enumerate(self.passes):
+                module.export(one, str(number))
         with f.block() as nothing:
             f.jump(nothing, op("i32.eqz", steps))
-            with self.each_group(f, batch) as group:
-                f.set(library.group, group)
-                f.set(library.present, load("i64.load", group, memory.present))
-                self._parameters(f, batch, number)
+            with f.each(ZERO, word(batch, GROUPS)) as group:
+                f.do(enter(batch, group))
                 with f.each(ZERO, steps) as step:
-                    f.do(begin(batch, number, step))
-                    self._reset(f)
-                    look = self._look()
-                    if look is not None:
-                        with f.when(op("i64.eq", library.present.value, const("i64", -1))):
-                            f.do(look())
+                    f.do(begin(batch, group, step))
                     for one in self.passes:
                         f.do(one())
-                f.store("i64.store", group, library.present.value, memory.present)
-                f.set(number, number + 1)
+                f.do(leave())
         with f.each(ZERO, word(batch, WORLDS), some=False) as world:
             at = f.let(self.clock(batch, 2, world))
             f.store("i64.store", at, load("i64.load", at) + counted(steps))
+        return f
+
+    def _enter(self) -> Function:
+        """A group becomes the one that runs: batch, number of the group."""
+        f, library, memory = self.library.function("i32 i32"), self.library, self.memory
+        batch, number = f.param(0), f.param(1)
+        f.set(library.group, self.groups(batch) + number * memory.group)
+        f.set(library.present, load("i64.load", library.group.value, memory.present))
+        self._parameters(f, batch, number)
+        return f
+
+    def _leave(self) -> Function:
+        f, library = self.library.function(), self.library
+        f.store("i64.store", library.group.value, library.present.value, self.memory.present)
         return f
 
     def world_of(self, f: Function, batch: Value, number: Value, lane: int) -> Local:
@@ -114,8 +131,8 @@ class Steps(Batches):
                     f.store("i32.store", const("i32", memory.at("reals", i, 8) + 4 * lane), word(values))
                     f.set(values, values + (worlds << 2))
 
-    def _begin(self) -> Callee:
-        """Keys and bits of a step: batch, number of the group, steps that are done."""
+    def _begin(self) -> Function:
+        """What comes before the passes of a step: batch, number of the group, steps that are done."""
         f, library, memory = self.library.function("i32 i32 i32"), self.library, self.memory
         batch, number, done = (f.param(i) for i in range(3))
         strip = f.let(either(library.strips.value, library.rows.value, ZERO) * (-(-memory.width // 32) * 32))
@@ -150,7 +167,12 @@ class Steps(Batches):
                 with f.when(old):
                     f.do(library.give(old))
                     f.store("i32.store", place, ZERO)
-        return library.module.add(f, "begin")
+        self._reset(f)
+        look = self._look()
+        if look is not None:
+            with f.when(op("i64.eq", library.present.value, const("i64", -1))):
+                f.do(look())
+        return f
 
     def _reset(self, f: Function) -> None:
         library, memory = self.library, self.memory

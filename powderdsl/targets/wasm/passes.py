@@ -33,7 +33,12 @@ ONE = const("i32", 1)
 def pass_function(schedule: Schedule, library: Library) -> Callee:
     """The function of a pass."""
     printer = Pass(schedule, library)
-    return library.module.add(printer.made(), f"pass_{schedule.name}")
+    return library.module.add(printer.made(), pass_function_name(schedule.name))
+
+
+def pass_function_name(name: str) -> str:
+    """The name of a pass's function."""
+    return f"pass_{name}"
 
 
 class Pass:

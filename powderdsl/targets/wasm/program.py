@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import ctypes
+import time
 from collections.abc import Iterator, Mapping
+from threading import RLock
 from typing import Any
 
 import torch
 import wasmtime
 from torch import Tensor
+from wasmtime import _ffi
 
 from powderdsl.ir.ops import Program
-from powderdsl.targets.codec import Piece, parameters, pieces
+from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job
+from powderdsl.targets.profiling import PassClock
 from powderdsl.targets.wasm.source import wasm_module
 
 Like = Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
@@ -22,23 +26,24 @@ Like = Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
 class WasmState(Mapping[str, Tensor]):
     """A batch's state in the memory of an instance. Slots are unpacked into tensors one by one, on first access."""
 
-    def __init__(self, instance: _Instance, batch: int, like: Like):
+    def __init__(self, instance: Instance, batch: int, like: Like):
         self.instance, self.batch, self.like = instance, batch, like
         self._tensors: dict[str, Tensor] = {}
 
     def __del__(self) -> None:
-        self.instance.call("release", self.batch)
+        # The collector may come in the middle of a call, of this or another thread: the next call releases it.
+        self.instance.gone.append(self.batch)
 
     def __copy__(self) -> WasmState:
-        return WasmState(self.instance, self.instance.call("copy", self.batch), self.like)
+        with self.instance as call:
+            return WasmState(self.instance, call("copy", self.batch), self.like)
 
     def __deepcopy__(self, memo: Any) -> WasmState:
         return self.__copy__()
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._tensors:
-            dtype, shape = self.like[name]
-            self._tensors[name] = self.instance.read(self.batch, name, torch.empty(shape, dtype=dtype))
+            self._tensors[name] = self.instance.read(self.batch, name, self.like)
         return self._tensors[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -48,75 +53,155 @@ class WasmState(Mapping[str, Tensor]):
         return len(self.like)
 
 
-class _Instance:
-    """An instance of a module, for worlds of one number of rows."""
+class Functions:
+    """The functions of an instance. Arguments and results are i32, without checks: `Func` takes 20 µs a call."""
 
-    def __init__(self, module: _Loaded):
-        self.module = module
-        self.store = wasmtime.Store(module.engine)
-        exports = wasmtime.Instance(self.store, module.module, []).exports(self.store)
-        self.functions: dict[str, Any] = {name: exports[name] for name in exports}
-        self.memory: Any = self.functions["memory"]
+    def __init__(self, store: wasmtime.Store, exports: wasmtime.InstanceExports):
+        self._context = store._context()
+        self._functions = {name: one._func for name, one in exports.items() if isinstance(one, wasmtime.Func)}
+        self._raw = (ctypes.c_uint64 * 32)()  # of 16 bytes each
+        self._values = ctypes.cast(self._raw, ctypes.POINTER(_ffi.wasmtime_val_raw_t))
+        self._trap = ctypes.POINTER(_ffi.wasm_trap_t)()
 
-    def call(self, name: str, *args: float) -> Any:
-        return self.functions[name](self.store, *args)
+    def __call__(self, name: str, *args: int) -> int:
+        raw = self._raw
+        for i, arg in enumerate(args):
+            raw[2 * i] = arg
+        function, trap = ctypes.byref(self._functions[name]), ctypes.byref(self._trap)
+        count = max(len(args), 1)
+        error = _ffi.wasmtime_func_call_unchecked(self._context, function, self._values, count, trap)
+        if error or self._trap:
+            raise MemoryError("the worlds do not fit into the memory of a WebAssembly module")
+        return raw[0] & 0xFFFFFFFF
+
+
+class Instance:
+    """An instance of a module, for worlds of one number of rows. As a context, it lets one thread call functions."""
+
+    def __init__(self, loaded: Loaded):
+        self.loaded = loaded
+        self.store = wasmtime.Store(loaded.module_engine)
+        exports = wasmtime.Instance(self.store, loaded.module, []).exports(self.store)
+        self.call = Functions(self.store, exports)
+        self._memory: Any = exports["memory"]
+        self.gone: list[int] = []
+        """Batches that nobody uses any more."""
+        self._lock = RLock()
+        self._inputs: tuple[Mapping[str, Tensor], int, bytes] | None = None
+        """The last parameters, the number of worlds, and what the module takes for them."""
+
+    def __enter__(self) -> Functions:
+        self._lock.acquire()
+        while self.gone:
+            self.call("release", self.gone.pop())
+        return self.call
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
 
     def address(self, at: int) -> int:
-        """An address in the module's memory as one of this process; memory moves when it grows."""
-        found = ctypes.addressof(self.memory.data_ptr(self.store).contents)
-        return found + at
+        """An address in the module's memory as one of this process; memory may move when it grows."""
+        start = self._memory.data_ptr(self.store)
+        return ctypes.addressof(start.contents) + at
 
     def write(self, at: int, tensor: Tensor) -> None:
         ctypes.memmove(self.address(at), tensor.data_ptr(), tensor.nbytes)
 
     def pack(self, state: Mapping[str, Tensor]) -> tuple[int, Like]:
-        layout = self.module.layout
+        """A new batch with the state."""
+        layout = self.loaded.layout
         worlds, rows, _ = state["element"].shape
         batch = self.call("allocate", worlds, rows)
         like: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {}
-        for name, value in state.items():
-            value = value.contiguous()
+        for name, given in state.items():
+            value = given.contiguous()
+            size = value.element_size()
             like[name] = (value.dtype, tuple(value.shape))
             at = self.call("scratch", value.nbytes)
             self.write(at, value)
-            for piece in self.module.pieces[name]:
-                begin = at + piece.of(value).storage_offset() * value.element_size()
+            for piece in self.loaded.pieces[name]:
+                begin = at + int(piece.of(value).storage_offset()) * size
                 if piece.is_real:
-                    apart = value.stride(0) * value.element_size()
-                    self.call("load_real", batch, layout.reals[piece.slot], begin, apart)
+                    self.call("load_real", batch, layout.reals[piece.slot], begin, value.stride(0) * size)
                 else:
                     first = layout.planes[piece.planes[0]]
-                    self.call("load", batch, first, len(piece.planes), value.element_size(), begin)
+                    self.call("load", batch, first, len(piece.planes), size, begin)
         return batch, like
 
-    def read(self, batch: int, name: str, out: Tensor) -> Tensor:
-        """One slot, written into a contiguous tensor of its storage dtype; returns it."""
-        layout, size = self.module.layout, out.element_size()
-        at = self.call("scratch", out.nbytes)
-        for piece in self.module.pieces[name]:
-            begin = at + piece.of(out).storage_offset() * size
-            if piece.is_real:
-                self.call("store_real", batch, layout.reals[piece.slot], begin, out.stride(0) * size)
-            else:
-                first = layout.planes[piece.planes[0]]
-                self.call("store", batch, first, len(piece.planes), int(piece.signed), size, begin)
-        ctypes.memmove(out.data_ptr(), self.address(at), out.nbytes)
+    def read(self, batch: int, name: str, like: Like) -> Tensor:
+        """One slot as a new tensor of its storage dtype."""
+        layout = self.loaded.layout
+        dtype, shape = like[name]
+        out = torch.empty(shape, dtype=dtype)
+        size = out.element_size()
+        with self as call:
+            at = call("scratch", out.nbytes)
+            for piece in self.loaded.pieces[name]:
+                begin = at + int(piece.of(out).storage_offset()) * size
+                if piece.is_real:
+                    call("store_real", batch, layout.reals[piece.slot], begin, out.stride(0) * size)
+                else:
+                    first = layout.planes[piece.planes[0]]
+                    call("store", batch, first, len(piece.planes), int(piece.signed), size, begin)
+            ctypes.memmove(out.data_ptr(), self.address(at), out.nbytes)
         return out
 
+    def set_inputs(self, batch: int, job: Job, worlds: int) -> None:
+        """The clocks and parameters of a job."""
+        if self._inputs is None or self._inputs[0] is not job.params or self._inputs[1] != worlds:
+            layout = self.loaded.layout
+            planes, reals = parameters(
+                job.params, layout.param_planes, layout.param_reals, worlds, torch.device("cpu")
+            )
+            bits = bytes(planes[: len(layout.param_planes)].numpy())
+            padding = bytes(-len(bits) - 8 * worlds & 15)  # the values begin at a multiple of 16 bytes
+            values = bytes(reals[: len(layout.param_reals)].numpy())
+            self._inputs = (job.params, worlds, bits + padding + values)
+        at = self.address(self.call("inputs", batch))
+        for part in (job.clock.seed, job.clock.world, job.clock.step):
+            ctypes.memmove(at, part.contiguous().data_ptr(), 8 * worlds)
+            at += 8 * worlds
+        ctypes.memmove(at, self._inputs[2], len(self._inputs[2]))
 
-class _Loaded:
-    """A module, ready to be instantiated, and its numbers."""
+    def run(self, batch: int, job: Job, worlds: int) -> None:
+        """Run a batch, and measure the time of passes if the job asks for it."""
+        self.set_inputs(batch, job, worlds)
+        if job.timing is None:
+            self.call("run", batch, job.steps)
+            return
+        groups = self.call("groups", batch)
+        for group in range(groups):
+            self.call("enter", batch, group)
+            for step in range(job.steps):
+                self.call("begin", batch, group, step)
+                self._timed(job.timing)
+            self.call("leave")
 
-    def __init__(self, engine: wasmtime.Engine, program: Program, planes: Program, width: int):
-        made = wasm_module(planes, width)
-        self.engine, self.module = engine, wasmtime.Module(engine, made.code)
-        self.layout = made.layout
-        self.pieces: dict[str, tuple[Piece, ...]] = pieces(program)
-        self._instances: dict[tuple[int, bool], _Instance] = {}
+    def _timed(self, clock: PassClock) -> None:
+        for number, name in enumerate(self.loaded.passes):
+            before = time.perf_counter()
+            self.call(str(number))
+            clock.add(name, time.perf_counter() - before)
 
-    def instance(self, worlds: int, rows: int) -> _Instance:
+
+class Loaded:
+    """A module for grids of one width, ready to be instantiated, and its numbers."""
+
+    def __init__(
+        self, engine: wasmtime.Engine, program: Program, planes: Program, width: int, *, apart: bool
+    ):
+        made = wasm_module(planes, width, apart=apart)
+        self.module_engine, self.module = engine, wasmtime.Module(engine, made.code)
+        self.layout, self.pieces = made.layout, pieces(program)
+        self.passes = tuple(one.name for one in planes.passes)
+        self._instances: dict[tuple[int, bool], Instance] = {}
+
+    def instance(self, worlds: int, rows: int) -> Instance:
         """The instance for a shape. Whether lanes are strips depends on the rows and on whether there is one world."""
-        return self._instances.setdefault((rows, worlds == 1), _Instance(self))
+        key = (rows, worlds == 1)
+        if key not in self._instances:
+            self._instances[key] = Instance(self)
+        return self._instances[key]
 
 
 class WasmProgram:
@@ -130,33 +215,29 @@ class WasmProgram:
     def __init__(self, program: Program, planes: Program):
         self._program, self._planes = program, planes
         self._engine = wasmtime.Engine()
-        self._modules: dict[int, _Loaded] = {}
+        self._modules: dict[tuple[int, bool], Loaded] = {}
 
-    def module(self, width: int) -> _Loaded:
-        if width not in self._modules:
-            self._modules[width] = _Loaded(self._engine, self._program, self._planes, width)
-        return self._modules[width]
+    def loaded(self, width: int, *, apart: bool = False) -> Loaded:
+        """The module for a width; `apart`: one whose passes can be called one by one."""
+        key = (width, apart)
+        if key not in self._modules:
+            self._modules[key] = Loaded(self._engine, self._program, self._planes, width, apart=apart)
+        return self._modules[key]
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
-        state, clock = job.state, job.clock
-        element = state.like["element"][1] if isinstance(state, WasmState) else state["element"].shape
-        worlds, rows, width = element
-        module = self.module(width)
-        instance = module.instance(worlds, rows)
-        if isinstance(state, WasmState) and state.instance is instance:
-            batch, like = instance.call("copy", state.batch), state.like
-        else:
-            batch, like = instance.pack(state)
-        bits, values = parameters(
-            job.params, module.layout.param_planes, module.layout.param_reals, worlds, torch.device("cpu")
-        )
-        at = instance.call("inputs", batch)
-        for part in (clock.seed, clock.world, clock.step):
-            instance.write(at, part.to(torch.int64).contiguous())
-            at += 8 * worlds
-        instance.write(at, bits[: len(module.layout.param_planes)].contiguous())
-        at += worlds * len(module.layout.param_planes)
-        instance.write((at + 15) & ~15, values[: len(module.layout.param_reals)].contiguous())
-        instance.call("run", batch, job.steps)
+        assert not job.draws
+        assert job.passes is None
+        state = job.state
+        shape = state.like["element"][1] if isinstance(state, WasmState) else state["element"].shape
+        worlds, rows, width = shape
+        instance = self.loaded(width, apart=job.timing is not None).instance(worlds, rows)
+        if isinstance(state, WasmState) and state.instance is not instance:
+            state = dict(state)
+        with instance as call:
+            if isinstance(state, WasmState):
+                batch, like = call("copy", state.batch), state.like
+            else:
+                batch, like = instance.pack(state)
+            instance.run(batch, job, worlds)
         return WasmState(instance, batch, like)

@@ -35,13 +35,13 @@ class WasmModule:
 
 
 @collection_paused()
-def wasm_module(program: Program, width: int) -> WasmModule:
-    """The module of a program on planes, for grids of this width."""
+def wasm_module(program: Program, width: int, *, apart: bool = False) -> WasmModule:
+    """The module of a program on planes, for grids of this width. `apart`: passes are exported too, by their numbers."""
     layout = layout_of(program)
     schedules = [plan(pass_, WASM) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout)
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
-    add_driver(library, program, passes, reduce(or_, map(asked_ids, schedules), 0))
+    add_driver(library, program, passes, reduce(or_, map(asked_ids, schedules), 0), apart=apart)
     return WasmModule(module, layout, width)
