@@ -244,7 +244,7 @@ def test_peak_memory_sees_what_was_freed():
 # What passes cost
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
 def test_every_backend_profiles_every_pass(backend, tmp_path, torch):
     rules = powderdsl.load("core+sand")  # little to compile
     with building(Building("-O0", tmp_path)):

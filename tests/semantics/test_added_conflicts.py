@@ -65,7 +65,7 @@ def under_caret(one: Diagnostic) -> tuple[str, str]:
     return Path(span.source.name).name, span.text
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
 def test_the_rule_that_stands_first_holds(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     skip_without_compiler(backend)
     ruleset, (warning,) = load(CHANGE, GEYSER)

@@ -21,7 +21,7 @@ def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:
     return powderdsl.compile(rules, backend=backend)
 
 
-@pytest.mark.parametrize("backend", ["torch", "arrays", "native"])
+@pytest.mark.parametrize("backend", ["torch", "arrays", "native", "wasm"])
 @pytest.mark.parametrize("name", RULESETS)
 def test_same_worlds(name: str, backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     rules = powderdsl.load(name)
@@ -54,7 +54,7 @@ def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyp
     rates = torch.tensor([0.0, 0.3, 1.0], dtype=torch.float64)
     ids = torch.randint(14, (3, 8, 40), generator=torch.Generator().manual_seed(1))
     oracle = powderdsl.compile(rules, backend="reference")
-    for backend in ("torch", "arrays", "native"):
+    for backend in ("torch", "arrays", "native", "wasm"):
         sim = compiled(rules, backend)
         together = sim.step(sim.world(ids, seed=4), 3, params={"water.melt": rates, "fire.spread": rates})
         for i, rate in enumerate(rates.tolist()):

@@ -53,7 +53,7 @@ def reported(condition: str) -> list[str]:
     return [f"{one.code}: {one.message}" for one in reporter.diagnostics if one.code in wanted]
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
 def test_the_opposite_points_the_other_way(tmp_path, backend):
     skip_without_compiler(backend)
     path = tmp_path / "compass.yaml"

@@ -78,7 +78,7 @@ def rules(tmp_path_factory):
     return package.load(path)
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
 def test_fresh_cells_have_their_elements_default(rules, backend):
     assert [result.problem for result in run_examples(rules, backend=backend)] == ["", ""]
 

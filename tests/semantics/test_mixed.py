@@ -76,7 +76,7 @@ def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
     assert [any(slot.resets for slot in part.program.slots) for part in parts] == [True, False, False]
 
 
-@pytest.mark.parametrize("backend", ["arrays", "native"])
+@pytest.mark.parametrize("backend", ["arrays", "native", "wasm"])
 def test_the_oracles_worlds(backend: str) -> None:
     """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one at a time."""
     rules = spread("heavy")

@@ -1,4 +1,4 @@
-"""Native code cuts a large world, or one of few, into strips that lie side by side: the worlds are the same."""
+"""Native code and WebAssembly cut large or few worlds into strips that lie side by side: the worlds are the same."""
 
 from __future__ import annotations
 
@@ -23,23 +23,25 @@ SEEDS = range(60, 66)
 """Few, since each takes seconds to compile."""
 
 
-@pytest.fixture(autouse=True)
-def needs_compiler() -> None:
-    skip_without_compiler()
+BACKENDS = ("native", "wasm")
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", ["powderworld", "forest_fire", "langtons_ant", "margolus", "wireworld"])
-def test_shipped_rulesets_in_strips(name: str) -> None:
+def test_shipped_rulesets_in_strips(name: str, backend: str) -> None:
     """With edges that wrap and with nothing outside, parities of rows, floats, draws, and parameters by world."""
+    skip_without_compiler(backend)
     ruleset = load(name)
-    simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("torch", "native")]
+    simulators = [compile_ruleset(ruleset, backend=one) for one in ("torch", backend)]
     for seed, shape in enumerate(STRIPS):
         assert_same(
             ruleset, random_start(ruleset, Choices.seeded(seed), shape), steps=3, simulators=simulators
         )
 
 
-def test_random_rulesets_in_strips(tmp_path: Path) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_random_rulesets_in_strips(backend: str, tmp_path: Path) -> None:
+    skip_without_compiler(backend)
     compared = 0
     for seed in SEEDS:
         try:
@@ -47,7 +49,7 @@ def test_random_rulesets_in_strips(tmp_path: Path) -> None:
         except CompileError:
             continue
         with building(Building("-O0", tmp_path)):
-            simulators = [compile_ruleset(ruleset, backend=backend) for backend in ("torch", "native")]
+            simulators = [compile_ruleset(ruleset, backend=one) for one in ("torch", backend)]
         choices = Choices.seeded(seed)
         for height in (8, 16):
             shape = (choices.integer(1, 4), height, choices.pick((1, 5, 33, 64, 70, 130)))

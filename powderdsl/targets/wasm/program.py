@@ -56,7 +56,7 @@ class WasmState(Mapping[str, Tensor]):
 class Functions:
     """The functions of an instance. Arguments and results are i32, without checks: `Func` takes 20 µs a call."""
 
-    def __init__(self, store: wasmtime.Store, exports: wasmtime.InstanceExports):
+    def __init__(self, store: wasmtime.Store, exports: Mapping[str, Any]):
         self._context = store._context()
         self._functions = {name: one._func for name, one in exports.items() if isinstance(one, wasmtime.Func)}
         self._raw = (ctypes.c_uint64 * 32)()  # of 16 bytes each
@@ -70,7 +70,7 @@ class Functions:
         function, trap = ctypes.byref(self._functions[name]), ctypes.byref(self._trap)
         count = max(len(args), 1)
         error = _ffi.wasmtime_func_call_unchecked(self._context, function, self._values, count, trap)
-        if error or self._trap:
+        if bool(error) or bool(self._trap):
             raise MemoryError("the worlds do not fit into the memory of a WebAssembly module")
         return raw[0] & 0xFFFFFFFF
 
@@ -81,7 +81,7 @@ class Instance:
     def __init__(self, loaded: Loaded):
         self.loaded = loaded
         self.store = wasmtime.Store(loaded.module_engine)
-        exports = wasmtime.Instance(self.store, loaded.module, []).exports(self.store)
+        exports = dict(wasmtime.Instance(self.store, loaded.module, []).exports(self.store).items())
         self.call = Functions(self.store, exports)
         self._memory: Any = exports["memory"]
         self.gone: list[int] = []
