@@ -38,6 +38,9 @@ class Batches:
     def allocate(self, setup: Callee) -> Function:
         f, library, memory = self.library.function("i32 i32", "i32"), self.library, self.memory
         worlds, rows = f.param(0), f.param(1)
+        per_world = 24 + len(self.layout.param_planes) + 4 * len(self.layout.param_reals)
+        library.trap_from(f, worlds, per_world + memory.group)
+        library.trap_from(f, rows, 8 * memory.stride + memory.row)
         with f.when(library.world_rows.value.equals(0)):
             even = (rows & 1).equals(0)
             reachable = (rows >> 1) >= max(1, memory.extent.around)
@@ -48,7 +51,6 @@ class Batches:
                 f.trap()
         count = f.let((worlds + 1) >> op("i32.eqz", library.strips.value))
         f.set(count, either(library.strips.value, worlds, count))
-        per_world = 24 + len(self.layout.param_planes) + 4 * len(self.layout.param_reals)
         size = f.let((worlds * per_world + count * memory.group + (HEADER + 32 + 15)) & ~15)
         before, batch = f.let(ZERO), f.let(library.batches.value)
         with f.block() as found:
@@ -116,6 +118,7 @@ class Batches:
 
     def scratch(self) -> Function:
         f, library = self.library.function("i32", "i32"), self.library
+        library.trap_from(f, f.param(0), 1)
         with f.when(library.scratch_end.value < library.scratch.value + f.param(0)):
             size = f.let((f.param(0) + 79) & ~15)
             f.set(library.scratch, self.library.bump(size))

@@ -102,16 +102,23 @@ class Library:
         """New memory: bytes, a multiple of 16 → address. Traps where the module's limit is reached."""
         f = self.function("i32", "i32")
         place = f.let(self.top.value)
+        with f.when(f.param(0) >= self.module.most * PAGE):
+            f.trap()
         end = f.let(place + f.param(0))
-        size = op("memory.size", tail=b"\0")
-        with f.when(((end + (PAGE - 1)) >> 16) >= size + 1):
-            missing = ((end + (PAGE - 1)) >> 16) - size
-            grown = op("memory.grow", missing, tail=b"\0")
+        pages, size = f.let((end + (PAGE - 1)) >> 16), op("memory.size", tail=b"\0")
+        with f.when(pages >= size + 1):
+            grown = op("memory.grow", pages - size, tail=b"\0")
             with f.when(grown.equals(const("i32", -1))):
                 f.trap()
         f.set(self.top, end)
         f.give(place)
         return self.module.add(f, "bump")
+
+    def trap_from(self, f: Function, count: Value, size: int) -> None:
+        """Trap if items of a size, together with as much again, do not fit into the memory."""
+        bytes = counted(count) * size
+        with f.when(bytes >= self.module.most * PAGE // 2):
+            f.trap()
 
     def _take(self, name: str, free, size: Value) -> Callee:  # type: ignore[no-untyped-def]
         f = self.function("", "i32")

@@ -104,59 +104,70 @@ class Instance:
         start = self._memory.data_ptr(self.store)
         return ctypes.addressof(start.contents) + at
 
-    def write(self, at: int, tensor: Tensor) -> None:
-        ctypes.memmove(self.address(at), tensor.data_ptr(), tensor.nbytes)
+    def memory_size(self) -> int:
+        """The bytes of the module's memory."""
+        return int(self._memory.data_len(self.store))
+
+    def transfers(self, name: str, tensor: Tensor) -> Iterator[dict[str, int]]:
+        """How the pieces of a slot get in and out of a tensor: the number of the field, the bytes from its beginning and
+        from one world to the next; or that of the first plane, how many there are, and the size of a cell.
+        """
+        layout, size = self.loaded.layout, tensor.element_size()
+        for piece in self.loaded.pieces[name]:
+            begin = int(piece.of(tensor).storage_offset()) * size
+            if piece.is_real:
+                apart = tensor.stride(0) * size
+                yield {"number": layout.reals[piece.slot], "planes": 0, "begin": begin, "apart": apart}
+            else:
+                first, count = layout.planes[piece.planes[0]], len(piece.planes)
+                found = {"number": first, "planes": count, "signed": int(piece.signed), "size": size}
+                yield found | {"begin": begin}
 
     def pack(self, state: Mapping[str, Tensor]) -> tuple[int, Like]:
         """A new batch with the state."""
-        layout = self.loaded.layout
         worlds, rows, _ = state["element"].shape
         batch = self.call("allocate", worlds, rows)
         like: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {}
         for name, given in state.items():
             value = given.contiguous()
-            size = value.element_size()
             like[name] = (value.dtype, tuple(value.shape))
             at = self.call("scratch", value.nbytes)
-            self.write(at, value)
-            for piece in self.loaded.pieces[name]:
-                begin = at + int(piece.of(value).storage_offset()) * size
-                if piece.is_real:
-                    self.call("load_real", batch, layout.reals[piece.slot], begin, value.stride(0) * size)
+            ctypes.memmove(self.address(at), value.data_ptr(), value.nbytes)
+            for one in self.transfers(name, value):
+                begin = at + one["begin"]
+                if one["planes"]:
+                    self.call("load", batch, one["number"], one["planes"], one["size"], begin)
                 else:
-                    first = layout.planes[piece.planes[0]]
-                    self.call("load", batch, first, len(piece.planes), size, begin)
+                    self.call("load_real", batch, one["number"], begin, one["apart"])
         return batch, like
 
     def read(self, batch: int, name: str, like: Like) -> Tensor:
         """One slot as a new tensor of its storage dtype."""
-        layout = self.loaded.layout
         dtype, shape = like[name]
         out = torch.empty(shape, dtype=dtype)
-        size = out.element_size()
         with self as call:
             at = call("scratch", out.nbytes)
-            for piece in self.loaded.pieces[name]:
-                begin = at + int(piece.of(out).storage_offset()) * size
-                if piece.is_real:
-                    call("store_real", batch, layout.reals[piece.slot], begin, out.stride(0) * size)
+            for one in self.transfers(name, out):
+                begin = at + one["begin"]
+                if one["planes"]:
+                    call("store", batch, one["number"], one["planes"], one["signed"], one["size"], begin)
                 else:
-                    first = layout.planes[piece.planes[0]]
-                    call("store", batch, first, len(piece.planes), int(piece.signed), size, begin)
+                    call("store_real", batch, one["number"], begin, one["apart"])
             ctypes.memmove(out.data_ptr(), self.address(at), out.nbytes)
         return out
+
+    def input_bytes(self, params: Mapping[str, Tensor], worlds: int) -> bytes:
+        """Parameters as the module takes them, after the clocks."""
+        layout = self.loaded.layout
+        bits, reals = parameters(params, layout.param_planes, layout.param_reals, worlds, torch.device("cpu"))
+        head = bytes(bits[: len(layout.param_planes)].numpy())
+        padding = bytes(-len(head) - 8 * worlds & 15)  # the values begin at a multiple of 16 bytes
+        return head + padding + bytes(reals[: len(layout.param_reals)].numpy())
 
     def set_inputs(self, batch: int, job: Job, worlds: int) -> None:
         """The clocks and parameters of a job."""
         if self._inputs is None or self._inputs[0] is not job.params or self._inputs[1] != worlds:
-            layout = self.loaded.layout
-            planes, reals = parameters(
-                job.params, layout.param_planes, layout.param_reals, worlds, torch.device("cpu")
-            )
-            bits = bytes(planes[: len(layout.param_planes)].numpy())
-            padding = bytes(-len(bits) - 8 * worlds & 15)  # the values begin at a multiple of 16 bytes
-            values = bytes(reals[: len(layout.param_reals)].numpy())
-            self._inputs = (job.params, worlds, bits + padding + values)
+            self._inputs = (job.params, worlds, self.input_bytes(job.params, worlds))
         at = self.address(self.call("inputs", batch))
         for part in (job.clock.seed, job.clock.world, job.clock.step):
             ctypes.memmove(at, part.contiguous().data_ptr(), 8 * worlds)

@@ -1,0 +1,156 @@
+"""The binary format: what is written runs in an engine and means what Python says."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import pytest
+import wasmtime
+
+from powderdsl.targets.wasm.binary import (
+    NAMES,
+    OPCODES,
+    Function,
+    Module,
+    Value,
+    const,
+    load,
+    op,
+    signed,
+    unsigned,
+    vector,
+)
+
+
+def ran(function: Function, *args: float) -> Any:
+    """The result of a function in a module of its own."""
+    module = Module(1, 1)
+    module.add(function, "f", export=True)
+    store = wasmtime.Store()
+    instance = wasmtime.Instance(store, wasmtime.Module(store.engine, module.code()), [])
+    found: Any = instance.exports(store)["f"]
+    return found(store, *args)
+
+
+def value_of(value: Value) -> Any:
+    function = Function((), (value.type,))
+    function.give(value)
+    return ran(function)
+
+
+@pytest.mark.parametrize("number", [0, 1, 63, 64, 127, 128, 300, 1 << 20, (1 << 32) - 1])
+def test_numbers_without_a_sign(number: int) -> None:
+    found = 0
+    for i, octet in enumerate(unsigned(number)):
+        found |= (octet & 127) << 7 * i
+    assert found == number
+    assert unsigned(number)[-1] < 128
+
+
+@pytest.mark.parametrize("type", ["i32", "i64"])
+@pytest.mark.parametrize("number", [0, 1, -1, 63, 64, -64, -65, 1 << 20, 1 << 30, -(1 << 31)])
+def test_constants(type: str, number: int) -> None:
+    assert value_of(const(type, number)) == number
+    assert len(signed(number)) <= 5
+
+
+@pytest.mark.parametrize("number", [0.1, -0.0, 1e30, 1e-40])
+def test_float_constants_are_exact(number: float) -> None:
+    wanted = struct.pack("<f", number)
+    assert struct.pack("<f", value_of(const("f32", number))) == wanted
+
+
+def test_operators() -> None:
+    seven, three = const("i32", 7), const("i32", 3)
+    assert value_of(seven + three) == 10
+    assert value_of(seven - three) == 4
+    assert value_of(seven * three) == 21
+    assert value_of(seven % three) == 1
+    assert value_of(seven // three) == 2
+    assert value_of(seven & three) == 3
+    assert value_of(seven ^ three) == 4
+    assert value_of(seven << three) == 56
+    assert value_of(seven >> 1) == 3
+    assert value_of(const("i32", -1) >> 28) == 15
+    assert value_of(const("i32", -1) < three) == 0
+    assert value_of(seven >= three) == 1
+    assert value_of(seven.equals(7)) == 1
+
+
+def test_vectors() -> None:
+    octets = bytes(range(16))
+    low = int.from_bytes(octets[:8], "little")
+    word = op("i64x2.extract_lane", vector(octets) >> 8, tail=b"\0")
+    assert value_of(word) == low >> 8
+    high = op("i64x2.extract_lane", vector(octets), tail=b"\1")
+    assert value_of(high) == int.from_bytes(octets[8:], "little")
+    assert value_of(op("v128.any_true", ~const("v128", -1))) == 0
+
+
+def test_loops_and_memory() -> None:
+    function = Function(("i32",), ("i32",))
+    zero = const("i32", 0)
+    with function.each(zero, function.param(0)) as i:
+        function.store("i32.store", i << 2, i * i, 16)
+    total = function.let(zero)
+    with function.each(zero, function.param(0)) as i:
+        function.set(total, total + load("i32.load", i << 2, 16))
+    function.give(total)
+    assert ran(function, 10) == sum(i * i for i in range(10))
+
+
+def test_a_loop_may_be_empty() -> None:
+    function = Function(("i32",), ("i32",))
+    count = function.let(const("i32", 0))
+    with function.each(const("i32", 0), function.param(0), some=False):
+        function.set(count, count + 1)
+    function.give(count)
+    assert [ran(function, n) for n in (0, 1, 5)] == [0, 1, 5]
+
+
+def test_blocks_are_left_by_their_labels() -> None:
+    function = Function(("i32",), ("i32",))
+    with function.block() as outer:
+        with function.block(), function.when(function.param(0)):
+            function.jump(outer)
+        function.give(const("i32", 1))
+    function.give(const("i32", 2))
+    assert [ran(function, n) for n in (0, 1)] == [1, 2]
+
+
+def test_variables_of_a_scope_are_used_again() -> None:
+    function = Function()
+    for _ in range(3):
+        with function.scope():
+            function.let(const("i64", 1))
+    assert function.types == ["i64"]
+
+
+def test_equal_functions_are_one() -> None:
+    module = Module(1, 1)
+    added = [Function(("i32",), ("i32",)) for _ in range(3)]
+    for number, function in enumerate(added):
+        function.give(function.param(0) + number // 2)
+    first, second, third = (module.add(function, "f") for function in added)
+    assert first == second != third
+
+
+def test_listings_have_every_instruction() -> None:
+    function = Function(("i32",), ("i32",))
+    held = function.let(const("v128", 5))
+    with function.when(op("v128.any_true", held)):
+        function.store("v128.store", function.param(0), held, 32)
+    function.give(const("i32", -7))
+    module = Module(1, 1)
+    module.add(function, "f")
+    for line in ("v128.const i32x4 0x5 0x0 0x5 0x0", "v128.any_true", "v128.store offset=32", "i32.const -7"):
+        assert f"  {line}\n" in module.listing()
+
+
+def test_opcodes_are_read_back() -> None:
+    for name, code in OPCODES.items():
+        number = code[0]
+        if number in (0xFC, 0xFD):
+            number = number << 8 | code[1] & 127 | (code[2] << 7 if len(code) > 2 else 0)
+        assert NAMES[number] == name

@@ -1,0 +1,153 @@
+"""Modules for rules: what they promise to hosts, in wasmtime and in V8."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import wasmtime
+
+import powderdsl
+from powderdsl.compiler import lower
+from powderdsl.ir.segments import segments
+from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
+from powderdsl.targets.wasm.source import WasmModule, wasm_module
+
+HOST = Path(__file__).with_name("host.mjs")
+
+
+def module_of(name: str, width: int) -> WasmModule:
+    (segment,) = segments(lower(powderdsl.load(name)))
+    assert segment.planes is not None
+    return wasm_module(segment.planes, width)
+
+
+def test_the_module_of_powderworld_is_small() -> None:
+    code = module_of("powderworld", 64).code
+    assert len(code) <= 150_000
+    assert len(gzip.compress(code)) <= 50_000
+
+
+def test_modules_are_deterministic() -> None:
+    assert module_of("core+water", 70).code == module_of("core+water", 70).code
+
+
+def test_modules_import_nothing_and_have_bounded_memory() -> None:
+    module = wasmtime.Module(wasmtime.Engine(), module_of("life", 64).code)
+    assert not module.imports
+    (memory,) = (one.type for one in module.exports if isinstance(one.type, wasmtime.MemoryType))
+    assert memory.limits.max is not None
+    assert memory.limits.max <= 1 << 14
+
+
+def test_powderworld_has_every_kind_of_function() -> None:
+    """What other tests compare with the reference includes these."""
+    text = module_of("powderworld", 64).module.listing()
+    for name in ("words", "cells", "swap_1_1_same", "arrive_-1_0_nothing", "arrive_-1_0_everything"):
+        assert f"$ {name}".replace(" ", "") in text
+    for name in ("draw_below", "draw_below_planes", "coin", "copy_line", "look"):
+        assert f"call ${name}_" in text
+
+
+def packed(world: Any) -> tuple[Instance, int]:
+    state = world.state
+    assert isinstance(state, WasmState)
+    return state.instance, state.batch
+
+
+def test_worlds_keep_their_state_when_others_follow(torch) -> None:  # type: ignore[no-untyped-def]
+    sim = powderdsl.compile("core+water+sand", backend="wasm")
+    ids = torch.randint(0, 4, (3, 12, 40), generator=torch.Generator().manual_seed(1))
+    first = sim.step(sim.world(ids, seed=3))
+    sim.step(first, 5)
+    again = sim.step(sim.world(ids, seed=3))
+    assert torch.equal(first.ids, again.ids)
+    assert torch.equal(sim.step(first, 2).ids, sim.step(again, 2).ids)
+
+
+def test_memory_is_used_again(torch) -> None:  # type: ignore[no-untyped-def]
+    sim = powderdsl.compile("powderworld", backend="wasm")
+    ids = torch.randint(0, 14, (3, 20, 64), generator=torch.Generator().manual_seed(1))
+    world = sim.step(sim.world(ids, seed=3), 60)
+    instance, _ = packed(world)
+    before = instance.call("scratch", 0), instance.memory_size()
+    for _ in range(60):
+        world = sim.step(world)
+    assert (instance.call("scratch", 0), instance.memory_size()) == before
+
+
+def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-def]
+    program = WasmProgram(*_programs("life"))
+    instance = program.loaded(64).instance(2, 64)
+    for worlds, rows in ((1 << 31, 64), (1 << 24, 64), (2, 1 << 30)):
+        with pytest.raises(MemoryError):
+            instance.call("allocate", worlds, rows)
+    with pytest.raises(MemoryError):
+        instance.call("scratch", (1 << 32) - 1)
+
+
+def _programs(name: str) -> tuple[Any, Any]:
+    (segment,) = segments(lower(powderdsl.load(name)))
+    return segment.program, segment.planes
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_boxes_are_filled(worlds: int, torch) -> None:  # type: ignore[no-untyped-def]
+    """As a host paints: one box of cells in one world, in a batch that shares its planes with a copy."""
+    sim = powderdsl.compile("powderworld", backend="wasm")
+    ids = torch.randint(0, 3, (worlds, 12, 70), generator=torch.Generator().manual_seed(1))
+    world = sim.step(sim.world(ids, seed=3))
+    before = world.ids.clone()
+    instance, batch = packed(world)
+    shapes = {name: (value.dtype, tuple(value.shape)) for name, value in world.state.items()}
+    layout = instance.loaded.layout
+    copy = WasmState(instance, instance.call("copy", batch), shapes)
+    last = worlds - 1
+    instance.call("fill", copy.batch, last, layout.planes["element:0"], 4, 2, 9, 60, 70, 9)
+    expected = before.clone()
+    expected[last, 2:9, 60:70] = 9
+    assert torch.equal(copy["element"], expected.to(copy["element"].dtype))
+    assert torch.equal(world.ids, before)
+    speed = torch.tensor([2.5]).view(torch.int32).item()
+    instance.call("fill_real", copy.batch, last, layout.reals["velocity.row"], 2, 9, 60, 70, int(speed))
+    wanted = world.state["velocity"].clone()
+    wanted[last, 0, 2:9, 60:70] = 2.5
+    assert torch.equal(copy["velocity"], wanted)
+
+
+@pytest.mark.parametrize(("batch", "rows", "width"), [(1, 32, 64), (3, 9, 70)])
+def test_v8_computes_the_same_worlds(batch: int, rows: int, width: int, tmp_path: Path, torch) -> None:  # type: ignore[no-untyped-def]
+    """The module alone, with its inputs in files, in Node.js."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no Node.js")
+    sim = powderdsl.compile("powderworld", backend="wasm")
+    generator = torch.Generator().manual_seed(1)
+    ids = torch.randint(0, 14, (batch, rows, width), generator=generator)
+    speed = 8 * torch.randn((batch, 2, rows, width), generator=generator)
+    world = sim.step(sim.replace(sim.world(ids, seed=3), velocity=speed))
+    instance, _ = packed(world)
+    code = module_of("powderworld", width).code
+    (tmp_path / "module.wasm").write_bytes(code)
+    calls = []
+    for name, value in world.state.items():
+        (tmp_path / name).write_bytes(value.contiguous().numpy().tobytes())
+        calls += [{"slot": name, **one} for one in instance.transfers(name, value.contiguous())]
+    inputs = instance.input_bytes(sim.parameters({}, batch), batch)
+    clock = torch.stack([world.seed, world.index, world.step])
+    (tmp_path / "inputs").write_bytes(clock.numpy().tobytes() + inputs)
+    job = {"worlds": batch, "rows": rows, "steps": 20, "calls": calls}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    done = subprocess.run([node, str(HOST), str(tmp_path)], capture_output=True, text=True, check=True)
+    expected = sim.step(world, 20)
+    hashes = {
+        name: hashlib.sha256(value.contiguous().numpy().tobytes()).hexdigest()
+        for name, value in expected.state.items()
+    }
+    assert json.loads(done.stdout) == hashes
