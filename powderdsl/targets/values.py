@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 from powderdsl.ir.ops import Node
-from powderdsl.schedule.types import ordered
+from powderdsl.schedule.types import Compute, ordered
 
 Named = TypeVar("Named")
 """What stands for a value in the text of a target: its name, or its code."""
@@ -122,3 +122,19 @@ class CellValues(Values[Named]):
 
 def _depends(value: Node, on: Node) -> bool:
     return any(node is on for node in ordered([value]))
+
+
+def chains_of(loop: Compute) -> list[list[Node]]:
+    """The chains of choices of a loop, all on the same masks, the outermost choice first."""
+    chains: dict[int, list[Node]] = {}
+    below: set[int] = set()
+    for node in reversed(ordered(out.value for out in loop.outs)):
+        if node.op != "select" or id(node) in below:
+            continue
+        chain = []
+        while node.op == "select":
+            chain.append(node)
+            below.add(id(node))
+            node = node.args[2]
+        chains[id(chain[0])] = chain
+    return list(reversed(chains.values()))

@@ -11,6 +11,7 @@ from powderdsl.schedule.join import field_reads, keeps
 from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, ordered, values_of
 from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
+from powderdsl.targets.values import chains_of
 
 SIDE_BY_SIDE = 8
 """The masks of a loop begin at a multiple of this many words: the most that a vector has."""
@@ -249,7 +250,7 @@ class _Loop:
         self.chains: list[list[Node]] = []
         self.masks: list[str] = []
         if loop.over == "choices":
-            self.chains = _chains(loop)
+            self.chains = chains_of(loop)
             self.masks = [str(choice.args[0].attr) for choice in reversed(self.chains[0])]
         self.text = "\n".join(self.laid() if loop.over == "choices" else self.swept())
 
@@ -424,19 +425,3 @@ PLACE = (
     "const int lane = strips ? y / height : l, row = strips ? y - lane * height : y; (void)lane; (void)row;"
 )
 """Where the words of row y lie in planes."""
-
-
-def _chains(loop: Compute) -> list[list[Node]]:
-    """The chains of choices of a loop, all on the same masks, the outermost choice first."""
-    chains: dict[int, list[Node]] = {}
-    below: set[int] = set()
-    for node in reversed(ordered(out.value for out in loop.outs)):
-        if node.op != "select" or id(node) in below:
-            continue
-        chain = []
-        while node.op == "select":
-            chain.append(node)
-            below.add(id(node))
-            node = node.args[2]
-        chains[id(chain[0])] = chain
-    return list(reversed(chains.values()))

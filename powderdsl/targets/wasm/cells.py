@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from powderdsl.ir.ops import REAL, SNAP, Node
 from powderdsl.schedule.types import Compute, loaded, ordered
 from powderdsl.targets.layout import param_key
-from powderdsl.targets.values import CellValues
+from powderdsl.targets.values import CellValues, chains_of
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, floats, load, op, vector
 from powderdsl.targets.wasm.library import ZERO, Library, choose, counted, either, some, splat
 from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
@@ -52,9 +52,6 @@ def sweep(within: Pass, loop: Compute) -> None:
             for out in loop.outs:
                 assert out.otherwise is not None
                 within.define(out.var, within.kept(out.otherwise))
-    for out in loop.outs:
-        if out.into is not None:
-            f.do(library.give_field(within.vars[out.into]))
 
 
 class CellLoop:
@@ -261,54 +258,66 @@ class CellLoop:
     # Chains of choices
 
     def lay(self) -> None:
-        """A line of all choices: chunk by chunk in which a choice holds, one choice after the other."""
-        f, library = self.f, self.library
-        chains = []
-        for out in self.loop.outs:
-            chain, node = [], out.value
-            while node.op == "select":
-                chain.append(node)
-                node = node.args[2]
-            chains.append((list(reversed(chain)), node))
-        masks = [str(choice.args[0].attr) for choice in chains[0][0]]
-        bases = [self.held[str(base.attr)] for _, base in chains]
-        any_flag = f.let(self.row_flags(list(dict.fromkeys(masks))))
+        """A line of all choices: chunk by chunk in which a choice holds, one choice after the other.
+
+        What follows from the results comes last, if they are not the new fields themselves.
+        """
+        f, library, memory, outs = self.f, self.library, self.memory, self.loop.outs
+        chains = [chain[::-1] for chain in chains_of(self.loop)]
+        bases = [self.held[str(chain[0].args[2].attr)] for chain in chains]
+        masks = [str(choice.args[0].attr) for choice in chains[0]]
+        continued = [chain[-1] for chain in chains] != [out.value for out in outs]
+        any_flag = self.row_flags(list(dict.fromkeys(masks)))
+        if continued:
+            for base in bases:
+                any_flag = any_flag | self.live(base)
         with f.when(op("i32.eqz", any_flag)):
-            for i, field in enumerate(bases):
-                self.copy(i, field)
+            for i in range(len(outs)):
+                self.set_live(i, ZERO) if continued else self.copy(i, bases[i])
             f.jump(self.skip)
         self.find_starts()
-        lines = []
-        for i, (_, base) in enumerate(chains):
+        for i in range(len(outs)):
             self.set_live(i, const("i32", 1))
-            lines.append(f.let(library.line_start(self.outs[i], self.line)))
-            self.copy_cells(lines[i], self.start(str(base.attr)))
+        lines = [f.let(library.line_start(place, self.line)) for place in self.outs]
+        running = lines
+        if continued:
+            first = memory.at("chains") + 4 * memory.halo
+            running = [f.let(const("i32", first + 4 * memory.stride * i)) for i in range(len(chains))]
+        for chain, line in zip(chains, running, strict=True):
+            self.copy_cells(line, self.start(str(chain[0].args[2].attr)))
         with self.each_word() as (at, x, _):
             for level, mask in enumerate(masks):
                 with f.scope():
-                    left = f.let(self.flags(self.held[mask], at))
-                    with f.block() as done, f.loop() as again:
-                        f.jump(done, op("i64.eqz", left))
-                        nibble = f.let(op("i64.ctz", left) & (WORD - CHUNK))
-                        self.column, self.at = f.let(x + op("i32.wrap_i64", nibble)), at
-                        four = splat(op("i32.wrap_i64", left >> nibble))
-                        chosen = f.let(op("i32x4.eq", four & vector(BITS), vector(BITS)))
-                        f.set(left, op("i64.and", left, const("i64", -1) ^ (const("i64", 15) << nibble)))
-                        values = Chunks(self, {})
-                        for i, (chain, _) in enumerate(chains):
-                            place = lines[i] + (self.column << 2)
-                            running = f.let(load("v128.load", place))
-                            values.known[id(chain[level].args[2])] = running
-                        for i, (chain, _) in enumerate(chains):
-                            value = choose(
-                                chosen,
-                                values.of(chain[level].args[1]),
-                                values.known[id(chain[level].args[2])],
-                            )
-                            f.store("v128.store", lines[i] + (self.column << 2), value)
-                        f.jump(again)
+                    self.choose(at, x, mask, [chain[level] for chain in chains], running)
+        if continued:
+            with f.each(ZERO, const("i32", memory.width), CHUNK) as self.column, f.scope():
+                values = Chunks(self, {})
+                for chain, line in zip(chains, running, strict=True):
+                    values.known[id(chain[-1])] = f.let(load("v128.load", line + (self.column << 2)))
+                for out, line in zip(outs, lines, strict=True):
+                    f.store("v128.store", line + (self.column << 2), values.of(out.value))
         for start in lines:
             library.finish_line(f, start)
+
+    def choose(self, at: Value, x: Value, mask: str, choices: Sequence[Node], lines: Sequence[Local]) -> None:
+        """Choices on a mask, in the chunks of a word in which it holds: `x` is the word's first column."""
+        f = self.f
+        left = f.let(self.flags(self.held[mask], at))
+        with f.block() as done, f.loop() as again:
+            f.jump(done, op("i64.eqz", left))
+            nibble = f.let(op("i64.ctz", left) & (WORD - CHUNK))
+            self.column = f.let(x + op("i32.wrap_i64", nibble))
+            four = splat(op("i32.wrap_i64", left >> nibble))
+            chosen = f.let(op("i32x4.eq", four & vector(BITS), vector(BITS)))
+            f.set(left, left & (const("i64", -1) ^ (const("i64", 15) << nibble)))
+            values = Chunks(self, {})
+            places = [line + (self.column << 2) for line in lines]
+            for choice, place in zip(choices, places, strict=True):
+                values.known[id(choice.args[2])] = f.let(load("v128.load", place))
+            for choice, place in zip(choices, places, strict=True):
+                new = choose(chosen, values.of(choice.args[1]), values.known[id(choice.args[2])])
+                f.store("v128.store", place, new)
+            f.jump(again)
 
 
 class Chunks(CellValues[Value]):
@@ -320,7 +329,6 @@ class Chunks(CellValues[Value]):
         self.memory = loop.memory
         self.choices = [node for node in loop.nodes if node.op == "select"]
         self.uses = Counter(id(arg) for node in loop.nodes for arg in node.args)
-        self.leaders: dict[int, Local] = {}
 
     def nibble(self, node: Node) -> Value:
         """The bits of a flag's plane from this column on: i32."""

@@ -17,8 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from powderdsl.ir.ops import REAL
-from powderdsl.schedule.types import Move, Schedule, flat, ordered, values_of
+from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, ordered, values_of
 from powderdsl.targets.layout import Layout
+from powderdsl.targets.values import chains_of
 
 WORD, LANES = 64, 2
 REFS, SOME, HALOED, NEXT, HEADER = 0, 4, 8, 12, 16
@@ -32,25 +33,31 @@ def aligned(count: int, by: int = 16) -> int:
 
 @dataclass(frozen=True)
 class Extent:
-    """The largest distances at which planes are read in rows (`around`), and fields in rows and columns."""
+    """The largest distances at which planes are read in rows (`around`), and fields in rows and columns; the most chains
+    of choices in a loop.
+    """
 
     around: int
     lines: int
     reach: int
+    chains: int
 
 
 def extent_of(schedules: Sequence[Schedule]) -> Extent:
-    around = lines = reach = 0
+    around = lines = reach = chains = 0
     for statement in (one for schedule in schedules for one in flat(schedule.body)):
         if isinstance(statement, Move):
             around = max(around, abs(statement.offset[0]))
+        elif isinstance(statement, Sweeps):
+            laid = (loop for loop in statement.loops if loop.over == "choices")
+            chains = max(chains, *(len(chains_of(loop)) for loop in laid), 0)
         for node in ordered(values_of(statement)):
             if node.op == "shift" and node.type != REAL:
                 around = max(around, abs(node.attr[0]))
             elif node.op in ("shift", "live"):
                 lines = max(lines, abs(node.attr[0]))
                 reach = max(reach, abs(node.attr[1]) if node.op == "shift" else 0)
-    return Extent(around, lines, reach)
+    return Extent(around, lines, reach, chains)
 
 
 @dataclass
@@ -79,6 +86,7 @@ class Memory:
             ("rows", 4),
             ("change", 2 * self.row),
             ("columns", 4 * self.stride),
+            ("chains", 4 * self.stride * self.extent.chains),
         ):
             self.places[name] = self.top
             self.top = aligned(self.top + size)

@@ -138,9 +138,10 @@ class Pass:
                     self.update(statement)
                 case Compute():
                     self.words(statement)
-                case Sweeps():
-                    for loop in statement.loops:
+                case Sweeps(loops, _, _, passing):
+                    for loop in loops:
                         sweep(self, loop)
+                    self.release(passing)
                 case Move():
                     self.move(statement)
                 case Guard():
