@@ -452,6 +452,8 @@ def slow_imports_after(statement: str, path: Path = ROOT) -> set[str]:
     [
         "import powderdsl; powderdsl.load('powderworld')",
         "import powderdsl.cli, powderdsl.testing.properties.refute",
+        "from powderdsl.compiler import load, lower; from powderdsl.ir.bits import lower_bits; "
+        "from powderdsl.targets.wasm.source import wasm_module; wasm_module(lower_bits(lower(load('life'))), 64)",
     ],
 )
 def test_the_front_end_does_without_torch(statement: str) -> None:
