@@ -27,12 +27,29 @@ class WasmState(Mapping[str, Tensor]):
     """A batch's state in the memory of an instance. Slots are unpacked into tensors one by one, on first access."""
 
     def __init__(self, instance: Instance, batch: int, like: Like):
-        self.instance, self.batch, self.like = instance, batch, like
+        self.instance, self.like = instance, like
+        self._batch: int | None = batch
         self._tensors: dict[str, Tensor] = {}
 
     def __del__(self) -> None:
         # The collector may come in the middle of a call, of this or another thread: the next call releases it.
-        self.instance.gone.append(self.batch)
+        if self._batch is not None:
+            self.instance.gone.append(self._batch)
+
+    @property
+    def batch(self) -> int:
+        """The batch's address. Raises RuntimeError after `take`."""
+        if self._batch is None:
+            raise RuntimeError(
+                "these worlds were stepped with `reuse`: only those that came of it can be used"
+            )
+        return self._batch
+
+    def take(self) -> int:
+        """The batch, for a new owner. This state must not be used afterwards."""
+        batch, self._batch = self.batch, None
+        self._tensors.clear()
+        return batch
 
     def __copy__(self) -> WasmState:
         with self.instance as call:
@@ -247,7 +264,7 @@ class WasmProgram:
             state = dict(state)
         with instance as call:
             if isinstance(state, WasmState):
-                batch, like = call("copy", state.batch), state.like
+                batch, like = state.take() if job.reuse else call("copy", state.batch), state.like
             else:
                 batch, like = instance.pack(state)
             instance.run(batch, job, worlds)

@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from powderdsl.targets.wasm.batches import Batches
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.wasm.library import ZERO, counted, either, word
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op, vector
+from powderdsl.targets.wasm.library import ZERO, counted, either, splat, word
 from powderdsl.targets.wasm.memory import HEADER, SOME, WORD
+
+WEIGHTS = bytes(1 << i for i in range(8)) * 2
 
 
 class Transfer(Batches):
@@ -36,8 +38,11 @@ class Transfer(Batches):
             with self.each_run(f) as (at, count):
                 with f.each(ZERO, planes) as bit:
                     plane = f.let(word(group + ((slot + bit) << 2)))
-                    found = f.let(const("i64", 0))
-                    with f.each(ZERO, count) as x:
+                    found, x = f.let(const("i64", 0)), f.let(ZERO)
+                    with self.each_sixteen(f, size, x, count):
+                        top_bits = op("i8x16.shl", load("v128.load", source + x), const("i32", 7) - bit)
+                        f.set(found, found | (counted(op("i8x16.bitmask", top_bits)) << counted(x)))
+                    with f.each(x, count, some=False) as x:
                         flag = (self.cell(source + x * size, size) >> bit) & 1
                         f.set(found, found | (counted(flag) << counted(x)))
                     f.store("i64.store", plane + at + (lane << 3), found, memory.base)
@@ -62,23 +67,47 @@ class Transfer(Batches):
         with self.each_lane(f, batch) as (group, lane, world, top):
             start = world * self.library.world_rows.value + top
             target = f.let(address + start * size * memory.width)
-            with self.each_run(f) as (at, count), f.each(ZERO, count) as x:
-                value, place = f.let(ZERO), f.let(at + (lane << 3))
-                with f.each(ZERO, planes) as bit:
+            with self.each_run(f) as (at, count):
+                place, x = f.let(at + (lane << 3)), f.let(ZERO)
+
+                def bits_from(bit: Value) -> Value:
                     plane = word(group + ((slot + bit) << 2))
-                    flag = (load("i64.load", plane + place, memory.base) >> counted(x)) & 1
-                    flag = op("i32.wrap_i64", flag)
-                    last = negative & bit.equals(planes - 1)
-                    f.set(value, value + (either(last, ZERO - flag, flag) << bit))
-                with f.when(size.equals(1)):
-                    f.store("i32.store8", target, value)
-                    f.otherwise()
-                    with f.when(size.equals(2)):
-                        f.store("i32.store16", target, value)
+                    return op("i32.wrap_i64", load("i64.load", plane + place, memory.base) >> counted(x))
+
+                def weight(bit: Value) -> Value:
+                    one = const("i32", 1) << bit
+                    return either(negative & bit.equals(planes - 1), ZERO - one, one)
+
+                with self.each_sixteen(f, size, x, count):
+                    cells = f.let(const("v128", 0))
+                    with f.each(ZERO, planes) as bit:
+                        bits = op("i8x16.swizzle", splat(bits_from(bit)), vector(bytes(8) + b"\1" * 8))
+                        chosen = op("i8x16.eq", bits & vector(WEIGHTS), vector(WEIGHTS))
+                        f.set(cells, op("i8x16.add", cells, chosen & op("i8x16.splat", weight(bit))))
+                    f.store("v128.store", target, cells)
+                    f.set(target, target + 16)
+                with f.each(x, count, some=False) as x:
+                    value = f.let(ZERO)
+                    with f.each(ZERO, planes) as bit:
+                        f.set(value, value + (bits_from(bit) & 1) * weight(bit))
+                    with f.when(size.equals(1)):
+                        f.store("i32.store8", target, value)
                         f.otherwise()
-                        f.store("i32.store", target, value)
-                f.set(target, target + size)
+                        with f.when(size.equals(2)):
+                            f.store("i32.store16", target, value)
+                            f.otherwise()
+                            f.store("i32.store", target, value)
+                    f.set(target, target + size)
         return f
+
+    @contextmanager
+    def each_sixteen(self, f: Function, size: Value, x: Local, count: Value) -> Iterator[None]:
+        """Sixteen cells of a byte at a time; `x` is the first one, and then the first that is left."""
+        with f.block() as done, f.loop() as again:
+            f.jump(done, op("i32.ne", size, const("i32", 1)) | (count < x + 16))
+            yield
+            f.set(x, x + 16)
+            f.jump(again)
 
     def load_real(self) -> Function:
         f, library, memory = self.library.function("i32 i32 i32 i32"), self.library, self.memory
