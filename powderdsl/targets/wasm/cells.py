@@ -52,6 +52,9 @@ def sweep(within: Pass, loop: Compute) -> None:
             for out in loop.outs:
                 assert out.otherwise is not None
                 within.define(out.var, within.kept(out.otherwise))
+    for out in loop.outs:
+        if out.into is not None:
+            f.do(library.give_field(within.vars[out.into]))
 
 
 class CellLoop:

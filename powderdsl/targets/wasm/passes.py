@@ -22,7 +22,6 @@ from powderdsl.schedule.updates import is_cleared
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
 from powderdsl.targets.wasm.cells import sweep
 from powderdsl.targets.wasm.library import ZERO, Library, word
-from powderdsl.targets.wasm.memory import SOME
 from powderdsl.targets.wasm.moves import move as in_place
 from powderdsl.targets.wasm.moves import moves_in_place
 from powderdsl.targets.wasm.words import WordLoop
@@ -221,7 +220,6 @@ class Pass:
                 needed = library.some(plane) if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
                 with f.when(needed):
                     f.set(plane, library.own(plane))
-                    f.store("i32.store", plane, ONE, SOME)
             for name in made.haloed:
                 f.do(library.edges(self.vars[name]))
             function = made.made()

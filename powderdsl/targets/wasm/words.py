@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from powderdsl.ir.ops import Node
+from powderdsl.schedule.draws import is_coin
 from powderdsl.schedule.types import Compute, loaded, ordered
 from powderdsl.schedule.updates import asked
 from powderdsl.targets.layout import param_key
@@ -20,7 +21,7 @@ def plane_name(node: Node, library: Library) -> tuple[str, int] | None:
     """The table, and the number in it, of a plane that a leaf other than a variable stands for."""
     layout = library.memory.layout
     match node.op:
-        case "chance" if node.attr[2] == 1 << node.attr[1] - 1:
+        case "chance" if is_coin(node):
             return "coins", layout.streams[node.attr[0]]
         case "coordinate" if node.attr[0] != "step":
             return "fixed", layout.fixed[0 if node.attr[0] == "row" else 1, node.attr[1], node.attr[2]]
@@ -65,7 +66,7 @@ class WordLoop:
         f, library = self.f, self.library
         memory = library.memory
         stop = f.let(library.cells.value)
-        kept = [] if self.updates else [f.let(const("v128", 0)) for _ in self.outs]
+        kept = [f.let(const("v128", 0)) for _ in self.outs]
         self.y = self.row = self.x = None
         if memory.words == 1:
             with f.each(ZERO, stop, 16) as at:
@@ -83,8 +84,9 @@ class WordLoop:
                     f.set(within, within + 16)
                     f.jump(again, within < memory.row)
                 f.set(y, y + 1)
-        for place, any_flag in zip(self.outs, kept, strict=False):
-            f.store("i32.store", place, some(any_flag), SOME)
+        for place, any_flag in zip(self.outs, kept, strict=True):
+            before = library.some(place) if self.updates else ZERO
+            f.store("i32.store", place, before | some(any_flag), SOME)
         return library.module.add(f, f"words_{self.loop.place.rpartition('/')[2]}")
 
     def body(self, kept: Sequence[Local]) -> None:
@@ -101,9 +103,8 @@ class WordLoop:
                 value = values.clean(out.value)
                 found.append(f.let(value) if self.updates or len(self.outs) > 1 else value)
             for i, (place, value) in enumerate(zip(self.outs, found, strict=True)):
-                if kept:
-                    value = value if isinstance(value, Local) else f.let(value)
-                    f.set(kept[i], kept[i] | value)
+                value = value if isinstance(value, Local) else f.let(value)
+                f.set(kept[i], kept[i] | value)
                 f.store("v128.store", place + self.at, value, self.base)
 
     @property
