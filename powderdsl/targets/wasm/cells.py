@@ -36,22 +36,27 @@ def sweep(within: Pass, loop: Compute) -> None:
     f, library = within.f, within.library
     for out in loop.outs:
         within.declare(out.var)
+    copies = all(out.value.op == "load" and out.var.type == REAL for out in loop.outs)
     with ExitStack() as asked:
-        if loop.region is not None:
+        if copies:  # fields are shared, not copied
+            for out in loop.outs:
+                within.define(out.var, within.kept(out.value))
+        elif loop.region is not None:
             condition = ZERO
             for part in parts_of(loop.region):
                 condition = condition | library.some(within.of(part.args[0] if part.op == "live" else part))
             asked.enter_context(f.when(condition))
-        for out in loop.outs:
-            within.define(out.var, (library.take_field if out.var.type == REAL else library.take)())
-        made = CellLoop(library, loop)
-        outs = [within.vars[out.var.name] for out in loop.outs]
-        f.do(made.made()(*(within.read(name) for name in made.reads), *outs))
-        if loop.region is not None:
-            f.otherwise()
+        if not copies:
             for out in loop.outs:
-                assert out.otherwise is not None
-                within.define(out.var, within.kept(out.otherwise))
+                within.define(out.var, (library.take_field if out.var.type == REAL else library.take)())
+            made = CellLoop(library, loop)
+            outs = [within.vars[out.var.name] for out in loop.outs]
+            f.do(made.made()(*(within.read(name) for name in made.reads), *outs))
+            if loop.region is not None:
+                f.otherwise()
+                for out in loop.outs:
+                    assert out.otherwise is not None
+                    within.define(out.var, within.kept(out.otherwise))
     for out in loop.outs:
         if out.into is not None:
             f.do(library.give_field(within.vars[out.into]))
