@@ -40,6 +40,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     # A row is a package with all that lies in it, or a module; the longest row that fits a module is its own. It may
     # import from its own row and from the rows named beside it, all of them further up.
     "moved": (),
+    "arrays": (),
     "diagnostics": (),
     "system": ("diagnostics",),
     "syntax": ("diagnostics", "system"),
@@ -50,7 +51,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir.stages": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
     "ir.lower": (*_FRONT, "analysis", "ir"),  # the one door from the model into the IR
     "schedule": ("diagnostics", "ir"),
-    "targets": ("diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
+    "targets": ("arrays", "diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.torch"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch"),
@@ -118,13 +119,14 @@ class Home:
 
 _TEXT = ("syntax", "worlds.scene")
 _TORCH = (
-    "targets.codec",
-    "targets.job",
-    "targets.profiling",
+    "targets.tensor_kind",
     "targets.random",
     "targets.words",
     "targets.torch.mixed",
-    "targets.*.program",
+    "targets.torch.program",
+    "targets.arrays.program",
+    "targets.cpp.program",
+    "targets.cuda.program",
     "targets.cpp.counts",
     "simulation.native_start",
     "simulation.widths",
@@ -153,6 +155,7 @@ THIRD_PARTIES: dict[str, Home] = {
         (
             *_TORCH,
             "system.random",
+            "targets.profiling",
             "worlds.store",
             "simulation.draw",
             "simulation.media",
@@ -166,7 +169,9 @@ THIRD_PARTIES: dict[str, Home] = {
     "minari": Home(("datasets.minari",), ()),
     "h5py": Home(("datasets.minari",), ()),
     "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
-    "wasmtime": Home(("targets.wasm.program",), ("targets.wasm.program",)),
+    "wasmtime": Home(("targets.wasm.wasmtime_host",), ("targets.wasm.wasmtime_host",)),
+    "js": Home(("targets.wasm.browser_host",), ()),
+    "pyodide": Home(("targets.wasm.browser_host",), ()),
     "click": Home(("cli",), ("cli",)),
     "matplotlib": Home(("experiments.bench", "experiments.studies", "cli"), ()),
     "ray": Home(("experiments.studies.cluster",), ()),

@@ -135,12 +135,14 @@ def _array_program(program: Program, device: torch.device) -> Runnable:
 
 def _wasm_program(program: Program, device: torch.device) -> Runnable:
     """On the CPU only; passes that do not fit bit planes run on torch tensors."""
+    from powderdsl.targets.tensor_kind import Tensors
     from powderdsl.targets.torch.mixed import packed_program
     from powderdsl.targets.wasm.program import WasmProgram
 
     if device.type != "cpu":
         raise _refusal("wasm", "wasmtime runs on the CPU", _ELSEWHERE.format(device))
-    return packed_program(program, device, WasmProgram)
+    kind = Tensors()
+    return packed_program(program, device, lambda numbers, planes: WasmProgram(numbers, planes, kind))
 
 
 def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:

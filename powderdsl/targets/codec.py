@@ -1,15 +1,14 @@
-"""The codec of the state: tensors to slots of a program and back, and parameters to the numbers that kernels read.
+"""The codec of the state: arrays to slots of a program and back, and parameters to the numbers that kernels read.
 
-A state tensor is one slot of the IR, or two if it is a vector. On bit planes, an integer slot has one plane per bit.
+A state array is one slot of the IR, or two if it is a vector. On bit planes, an integer slot has one plane per bit.
+Arrays are of one library: torch, or `powderdsl.arrays`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-
-import torch
-from torch import Tensor
+from typing import Any
 
 from powderdsl.ir.gates import width
 from powderdsl.ir.ops import Program, Threshold, Type, plane_name
@@ -17,16 +16,16 @@ from powderdsl.ir.ops import Program, Threshold, Type, plane_name
 
 @dataclass(frozen=True)
 class Piece:
-    """A tensor of the state, or one component of a vector, and the slot of the program that holds it."""
+    """An array of the state, or one component of a vector, and the slot of the program that holds it."""
 
     state: str
     component: int | None
     slot: str
     type: Type
 
-    def of(self, tensor: Tensor) -> Tensor:
-        """The piece of a tensor [B, H, W], or [B, 2, H, W] for a vector."""
-        return tensor if self.component is None else tensor[:, self.component]
+    def of(self, array: Any) -> Any:
+        """The piece of an array [B, H, W], or [B, 2, H, W] for a vector."""
+        return array if self.component is None else array[:, self.component]
 
     @property
     def planes(self) -> tuple[str, ...]:
@@ -46,7 +45,7 @@ class Piece:
 
 
 def pieces(program: Program) -> dict[str, tuple[Piece, ...]]:
-    """The pieces of each state tensor of a program on numbers, by the tensor's name."""
+    """The pieces of each state array of a program on numbers, by the array's name."""
     found: dict[str, tuple[Piece, ...]] = {}
     for slot in program.slots:
         piece = Piece(slot.state or slot.name, slot.component, slot.name, slot.type)
@@ -54,33 +53,37 @@ def pieces(program: Program) -> dict[str, tuple[Piece, ...]]:
     return found
 
 
-def limits(values: Tensor, threshold: Threshold) -> Tensor:
+def limits(xp: Any, values: Any, threshold: Threshold) -> Any:
     """For chances, float64 [B]: how many of the possible draws lie below each, or not above it if strict: int64 [B]."""
     count = 1 << threshold.bits
     scaled = values * count - 0.5
-    limit = scaled.ceil() if threshold.strict else scaled.floor() + 1
-    return limit.clamp(0, count).to(torch.int64)
+    limit = xp.ceil(scaled) if threshold.strict else xp.floor(scaled) + 1
+    return xp.asarray(xp.clip(limit, 0, count), dtype=xp.int64)
 
 
 def parameters(
-    params: Mapping[str, Tensor],
+    xp: Any,
+    params: Mapping[str, Any],
     planes: Mapping[tuple[str, Threshold | None, int], int],
     reals: Mapping[str, int],
     batch: int,
-    device: torch.device,
-) -> tuple[Tensor, Tensor]:
+    **where: Any,
+) -> tuple[Any, Any]:
     """Parameters as the bits and floats that compiled code reads: uint8 [n, B], float32 [m, B].
 
-    `planes` and `reals` give the numbers of what it reads: bits of a value or of a threshold, and values.
+    `xp` is the library of the arrays, and `where` says on which device, if it has some. `planes` and `reals` give the
+    numbers of what is read: bits of a value or of a threshold, and values.
     """
-    bits = torch.zeros(max(1, len(planes)), batch, dtype=torch.uint8, device=device)
-    views: dict[tuple[str, Threshold | None], Tensor] = {}
+    bits = xp.zeros((max(1, len(planes)), batch), dtype=xp.uint8, **where)
+    views: dict[tuple[str, Threshold | None], Any] = {}
     for (name, threshold, bit), number in planes.items():
         if (name, threshold) not in views:
             value = params[name]
-            views[name, threshold] = value.to(torch.int64) if threshold is None else limits(value, threshold)
+            views[name, threshold] = (
+                xp.asarray(value, dtype=xp.int64) if threshold is None else limits(xp, value, threshold)
+            )
         bits[number] = (views[name, threshold] >> bit) & 1
-    floats = torch.zeros(max(1, len(reals)), batch, dtype=torch.float32, device=device)
+    floats = xp.zeros((max(1, len(reals)), batch), dtype=xp.float32, **where)
     for name, number in reals.items():
-        floats[number] = params[name].to(torch.float32)
+        floats[number] = xp.asarray(params[name], dtype=xp.float32)
     return bits, floats

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
-
-from torch import Tensor
+from typing import Any, NamedTuple, Protocol
 
 from powderdsl.targets.profiling import PassClock
+
+Array = Any
+"""A torch tensor, or an array of `powderdsl.arrays`: all arrays of a job are of one library."""
 
 
 class Clock(NamedTuple):
@@ -16,13 +17,13 @@ class Clock(NamedTuple):
     Whoever needs the sum computes it: a step of one small world takes no longer than a few operations of torch.
     """
 
-    seed: Tensor
-    world: Tensor
-    start: Tensor
+    seed: Array
+    world: Array
+    start: Array
     since: int = 0
 
     @property
-    def step(self) -> Tensor:
+    def step(self) -> Array:
         """The step of each world: int64 [B]."""
         return self.start + self.since if self.since else self.start
 
@@ -30,16 +31,16 @@ class Clock(NamedTuple):
 class Job(NamedTuple):  # made faster than a frozen dataclass, at each call
     """Steps of a batch of worlds.
 
-    `state` has one tensor per slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B], in a
+    `state` has one array per slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B], in a
     mapping that nobody changes: programs recognize it. `draws`, int64 [B, H, W] below 2^bits, replace a stream's own
     numbers; `passes` names the passes to run, None for all.
     """
 
-    state: Mapping[str, Tensor]
+    state: Mapping[str, Array]
     clock: Clock
     steps: int
-    params: Mapping[str, Tensor]
-    draws: Mapping[str, Tensor]
+    params: Mapping[str, Array]
+    draws: Mapping[str, Array]
     passes: frozenset[str] | None
     reuse: bool = False
     """Whether `state` may be overwritten because nothing reads it afterwards."""
@@ -55,6 +56,6 @@ class Job(NamedTuple):  # made faster than a frozen dataclass, at each call
 class Runnable(Protocol):
     """A ruleset, or some of its passes, made executable."""
 
-    def run(self, job: Job) -> Mapping[str, Tensor]:
+    def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
         ...

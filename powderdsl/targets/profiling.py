@@ -5,9 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from powderdsl.targets.job import Job, Runnable
@@ -16,7 +14,8 @@ if TYPE_CHECKING:
 class PassClock:
     """Seconds by pass. Work before the first pass has the name ``""``."""
 
-    def __init__(self, device: torch.device):
+    def __init__(self, device: Any = None):
+        """`device`: that of the arrays, if they have one."""
         self._device = device
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._last = self._now()
@@ -37,13 +36,15 @@ class PassClock:
 
     def _now(self) -> float:
         # A GPU works asynchronously: without waiting, the time would count for a later pass.
-        if self._device.type == "cuda":
+        if getattr(self._device, "type", "") == "cuda":
+            import torch
+
             torch.cuda.synchronize(self._device)
         return time.perf_counter()
 
 
 def profile_of(program: Runnable, job: Job) -> Mapping[str, float]:
     """Seconds by pass over `job.steps`; empty if a program cannot report them."""
-    clock = PassClock(job.clock.seed.device)
+    clock = PassClock(getattr(job.clock.seed, "device", None))
     program.run(job._replace(timing=clock))
     return clock.passes()

@@ -16,7 +16,9 @@ import wasmtime
 import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir.segments import segments
-from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
+from powderdsl.targets.tensor_kind import Tensors
+from powderdsl.targets.wasm.instances import Instance, WasmState
+from powderdsl.targets.wasm.program import WasmProgram
 from powderdsl.targets.wasm.source import WasmModule, wasm_module
 
 HOST = Path(__file__).with_name("host.mjs")
@@ -76,14 +78,14 @@ def test_memory_is_used_again(torch) -> None:  # type: ignore[no-untyped-def]
     ids = torch.randint(0, 14, (3, 20, 64), generator=torch.Generator().manual_seed(1))
     world = sim.step(sim.world(ids, seed=3), 60)
     instance, _ = packed(world)
-    before = instance.call("scratch", 0), instance.memory_size()
+    before = instance.call("scratch", 0), instance.running.memory_size()
     for _ in range(60):
         world = sim.step(world)
-    assert (instance.call("scratch", 0), instance.memory_size()) == before
+    assert (instance.call("scratch", 0), instance.running.memory_size()) == before
 
 
 def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-def]
-    program = WasmProgram(*_programs("life"))
+    program = WasmProgram(*_programs("life"), Tensors())
     instance = program.loaded(64).instance(2, 64)
     for worlds, rows in ((1 << 31, 64), (1 << 24, 64), (2, 1 << 30)):
         with pytest.raises(MemoryError):
@@ -138,7 +140,7 @@ def test_v8_computes_the_same_worlds(batch: int, rows: int, width: int, tmp_path
     calls = []
     for name, value in world.state.items():
         (tmp_path / name).write_bytes(value.contiguous().numpy().tobytes())
-        calls += [{"slot": name, **one} for one in instance.transfers(name, value.contiguous())]
+        calls += [{"slot": name, **one} for one in instance.transfers(name, value.itemsize, value.shape)]
     inputs = instance.input_bytes(sim.parameters({}, batch), batch)
     clock = torch.stack([world.seed, world.index, world.step])
     (tmp_path / "inputs").write_bytes(clock.numpy().tobytes() + inputs)

@@ -212,9 +212,7 @@ class NativeProgram:
     def _made_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""
         layout = self.layout
-        planes, reals = parameters(
-            params, layout.param_planes, layout.param_reals, batch, torch.device("cpu")
-        )
+        planes, reals = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
         found = Inputs(params, planes, reals, planes.data_ptr(), reals.data_ptr())
         if len(self._inputs) >= BATCH_SIZES:
             self._inputs = {}  # not cleared: another thread may be reading it

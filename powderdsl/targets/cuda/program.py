@@ -176,7 +176,9 @@ class CudaProgram:
         )
         device = after.planes.device
         layout = source.layout
-        flags, numbers = parameters(job.params, layout.param_planes, layout.param_reals, batch, device)
+        flags, numbers = parameters(
+            torch, job.params, layout.param_planes, layout.param_reals, batch, device=device
+        )
         blocks = -(-batch // source.group)
         scratch = torch.empty(max(1, blocks * source.scratch // 4), dtype=torch.int32, device=device)
         seed, index, start = (part.contiguous() for part in (job.clock.seed, job.clock.world, job.clock.step))

@@ -125,7 +125,7 @@ class Kernels:
 
     def limit(self, name: str, bits: int, strict: bool) -> Tensor:
         """A parameter as a chance [B, 1, 1]: how many of the possible draws lie below it, or not above it."""
-        return limits(self.params[name], Threshold(bits, strict))[:, None, None]
+        return limits(torch, self.params[name], Threshold(bits, strict))[:, None, None]
 
     @staticmethod
     def swap(
