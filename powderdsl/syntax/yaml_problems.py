@@ -82,21 +82,20 @@ class Place:
         return self.span(start, len(self.text[start : self.line_end(start)].rstrip()))
 
 
+def report_character(source: Source, at: int, reporter: Reporter) -> None:
+    """Report a character that YAML does not allow as PD103."""
+    message = f"invalid YAML: the character U+{ord(source.text[at]):04X} is not allowed"
+    label = "cannot stand in a text file"
+    reporter.error("PD103", message, Span(source, at, at + 1), label, helps=["remove it"])
+
+
 def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> None:
     """Report what PyYAML raised as PD103."""
-    found = _marked(error, source) if isinstance(error, yaml.MarkedYAMLError) else _character(error, source)
+    assert isinstance(error, yaml.MarkedYAMLError), error
+    found = _marked(error, source)
     others, helps = [found.other] if found.other else [], [found.help] if found.help else []
     message = f"invalid YAML: {found.message}"
     reporter.error("PD103", message, found.span, found.label, secondary=others, helps=helps)
-
-
-def _character(error: yaml.YAMLError, source: Source) -> Problem:
-    # The position that comes with it counts bytes; the character itself is surer.
-    code = getattr(error, "character", 0)
-    char = chr(code) if isinstance(code, int) else str(code)
-    start = max(source.text.find(char), 0)
-    message = f"the character U+{ord(char[0]):04X} is not allowed"
-    return Problem(message, Span(source, start, start + 1), "cannot stand in a text file", "remove it")
 
 
 def _marked(error: yaml.MarkedYAMLError, source: Source) -> Problem:

@@ -6,19 +6,24 @@ surprises (`no` as false, `012` as ten, `1:30` as ninety) never happen.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import yaml
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span
-from powderdsl.syntax.yaml_problems import report_yaml
+from powderdsl.syntax import pure_yaml
+from powderdsl.syntax.yaml_problems import report_character, report_yaml
 
 MAX_CHARACTERS = 1 << 20
 MAX_DEPTH = 32
 MAX_NODES = 50_000
 
-_Loader: type | None = getattr(yaml, "CSafeLoader", None)
-"""libyaml's parser. The pure Python one is twenty times slower and refuses `[name?]`, so it cannot be a fallback."""
+_LIBYAML: type | None = getattr(yaml, "CSafeLoader", None)
+"""libyaml's parser, where PyYAML was built with it."""
+_UNPRINTABLE = re.compile("[^\t\n\r -~\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_ESCAPED_TAG = re.compile(r"![^\s!]*%")
 
 
 @dataclass(frozen=True)
@@ -71,14 +76,14 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
         helps = ["split the pack, or check that this is the file you meant"]
         reporter.error("PD102", f"file of {len(text):,} characters", None, notes=notes, helps=helps)
         return None
-    if _Loader is None:
-        helps = ["reinstall it from a wheel: `pip install --force-reinstall pyyaml`"]
-        reporter.error("PD701", "PyYAML was built without libyaml", None, helps=helps)
+    unprintable = _UNPRINTABLE.search(text)
+    if unprintable:
+        report_character(source, unprintable.start(), reporter)
         return None
     builder = _Builder(source, reporter)
     try:
         # Events are counted before anything recursive runs: the C loader's composer can be crashed by depth.
-        root = builder.build(yaml.parse(text, Loader=_Loader))
+        root = builder.build(_events(text))
     except yaml.YAMLError as error:
         report_yaml(error, source, reporter)
         return None
@@ -86,6 +91,14 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
         return None
     # A broken tree gets no further messages.
     return None if builder.failed else root
+
+
+def _events(text: str) -> Iterator[yaml.Event]:
+    """The parser's events: the same with libyaml and without. Raises yaml.YAMLError."""
+    # PyYAML cannot decode what escapes in a tag may spell for libyaml.
+    if _LIBYAML is None or _ESCAPED_TAG.search(text):
+        return pure_yaml.events(text)
+    return yaml.parse(text, Loader=_LIBYAML)
 
 
 class _Abort(Exception):
