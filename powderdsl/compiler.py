@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,18 +37,17 @@ if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
 
 BACKENDS = {
-    "auto": "`arrays` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
+    "auto": "`wasm` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
     "torch": "torch tensors with one element a cell, on any device: the readable one",
-    "arrays": "bit planes in NumPy arrays, on the CPU: starts at once, needs no compiler",
+    "wasm": "generated WebAssembly, run by wasmtime on the CPU: starts at once, needs no compiler",
     "native": "generated C++ for the CPU; compiled once, then kept",
-    "wasm": "generated WebAssembly, run by wasmtime on the CPU: needs no compiler",
     "cuda": "generated CUDA C++ for a GPU: whole worlds on the chip, all steps of a call in one launch",
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""
 
-RENAMED_BACKENDS = {"dense": "torch", "planes": "arrays"}
-"""Old names, which still work, and what they are called now."""
+RENAMED_BACKENDS = {"dense": "torch", "planes": "wasm", "arrays": "wasm"}
+"""Old names, which still work, and what runs instead."""
 
 
 def current_backend(name: str) -> str:
@@ -58,13 +58,14 @@ def current_backend(name: str) -> str:
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("powderdsl."):
         frame, level = frame.f_back, level + 1
-    warnings.warn(f"the backend `{name}` is called `{new}` now", DeprecationWarning, stacklevel=level)
+    warnings.warn(f"the backend `{name}` is `{new}` now", DeprecationWarning, stacklevel=level)
     return new
 
 
 def starting_backend(device: str) -> str:
-    """The backend that runs rules on a torch device at once, without compiling."""
-    return "arrays" if str(device).partition(":")[0] == "cpu" else "torch"
+    """The backend that runs rules on a torch device at once, without a compiler of C++."""
+    on_cpu = str(device).partition(":")[0] == "cpu"
+    return "wasm" if on_cpu and find_spec("wasmtime") is not None else "torch"
 
 
 MAX_BASES = 8

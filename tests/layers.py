@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 _FRONT = ("diagnostics", "system", "syntax", "model")
 _COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
-_TARGETS = ("targets", "targets.torch", "targets.arrays", "targets.cpp", "targets.wasm", "targets.cuda")
+_TARGETS = ("targets", "targets.torch", "targets.cpp", "targets.wasm", "targets.cuda")
 _BACK = (*_COMPILER, "model.reference", *_TARGETS)
 _STEPS = (
     "simulation.draw",
@@ -53,7 +53,6 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "schedule": ("diagnostics", "ir"),
     "targets": ("arrays", "diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
-    "targets.arrays": ("diagnostics", "ir", "schedule", "targets", "targets.torch"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch"),
     "targets.wasm": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch", "targets.cpp"),

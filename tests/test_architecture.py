@@ -283,7 +283,7 @@ def test_every_module_keeps(rule: Callable[[str, str], Iterable[str]], sources: 
         ),
         (layer_faults, "targets.torch.program", "from powderdsl.ir.stages import PIPELINE", "may not import"),
         (layer_faults, "targets.torch.program", "from powderdsl.syntax.ast import Syntax", "may not import"),
-        (layer_faults, "targets.arrays.program", "from powderdsl.targets.cpp import build", "may not import"),
+        (layer_faults, "targets.wasm.program", "from powderdsl.targets.cpp import build", "may not import"),
         (layer_faults, "targets.job", "from powderdsl.targets.cpp import build", "may not import"),
         (layer_faults, "ir.ops", "from powderdsl.model import Rule", "may not import"),
         (layer_faults, "ir.ops", "from powderdsl.ir.lower.rules import lower_ruleset", "may not import"),

@@ -237,7 +237,7 @@ def renamed_backend(name: str) -> str:
     """The current name of a backend; an old name gets a note on stderr."""
     new = RENAMED_BACKENDS.get(name, name)
     if new != name:
-        click.echo(f"note: the backend `{name}` is called `{new}` now", err=True)
+        click.echo(f"note: the backend `{name}` is `{new}` now", err=True)
     return new
 
 

@@ -15,7 +15,6 @@ from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant
 from powderdsl.schedule.cut import Cutter, Pairs
 from powderdsl.schedule.draws import DRAWS, is_coin
 from powderdsl.schedule.floats import is_comparison, of_floats
-from powderdsl.schedule.moves import is_movement
 from powderdsl.schedule.types import (
     Carried,
     Compute,
@@ -27,6 +26,7 @@ from powderdsl.schedule.types import (
     Statement,
     Var,
     combined,
+    is_movement,
     load,
 )
 

@@ -1,22 +1,15 @@
-"""Draws: thresholds of parameters, questions without draws, and the conditions under which a draw is needed."""
+"""Draws: thresholds of parameters, and the conditions under which a draw is needed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node
-from powderdsl.schedule.rewrite import map_values, without_unread
+from powderdsl.schedule.rewrite import map_values
 from powderdsl.schedule.types import (
     Compute,
-    Guard,
-    Namer,
-    Out,
     Schedule,
-    Statement,
     combined,
-    conjuncts,
-    load,
-    map_blocks,
     map_computes,
     ordered,
     with_args,
@@ -47,42 +40,6 @@ def thresholds(schedule: Schedule) -> Schedule:
         return schedule.graph.node("below_param", FLAG, (), (stream, bits, name, view), node.places)
 
     return map_values(schedule, rule)
-
-
-def cheap_questions(schedule: Schedule) -> Schedule:
-    """A guard first tests the part of its mask that needs no draws; its body makes the draws.
-
-    `p = a & b & below(limit); if any p` → `q = a & b; if any q: p = …`.
-    """
-    namer, graph = Namer(schedule), schedule.graph
-
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        result: list[Statement] = []
-        for statement in block:
-            masks = result[-1] if result else None
-            if not isinstance(statement, Guard) or not isinstance(masks, Compute):
-                result.append(statement)
-                continue
-            late, early, questions = [], [], []
-            asked = {str(node.attr) for node in statement.when if node.op == "load"}
-            for out in masks.outs:
-                cheap = _without_draws(out.value, graph) if out.var.name in asked else None
-                if cheap is None:
-                    early.append(out)
-                    continue
-                late.append(out)
-                questions.append(Out(namer.var(FLAG), cheap))
-            gone = {out.var.name for out in late}
-            when = [node for node in statement.when if node.attr not in gone or node.op != "load"]
-            when += [load(graph, out.var) for out in questions]
-            body = (replace(masks, outs=tuple(late)), *statement.body) if late else statement.body
-            nothing = graph.node("const", FLAG, (), False)
-            kept = tuple((out.var, nothing) for out in late)
-            result[-1:] = [replace(masks, outs=(*early, *questions))] if early or questions else []
-            result.append(replace(statement, when=tuple(when), body=body, keeps=(*statement.keeps, *kept)))
-        return tuple(result)
-
-    return without_unread(replace(schedule, body=map_blocks(schedule.body, change)))
 
 
 def conditions(schedule: Schedule) -> Schedule:
@@ -152,10 +109,3 @@ def takes_bits(node: Node) -> bool:
         _, bits, limit = node.attr
         return bits - ((limit & -limit).bit_length() - 1) > FEW_BITS
     return node.op in ("below_planes", "below_param", "draw")
-
-
-def _without_draws(mask: Node, graph: Graph) -> Node | None:
-    """The part of a mask without draws; None if that is all of it or nothing."""
-    parts = [(part, any(map(takes_bits, ordered([part])))) for part in conjuncts(mask)]
-    cheap = [part for part, random in parts if not random]
-    return combined("and", cheap, graph) if 0 < len(cheap) < len(parts) else None

@@ -10,7 +10,6 @@ from powderdsl.ir.ops import FLAG, Node
 from powderdsl.schedule.costs import LOGIC
 from powderdsl.schedule.draws import DRAWS
 from powderdsl.schedule.floats import is_comparison
-from powderdsl.schedule.moves import is_movement
 from powderdsl.schedule.presence import when_present
 from powderdsl.schedule.types import (
     Compute,
@@ -23,6 +22,7 @@ from powderdsl.schedule.types import (
     conjuncts,
     defined_by,
     flat,
+    is_movement,
     load,
     loaded,
     map_computes,

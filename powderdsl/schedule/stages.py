@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from powderdsl.ir.ops import PassGraph
-from powderdsl.schedule.blocks import blocks
-from powderdsl.schedule.calm import calm_pass
-from powderdsl.schedule.choices import choices
 from powderdsl.schedule.costs import Costs
 from powderdsl.schedule.cut import cut
 from powderdsl.schedule.cut_rows import cut_rows
-from powderdsl.schedule.draws import cheap_questions, conditions, thresholds
+from powderdsl.schedule.draws import conditions, thresholds
 from powderdsl.schedule.early import early
 from powderdsl.schedule.empty import empty
 from powderdsl.schedule.exact import exact
-from powderdsl.schedule.flatten import flatten
 from powderdsl.schedule.floats import chosen, late, led
 from powderdsl.schedule.join import join
 from powderdsl.schedule.lower import lower
-from powderdsl.schedule.moves import moves
 from powderdsl.schedule.narrow import ask_regions, narrow
-from powderdsl.schedule.place import place
 from powderdsl.schedule.presence import presence
 from powderdsl.schedule.release import release
 from powderdsl.schedule.rewrite import without_unread
-from powderdsl.schedule.share import share
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.updates import updates
 from powderdsl.schedule.verify import verify
@@ -39,32 +32,6 @@ class Stage:
     name: str
     apply: Callable[[Schedule], Schedule]
     about: str
-
-
-ARRAYS = (
-    Stage(
-        "thresholds",
-        thresholds,
-        "which draws are compared with a parameter; before their planes get variables",
-    ),
-    Stage("questions", cheap_questions, "guards test their masks without draws first"),
-    Stage(
-        "share",
-        share,
-        "what several statements need is computed once; after `questions`, which copies parts of masks",
-    ),
-    Stage(
-        "conditions",
-        conditions,
-        "where the result of each draw matters; after `share`, so that a draw has its own users only",
-    ),
-    Stage("moves", moves, "which planes move together; after `share`, so that their movers are variables"),
-    Stage("blocks", blocks, "moving planes lie in one array"),
-    Stage("choices", choices, "which choices between floats change only a few cells"),
-    Stage("flatten", flatten, "one operation per statement; no later stage creates operations"),
-    Stage("place", place, "which arrays are released and which are overwritten"),
-)
-"""For targets that execute one operation on all cells of all worlds before the next."""
 
 
 CUDA = (
@@ -84,7 +51,7 @@ CUDA = (
 """For blocks of threads, each of which holds some worlds in shared memory."""
 
 
-CPP = (
+CPU = (
     Stage("thresholds", thresholds, "which draws are compared with a parameter"),
     Stage("late", late, "floats are computed where they are used"),
     Stage(
@@ -123,26 +90,21 @@ CPP = (
     Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read"),
     Stage("release", release, "when a plane is no longer needed; last, after all reads have their place"),
 )
-"""For a thread that processes eight worlds side by side, plane by plane."""
+"""For a thread that processes some worlds side by side, plane by plane, in C++ or WebAssembly."""
 
 
-WASM = CPP
-"""For WebAssembly: as for C++; a product that is fused is exact, so that two operations give the same."""
-
-
-PLANNERS = {"arrays": ARRAYS, "native": CPP, "wasm": WASM, "cuda": CUDA}
+PLANNERS = {"native": CPU, "wasm": CPU, "cuda": CUDA}
 """The stages of each backend that prints schedules."""
 
 
 def plan(pass_: PassGraph, stages: tuple[Stage, ...]) -> Schedule:
-    """The schedule of a pass on bit planes, with its calm form if it has one.
+    """The schedule of a pass on bit planes.
 
     Only the last schedule is verified: verifying each one takes as long as making them. Tests verify all.
     """
     *_, (_, schedule) = steps(pass_, stages)
     verify(schedule, stages[-1].name)
-    calm = calm_pass(pass_) if stages is ARRAYS else None
-    return schedule if calm is None else replace(schedule, calm=plan(calm, stages))
+    return schedule
 
 
 def steps(pass_: PassGraph, stages: tuple[Stage, ...]) -> Iterator[tuple[str, Schedule]]:

@@ -31,7 +31,7 @@ _INFIX = {
 
 
 def print_schedule(schedule: Schedule) -> str:
-    """A schedule as text, followed by its calm form."""
+    """A schedule as text."""
     names = _Names()
     lines = [f"schedule {schedule.name}"]
     if schedule.finds:
@@ -42,9 +42,6 @@ def print_schedule(schedule: Schedule) -> str:
     lines += _block(schedule.body, "  ", names)
     for slot, node in schedule.leaves:
         lines.append(f"  leave {slot} = {_Values([node], names).text(node)}")
-    if schedule.calm is not None:
-        calm = print_schedule(schedule.calm).splitlines()
-        lines += ["  calm", *(f"  {line}" for line in calm[1:])]
     return "\n".join(lines)
 
 

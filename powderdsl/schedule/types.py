@@ -16,10 +16,7 @@ from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, walk
 ANSWER = Type("answer")
 """One truth value for all cells, such as whether a flag is set anywhere."""
 
-BLOCK, CELLS, PLACES = Type("block"), Type("cells"), Type("places")
-"""Types that only array kernels use: planes in one array, flags as bool cells, indices of cells."""
-
-_PREFIX = {"flag": "p", "real": "f", "answer": "q", "block": "b", "cells": "s", "places": "i"}
+_PREFIX = {"flag": "p", "real": "f", "answer": "q"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +30,7 @@ class Var:
 
 @dataclass(frozen=True)
 class Out:
-    """A variable and its value. `into` names the variable whose array it reuses (set by `place`).
+    """A variable and its value. `into` names the variable whose memory it reuses (set by `buffers` and `release`).
 
     `otherwise` is its value outside the statement's `region`: a constant or a load.
     """
@@ -151,8 +148,6 @@ class Schedule:
     """An answer: if it is false, the pass changes nothing."""
     buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
     """The kind and number of each variable's buffer, for targets that number buffers."""
-    calm: Schedule | None = None
-    """The pass for worlds in which all float slots that it reads are zero, if that is much less work."""
 
 
 # Values
@@ -226,6 +221,11 @@ def combined(op: Literal["and", "or"], nodes: Iterable[Node], graph: Graph) -> N
     for node in rest:
         first = graph.node(op, first.type, (first, node))
     return first
+
+
+def is_movement(node: Node) -> bool:
+    """Whether a node is a plane in which cells move."""
+    return node.op in ("swap", "arrive") and node.type == FLAG
 
 
 def conjuncts(node: Node) -> list[Node]:
@@ -334,8 +334,8 @@ class Namer:
 
 
 __all__ = [
-    "ANSWER", "BLOCK", "CELLS", "FLAG", "PLACES", "REAL",
+    "ANSWER", "FLAG", "REAL",
     "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
-    "combined", "conjuncts", "defined_by", "flat", "in_order", "load", "loaded", "map_blocks", "map_computes", "ordered",
+    "combined", "conjuncts", "defined_by", "flat", "in_order", "is_movement", "load", "loaded", "map_blocks", "map_computes", "ordered",
     "over_variables", "rewritten", "values_of", "variables", "with_args",
 ]  # fmt: skip

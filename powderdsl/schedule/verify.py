@@ -9,9 +9,6 @@ from powderdsl.ir.verify import InvalidIR
 from powderdsl.schedule.join import field_reads
 from powderdsl.schedule.types import (
     ANSWER,
-    BLOCK,
-    CELLS,
-    PLACES,
     Compute,
     Guard,
     Move,
@@ -28,7 +25,7 @@ from powderdsl.schedule.types import (
 )
 from powderdsl.schedule.updates import read_elsewhere
 
-_KINDS = ("flag", "real", ANSWER.name, BLOCK.name, CELLS.name, PLACES.name)
+_KINDS = ("flag", "real", ANSWER.name)
 
 
 def verify(schedule: Schedule, after: str) -> None:
@@ -148,19 +145,13 @@ def _is_region(node: Node | None) -> bool:
 
 
 SCHEDULE_OPS = frozenset({
-    "load",
-    "stack", "member", "swap_onto", "leave", "cells", "choose", "places", "moved", "update", "carry", "copy",
-    "below_param", "any", "when", "led", "live", "present", "fused", "ratio",
+    "load", "below_param", "any", "when", "led", "live", "present", "fused", "ratio",
 })  # fmt: skip
-"""Operations that only schedules have: `load` → what a variable holds; `stack` planes → block; `member` (block) → a plane; `swap` (block, movers) and
-`leave` (block, movers) → block; `arrive` and `swap_onto` (block, movers, rest) → block; `cells` (flag) → bool cells;
-`choose` (cells, yes, no) → floats; `places` (flag) → where it holds, `moved` (places) → their neighbors; `update`
-(places, no, other) → `no`, and there `other` added to it, taken off or multiplied; `carry` (places, moved, no, other) →
-the same at neighbors with what `other` has at the places; `copy` (floats) → the same in an array of their own;
-`below_param` → a draw below a parameter; `any` (flag) → whether it holds in some cell; `when` (flag, flag) → both, the
-second computed only in words where the first holds somewhere; `fused` (a, b, c) → a + b·c, where b·c
-is exact, `ratio` (a, b) → a / b far from the limits of floats (`exact`); `led` (comparison, comparison) → the same in cells; `live` (floats), attribute (rows, reach) → whether the field may be
-other than zero so many rows down, at most so many columns to either side."""
+"""Operations that only schedules have: `load` → what a variable holds; `below_param` → a draw below a parameter; `any`
+(flag) → whether it holds in some cell; `when` (flag, flag) → both, the second computed only in words where the first
+holds somewhere; `led` (comparison, comparison) → the same in cells; `fused` (a, b, c) → a + b·c, where b·c is exact;
+`ratio` (a, b) → a / b far from the limits of floats (`exact`); `live` (floats), attribute (rows, reach) → whether the
+field may be other than zero so many rows down, at most so many columns to either side."""
 
 
 def _demand(holds: bool, message: str) -> None:

@@ -1,6 +1,7 @@
-"""The backend `auto` on the CPU: it starts on arrays and switches to native code. Both give the same worlds, bit for bit.
+"""The backend `auto` on the CPU: it starts on WebAssembly and switches to native code. Both give the same worlds.
 
-Code that was compiled before is loaded when the program is made. Otherwise arrays run; once the work done and asked
+Native code that was compiled before is loaded when the program is made. Otherwise WebAssembly runs, or torch on machines
+that wasmtime has no wheel for; once the work done and asked
 for is worth it, a thread compiles in the background. The change comes between two steps: long calls are cut into slices
 for it. Short scripts never start a compiler.
 """
@@ -21,11 +22,11 @@ from powderdsl.targets.cpp.compilers import INSTALL, MISSING, NoCompiler, NoComp
 from powderdsl.targets.job import Job, Runnable
 
 WORTH = 2.0
-"""Native code is compiled once work on arrays, done or expected in the current call, exceeds this many seconds.
+"""Native code is compiled once work on the first backend, done or expected in the current call, exceeds this many seconds.
 Compiling takes longer, but runs in another thread, and its result is cached."""
 
 SLICE = 0.25
-"""Seconds on arrays between two checks for native code."""
+"""Seconds on the first backend between two checks for native code."""
 
 
 class Build:
@@ -45,7 +46,7 @@ class Build:
             self.program = self._make()
         except NoCompiler as error:
             self.problem = str(error)
-        except Exception as error:  # arrays continue; `--backend native` shows what is wrong
+        except Exception as error:  # what runs continues; `--backend native` shows what is wrong
             self.problem = f"{type(error).__name__}: {error}"
         self._took = time.perf_counter() - self._began
 
@@ -61,28 +62,30 @@ class Build:
 
 
 class AutoProgram:
-    """Runs on arrays until native code has been compiled.
+    """Runs on a backend that starts at once until native code has been compiled.
 
     Args:
-        arrays: gives the program on arrays, the same at each call.
+        first: the name of that backend, and a function that gives its program, the same at each call.
+        asked: gives the program for jobs with given draws or chosen passes.
         ready: native code that was compiled before, or None; raises NoCompiler if none could be made.
         make: native code, compiled; raises NoCompiler.
     """
 
     def __init__(
         self,
-        arrays: Callable[[], Runnable],
+        first: tuple[str, Callable[[], Runnable]],
+        asked: Callable[[], Runnable],
         ready: Callable[[], Runnable | None],
         make: Callable[[], Runnable],
     ):
-        self._arrays, self._make = arrays, make
+        (self._name, self._first), self._asked, self._make = first, asked, make
         self._build: Build | None = None
         self._native: Runnable | None = None
         self._problem = ""
         self._beginning = threading.Lock()
         self._spent = 0.0
-        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on arrays
-        self._steps = {"arrays": 0, "native": 0, "asked": 0}
+        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on the first backend
+        self._steps = {"first": 0, "native": 0, "asked": 0}
         try:
             self._native = ready()
         except NoCompiler as error:
@@ -90,41 +93,41 @@ class AutoProgram:
 
     @property
     def running(self) -> str:
-        """What the next step runs on: ``arrays`` or ``native``."""
-        return "arrays" if self._arrived() is None else "native"
+        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
+        return self._name if self._arrived() is None else "native"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about which backend ran, and why."""
-        native, steps, build = self._arrived(), self._steps, self._build
+        native, steps, build, first = self._arrived(), self._steps, self._build, self._name
         found = []
         if native is not None and build is None:
             found.append("native: it was compiled before")
         elif native is not None and build is not None:
             found.append(
-                f"arrays for {steps['arrays']} steps while native was made ready ({build.seconds:.0f} s), "
+                f"{first} for {steps['first']} steps while native was made ready ({build.seconds:.0f} s), "
                 f"then native for {steps['native']}"
             )
         elif self._problem:
-            found.append(f"arrays: {self._problem}")
+            found.append(f"{first}: {self._problem}")
             found.append(f"native code is faster: {INSTALL}")
         elif build is not None and not build.lost:
             found.append(
-                f"arrays for {steps['arrays']} steps; native is being made ready ({build.seconds:.0f} s)"
+                f"{first} for {steps['first']} steps; native is being made ready ({build.seconds:.0f} s)"
             )
         else:
-            found.append(f"arrays: native is compiled from {WORTH:g} s of work, or by --backend native")
+            found.append(f"{first}: native is compiled from {WORTH:g} s of work, or by --backend native")
         if steps["asked"]:
-            found.append(f"arrays for {steps['asked']} steps with given draws or chosen passes")
+            found.append(f"torch for {steps['asked']} steps with given draws or chosen passes")
         return tuple(found)
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
         if job.draws or job.passes is not None:
             self._steps["asked"] += job.steps
-            return self._arrays().run(job)
+            return self._asked().run(job)
         if job.timing is not None:
-            return (self._arrived() or self._arrays()).run(job)
+            return (self._arrived() or self._first()).run(job)
         clock, part, done = job.clock, job, 0
         while True:
             native = self._arrived()
@@ -133,7 +136,7 @@ class AutoProgram:
                 return native.run(part)
             count = self._slice(job, job.steps - done)
             began = time.perf_counter()
-            state = self._arrays().run(part._replace(steps=count))
+            state = self._first().run(part._replace(steps=count))
             done += count
             later = clock._replace(since=clock.since + done)
             part = part._replace(state=state, clock=later, steps=job.steps - done)
@@ -142,7 +145,7 @@ class AutoProgram:
                 return state
 
     def _slice(self, job: Job, left: int) -> int:
-        """The number of steps to run on arrays before the next check: one until their speed is known."""
+        """The number of steps to run on the first backend before the next check: one until their speed is known."""
         if self._problem:
             return left
         cells = job.state["element"].numel()
@@ -151,10 +154,10 @@ class AutoProgram:
         return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
 
     def _account(self, job: Job, count: int, left: int, seconds: float) -> None:
-        """Count steps that ran on arrays, and start to compile once that is worth it."""
+        """Count steps that ran on the first backend, and start to compile once that is worth it."""
         if count == 0:
             return
-        self._steps["arrays"] += count
+        self._steps["first"] += count
         self._spent += seconds
         cells = job.state["element"].numel()
         # The first step makes what later ones reuse: its duration does not predict theirs.
@@ -207,7 +210,7 @@ class AutoByWidth(ByWidth[AutoProgram]):
 
     @property
     def running(self) -> str:
-        """What the next step runs on: ``arrays`` or ``native``."""
+        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
         return self._latest.running
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
+from importlib.util import find_spec
 
 import torch
 from torch import Tensor
@@ -60,7 +61,7 @@ def find_device(name: str | torch.device) -> torch.device:
 
 
 class CompiledProgram:
-    """Native code or kernels for whole steps; the program without a compiler where draws are given or passes chosen."""
+    """Compiled code for whole steps; torch tensors where draws are given or passes chosen."""
 
     def __init__(self, native: Runnable, rest: Callable[[], Runnable], running: str = "native"):
         self._native, self._rest, self.running = native, rest, running
@@ -81,25 +82,24 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         return ReferenceProgram(ruleset)
     # Both are made when first needed: code that was compiled before needs neither.
     lowered = cache(lambda: lower(ruleset))
-    begin = _array_program if starting_backend(device.type) == "arrays" else _torch_program
-    starting = cache(lambda: begin(lowered(), device))
+    cells = cache(lambda: _torch_program(lowered(), device))
     if backend == "torch":
-        return _torch_program(lowered(), device)
-    if backend == "arrays":
-        return _array_program(lowered(), device)
+        return cells()
     if backend == "wasm":
-        return CompiledProgram(_wasm_program(lowered(), device), starting, "wasm")
+        return CompiledProgram(_wasm_program(lowered(), device), cells, "wasm")
     if backend == "native":
-        return CompiledProgram(_native(ruleset, lowered, device, threads), starting)
+        return CompiledProgram(_native(ruleset, lowered, device, threads), cells)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
         from powderdsl.targets.cuda.program import cuda_program
 
         with suppress(CompileError) if backend == "auto" else nullcontext():
-            return CompiledProgram(cuda_program(lowered(), device), starting, "cuda")
+            return CompiledProgram(cuda_program(lowered(), device), cells, "cuda")
     if backend == "auto" and device.type == "cpu":
         from powderdsl.simulation.auto import AutoByWidth, AutoProgram
         from powderdsl.simulation.native_start import latest_words, native_program, ready_program
 
+        first = starting_backend(device.type)
+        begin = cache(lambda: _wasm_program(lowered(), device)) if first == "wasm" else cells
         latest = None
         with suppress(NoCompiler):
             latest = latest_words(ruleset)
@@ -107,13 +107,14 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
             lowered()  # what cannot be lowered is reported before the first step
         return AutoByWidth(
             lambda words: AutoProgram(
-                starting,
+                (first, begin),
+                cells,
                 lambda: ready_program(ruleset, lowered, threads, words),
                 lambda: native_program(ruleset, lowered, threads, words),
             ),
             latest or 0,
         )
-    return starting()
+    return cells()
 
 
 def _torch_program(program: Program, device: torch.device) -> Runnable:
@@ -122,25 +123,17 @@ def _torch_program(program: Program, device: torch.device) -> Runnable:
     return TorchProgram(program, device)
 
 
-def _array_program(program: Program, device: torch.device) -> Runnable:
-    """On the CPU only; passes that do not fit bit planes run on torch tensors."""
-    from powderdsl.targets.arrays.program import ArrayProgram
-    from powderdsl.targets.torch.mixed import packed_program
-
-    if device.type != "cpu":
-        problem = "NumPy's arrays are in the memory of the CPU"
-        raise _refusal("arrays", problem, _ELSEWHERE.format(device))
-    return packed_program(program, device, ArrayProgram)
-
-
 def _wasm_program(program: Program, device: torch.device) -> Runnable:
     """On the CPU only; passes that do not fit bit planes run on torch tensors."""
+    if device.type != "cpu":
+        raise _refusal("wasm", "wasmtime runs on the CPU", _ELSEWHERE.format(device))
+    if find_spec("wasmtime") is None:
+        problem = "the package `wasmtime` is missing, which has no wheel for some machines"
+        raise _refusal("wasm", problem, "`pip install wasmtime`, or run on the backend `torch` or `native`")
     from powderdsl.targets.tensor_kind import Tensors
     from powderdsl.targets.torch.mixed import packed_program
     from powderdsl.targets.wasm.program import WasmProgram
 
-    if device.type != "cpu":
-        raise _refusal("wasm", "wasmtime runs on the CPU", _ELSEWHERE.format(device))
     kind = Tensors()
     return packed_program(program, device, lambda numbers, planes: WasmProgram(numbers, planes, kind))
 
@@ -168,7 +161,7 @@ def _compiler_needed() -> Iterator[None]:
     try:
         yield
     except NoCompiler as error:
-        help = f"run on the backend `arrays`, or {INSTALL}"
+        help = f"run on the backend `wasm`, or {INSTALL}"
         raise _refusal("native", str(error), help) from None
 
 

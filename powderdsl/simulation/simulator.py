@@ -134,7 +134,7 @@ class Simulator:
 
     @property
     def running(self) -> str:
-        """The backend that the next step runs on: for ``auto`` on the CPU, ``arrays`` or ``native``."""
+        """The backend that the next step runs on: for ``auto`` on the CPU, ``wasm`` (or ``torch``) or ``native``."""
         at_once = starting_backend(self.device.type) if self.backend == "auto" else self.backend
         return str(getattr(self._program, "running", at_once))
 

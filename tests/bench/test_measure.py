@@ -30,7 +30,7 @@ def rules():
 
 def test_a_plan_is_a_cross_product_without_repeats(rules):
     plan = make_plan(
-        rules, backends=["arrays", "torch"], batches=[1, 4, 1], sizes=[(8, 8), (4, 6)], elements=[2, 3]
+        rules, backends=["wasm", "torch"], batches=[1, 4, 1], sizes=[(8, 8), (4, 6)], elements=[2, 3]
     )
     assert len(plan.cells) == len(set(plan.cells)) == 16
     assert {cell.elements for cell in plan.cells} == {("empty", "wall"), ("empty", "wall", "sand")}
@@ -140,7 +140,7 @@ def test_rounds_are_interleaved():
 
 
 def test_all_cells_are_ready_before_the_first_round_and_costs_come_last(rules, torch):
-    plan = make_plan(rules, backends=["torch", "arrays"], profile=True, **TINY)
+    plan = make_plan(rules, backends=["torch", "wasm"], profile=True, **TINY)
     kinds = [kind for kind, _ in measuring(plan, [])]
     assert kinds == ["compile"] * 4 + ["measure"] * 8 + ["profile"] * 4
 
@@ -159,7 +159,7 @@ def test_torch_has_its_threads_back(rules, torch):
 
 @pytest.fixture(scope="module")
 def report(rules):
-    plan = make_plan(rules, backends=["reference", "arrays"], elements=[2, 4], profile=True, **TINY)
+    plan = make_plan(rules, backends=["reference", "wasm"], elements=[2, 4], profile=True, **TINY)
     return measure(plan)
 
 
@@ -244,7 +244,7 @@ def test_peak_memory_sees_what_was_freed():
 # What passes cost
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
 def test_every_backend_profiles_every_pass(backend, tmp_path, torch):
     rules = powderdsl.load("core+sand")  # little to compile
     with building(Building("-O0", tmp_path)):

@@ -17,7 +17,7 @@ MACHINE = Machine("Linux", "some processor", 4, "cpu", "3", "2", "none", "0", lo
 
 
 def a_report(sizes):
-    plan = make_plan(powderdsl.load("life"), backends=["arrays", "native"], batches=[1, 32], sizes=sizes)
+    plan = make_plan(powderdsl.load("life"), backends=["wasm", "native"], batches=[1, 32], sizes=sizes)
     memory, times = Memory(0, "not at all"), [1.0, 2.0]
     cells = [CellFigures(cell, 1.0, 1.0, memory, 100, 2, 5, times, times) for cell in plan.cells]
     return make_report(plan, MACHINE, cells)

@@ -31,11 +31,11 @@ def listed(names: tuple[str, ...]) -> str:
 @pytest.mark.slow
 def test_a_run_reports_saves_its_state_and_goes_on(tmp_path: Path) -> None:
     options = ("fuzz", "--jobs", 1, "--worlds", 2, "--steps", 1, "--save", tmp_path / "found")
-    options += ("--backends", "torch,arrays")
+    options += ("--backends", "torch,wasm")
     first = process(*options, "--seeds", "0..2")
     assert first.returncode == 0, first.stderr
     assert "2 rulesets" in first.stdout
-    assert "torch and arrays against the reference" in first.stdout
+    assert "torch and wasm against the reference" in first.stdout
     assert "no differences found" in first.stdout
     assert "bit planes" in first.stdout
     second = process(*options, "--seeds", "0..3", "--resume")
@@ -66,7 +66,7 @@ def test_without_a_compiler_the_others_are_compared(tmp_path: Path, monkeypatch:
     assert usual.exit_code == 0
     assert "without `native` and `cuda-emulated`: no C++ compiler" in usual.stderr
     assert f": {listed(STARTS_AT_ONCE)} against the reference" in usual.stdout
-    asked = powderdsl(*given, "--backends", "arrays,cuda-emulated")
+    asked = powderdsl(*given, "--backends", "wasm,cuda-emulated")
     assert asked.exit_code == 2
     assert "leave `cuda-emulated` out of --backends" in asked.stderr
 
@@ -74,22 +74,22 @@ def test_without_a_compiler_the_others_are_compared(tmp_path: Path, monkeypatch:
 def test_a_run_and_a_case_with_old_names_go_on(tmp_path: Path) -> None:
     """What was saved when `torch` was `dense` and `arrays` was `planes`."""
     given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path)
-    assert powderdsl(*given, "--seeds", "0..1", "--backends", "torch,arrays").exit_code == 0
+    assert powderdsl(*given, "--seeds", "0..1", "--backends", "torch,wasm").exit_code == 0
     state = tmp_path / "state.json"
-    state.write_text(state.read_text().replace("torch,arrays", "dense,planes"))
+    state.write_text(state.read_text().replace("torch,wasm", "dense,planes"))
     again = powderdsl(*given, "--seeds", "0..1", "--backends", "dense,planes", "--resume")
     assert again.exit_code == 0, again.stderr
-    assert "note: the backend `planes` is called `arrays` now" in again.stderr
+    assert "note: the backend `planes` is `wasm` now" in again.stderr
     text = random_ruleset_text(0)
     start = next(seeded_starts(load_text(text), 0, 1))
     write_case(tmp_path / "case.yaml", Case(text, start, 1, "planes"))
-    assert read_case(tmp_path / "case.yaml").backend == "arrays"
+    assert read_case(tmp_path / "case.yaml").backend == "wasm"
 
 
 @pytest.mark.slow
 def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
     line = command_line(
-        "fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path, "--backends", "arrays"
+        "fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path, "--backends", "wasm"
     )
     state = tmp_path / "state.json"
     with started([*line, "--seeds", "0..100000"], env=environment_with(), stdout=subprocess.PIPE) as running:
@@ -108,7 +108,7 @@ def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
     [
         (("--seeds", "5..2"), "is not a range of seeds"),
         (("--backends", "torch,sparse"), "no backend `sparse`"),
-        (("--backends", "torch,arrays,torch"), "`torch` is named twice: nothing is compared with itself"),
+        (("--backends", "torch,wasm,torch"), "`torch` is named twice: nothing is compared with itself"),
         (("--backends", "dense,torch"), "`torch` is named twice: nothing is compared with itself"),
         (("--backends", "reference"), "the reference is not compared with itself"),
         (("--seeds", "0..2", "--seconds", "3"), "not both"),
@@ -139,7 +139,7 @@ def test_a_wrong_backend_is_found_reduced_and_replayed(
 
     def wrong(ruleset: Any, backend: str, how: Building, threads: int) -> Simulator:
         simulator = compiled(ruleset, backend, how, threads)
-        if backend == "arrays":
+        if backend == "wasm":
             step = simulator.step
 
             def broken(world: Any, *args: Any, **options: Any) -> Any:
@@ -153,7 +153,7 @@ def test_a_wrong_backend_is_found_reduced_and_replayed(
         return simulator
 
     monkeypatch.setattr(differential, "_compiled", wrong)
-    plan = differential.Plan(("arrays",), worlds=2, steps=2)
+    plan = differential.Plan(("wasm",), worlds=2, steps=2)
     outcomes = (differential.run_seed(seed, plan) for seed in range(20))
     finding = next(found for outcome in outcomes for found in outcome.findings)
     small = reduce_case(finding.case, differential.still_fails(finding, plan.building))
@@ -164,10 +164,10 @@ def test_a_wrong_backend_is_found_reduced_and_replayed(
     assert "fields" not in (tmp_path / "case.yaml").read_text() or small.start.fields
     replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
     assert replayed.exit_code == 1
-    assert "arrays differs after step 1: `element`" in replayed.stdout
+    assert "wasm differs after step 1: `element`" in replayed.stdout
     monkeypatch.setattr(differential, "_compiled", compiled)
     differential._simulator.cache_clear()
     replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
     assert replayed.exit_code == 0
-    assert "arrays and the reference agree" in replayed.stdout
+    assert "wasm and the reference agree" in replayed.stdout
     assert read_case(tmp_path / "case.yaml").text == small.text

@@ -199,7 +199,7 @@ JSON = {
         "bench",
         "life",
         "--backend",
-        "arrays",
+        "wasm",
         "--seconds",
         "0.01",
         "--rounds",

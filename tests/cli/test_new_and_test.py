@@ -177,7 +177,7 @@ def test_conditions_may_read_fields_draws_and_parameters(folder):
 def test_both_backends_agree(folder):
     (folder / "grit.yaml").write_text(PACK + TESTS.replace(". x x .", ". x . ."))
     rules = package.load("core", "grit.yaml")
-    assert run_examples(rules, backend="arrays") == run_examples(rules, backend="reference")
+    assert run_examples(rules, backend="wasm") == run_examples(rules, backend="reference")
 
 
 def test_no_tests_are_no_failure(folder):

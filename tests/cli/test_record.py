@@ -43,7 +43,7 @@ def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
         "--seed",
         2,
         "--backend",
-        "arrays",
+        "wasm",
     )
     more = ("--knob", "disks=2", "--set", "water.melt=50%", "--split", "test", "--worlds", 5)
     done = powderdsl(*command, *more, "--policy", "nothing", "--observation", "compact", "--compress")
@@ -123,7 +123,7 @@ EPISODES = 600
 @contextmanager
 def recording(task: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
     """A process that has just written a shard and has many before it."""
-    given = ("--episodes", EPISODES, "--shard", 3, "--envs", 8, "--backend", "arrays")
+    given = ("--episodes", EPISODES, "--shard", 3, "--envs", 8, "--backend", "wasm")
     command = command_line("record", task, "--out", out, *given)
     seen = len(list(out.glob("shard-*")))
     with started(command, env=environment_with(), stderr=subprocess.PIPE) as running:
@@ -144,7 +144,7 @@ def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> 
     for delay in (0.0, 0.013, 0.037):
         with recording(task, out):
             time.sleep(delay)
-    program = compile_task(str(task), backend="arrays")
+    program = compile_task(str(task), backend="wasm")
     for folder in (out, other):
         record(program, "random", folder, episodes=EPISODES, shard=3)
     names = sorted(path.name for path in out.glob("*shard*"))
@@ -156,13 +156,13 @@ def test_a_trained_agent_is_recorded(task: Path, tmp_path: Path) -> None:
     """It acts as it does elsewhere: on what it was trained to see, by the keys of the episode."""
     run, out = tmp_path / "dunes", tmp_path / "data"
     few = ("--preset", "small", "--observation", "compact", "--envs", 2, "--rollout", 4, "--batch", 8)
-    trained = powderdsl("train", task, "--run", run, *few, "--steps", 8, "--epochs", 1, "--backend", "arrays")
+    trained = powderdsl("train", task, "--run", run, *few, "--steps", 8, "--epochs", 1, "--backend", "wasm")
     assert trained.exit_code == 0, trained.stderr
-    command = ("record", task, "--out", out, "--episodes", 3, "--backend", "arrays", "--policy", run)
+    command = ("record", task, "--out", out, "--episodes", 3, "--backend", "wasm", "--policy", run)
     assert powderdsl(*command).exit_code == 0
     data = Dataset.open(out)
     assert data.recipe.policy.startswith("dunes, checkpoint 000000000008-")
-    env = TensorEnv(str(task), 1, observation="compact", backend="arrays", autoreset_mode="disabled")
+    env = TensorEnv(str(task), 1, observation="compact", backend="wasm", autoreset_mode="disabled")
     policy = load_policy(run, env)
     for number in range(3):
         observed, _ = env.reset(seed=number)
@@ -178,13 +178,13 @@ def test_a_dataset_goes_to_minari_and_back(
     pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     out, again, third = tmp_path / "data", tmp_path / "again", tmp_path / "third"
-    data = record(str(task), "random", out, episodes=3, backend="arrays")
+    data = record(str(task), "random", out, episodes=3, backend="wasm")
     written = powderdsl("record", "--out", out, "--to-minari", "me/small-v0")
     assert written.exit_code == 0, written.stderr
     assert written.stderr == f"me/small-v0: 3 episodes, {data.steps} transitions\n"
     assert powderdsl("record", "--out", again, "--from-minari", "me/small-v0").exit_code == 0
     assert (again / "shard-000000.npz").read_bytes() == (out / "shard-000000.npz").read_bytes()
-    done = powderdsl("record", task, "--out", third, "--from-minari", "me/small-v0", "--backend", "arrays")
+    done = powderdsl("record", task, "--out", third, "--from-minari", "me/small-v0", "--backend", "wasm")
     assert done.exit_code == 0, done.stderr
     assert (third / "shard-000000.npz").read_bytes() == (out / "shard-000000.npz").read_bytes()
     for words, says in (

@@ -54,7 +54,7 @@ def test_every_ruleset_shows_something(name):
 
 
 def test_torch_runs_too():
-    one = powderdsl("run", "core+grit.yaml", "--size", "12x20", "--steps", "3", "--backend", "arrays")
+    one = powderdsl("run", "core+grit.yaml", "--size", "12x20", "--steps", "3", "--backend", "wasm")
     other = powderdsl("run", "core+grit.yaml", *FAST)
     assert one.exit_code == 0
     assert one.stdout == other.stdout

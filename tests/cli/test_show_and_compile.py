@@ -164,7 +164,7 @@ def test_every_stage_can_be_printed(stage, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out.txt"]
 
 
-@pytest.mark.parametrize("backend", ["arrays", "torch", "native"])
+@pytest.mark.parametrize("backend", ["wasm", "torch", "native"])
 def test_every_backend_shows_its_kernels(backend):
     result = powderdsl("compile", "life", "--emit", "kernels", "--backend", backend)
     assert result.exit_code == 0

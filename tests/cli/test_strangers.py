@@ -90,7 +90,7 @@ MODEL = [
     "--refresh",
     "2",
     "--backend",
-    "arrays",
+    "wasm",
 ]
 AGENT = [
     "--preset",
@@ -108,7 +108,7 @@ AGENT = [
     "--steps",
     "8",
     "--backend",
-    "arrays",
+    "wasm",
 ]
 PACKS = {"slime": ELEMENT, "heat": FIELD, "crab": CREATURE, "bugs": AUTOMATON}
 
@@ -140,25 +140,21 @@ def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
         "--steps",
         "3",
         "--backend",
-        "arrays",
+        "wasm",
         "--out",
         "w.npz",
     )
     run("wm", "train", "--task", "pool.yaml", *MODEL, "--run", "less")
-    run(
-        "wm", "finetune", "less", "--packs", file, "--iterations", "2", "--backend", "arrays", "--run", "more"
-    )
-    run("wm", "eval", "more", "--split", "train", "--worlds", "2", "--backend", "arrays")
+    run("wm", "finetune", "less", "--packs", file, "--iterations", "2", "--backend", "wasm", "--run", "more")
+    run("wm", "eval", "more", "--split", "train", "--worlds", "2", "--backend", "wasm")
     held = ["--rules", f"powderworld+{file}", "--held-out", name]
     run("wm", "train", "--task", "pool.yaml", *held, *MODEL, "--run", "held")
-    run(
-        "wm", "finetune", "held", "--packs", name, "--iterations", "2", "--backend", "arrays", "--run", "back"
-    )
+    run("wm", "finetune", "held", "--packs", name, "--iterations", "2", "--backend", "wasm", "--run", "back")
     run("train", "pool.yaml", *AGENT, "--packs", file, "--run", "agent")
     run("evaluate", "agent", "--episodes", "2")
     run("train", "pool.yaml", *AGENT, "--slots", "16", "--observation", "compact", "--run", "roomy")
     run("evaluate", "roomy", "--packs", file, "--episodes", "2")
-    run("record", "pool.yaml", "--packs", file, "--out", "data", "--episodes", "2", "--backend", "arrays")
+    run("record", "pool.yaml", "--packs", file, "--out", "data", "--episodes", "2", "--backend", "wasm")
     palettes = [
         json.loads(Path(one, "run.json").read_text())["config"]["palette"] for one in ("more", "back")
     ]

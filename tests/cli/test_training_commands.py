@@ -33,7 +33,7 @@ QUICK = (
 def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_task(tmp_path)
-    trained = run("train", "task.yaml", *QUICK, "--backend", "arrays", "--steps", "0.4e2", "--knob", "size=3")
+    trained = run("train", "task.yaml", *QUICK, "--backend", "wasm", "--steps", "0.4e2", "--knob", "size=3")
     assert trained.exit_code == 0, trained.output
     assert "runs/task-seed0: 64 interactions" in trained.output
     about = json.loads(Path("runs/task-seed0/run.json").read_text())
@@ -93,7 +93,7 @@ def test_what_cannot_be_done(
 @pytest.mark.slow
 def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "powderdsl", "train", str(write_task(tmp_path)), *QUICK]
-    command += ["--run", str(tmp_path / "run"), "--steps", "1e9", "--backend", "arrays"]
+    command += ["--run", str(tmp_path / "run"), "--steps", "1e9", "--backend", "wasm"]
     lines = tmp_path / "run" / "metrics.jsonl"
     with started(command, stderr=subprocess.PIPE) as child:
         assert waited(lambda: lines.exists() and lines.read_text().count("\n") > 2)

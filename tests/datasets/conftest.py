@@ -16,7 +16,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> TaskProgram:
     torch.set_num_threads(1)
     path = tmp_path_factory.mktemp("tasks") / "small.yaml"
     path.write_text(SMALL, encoding="utf-8")
-    return compile_task(str(path), backend="arrays")
+    return compile_task(str(path), backend="wasm")
 
 
 @pytest.fixture(scope="session")

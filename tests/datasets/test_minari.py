@@ -106,12 +106,12 @@ def test_a_shipped_task_is_recovered(tmp_path: Path, params: dict[str, float]) -
         episodes=1,
         max_episode_steps=3,
         seed=11,
-        backend="arrays",
+        backend="wasm",
         knobs={"complexity": 2},
         params=params,
     )
     found = to_minari(data, ID)
-    env = found.recover_environment(backend="arrays")
+    env = found.recover_environment(backend="wasm")
     assert found.env_spec.kwargs["params"] == params
     one = found[0]
     assert env.action_space == found.action_space
@@ -219,7 +219,7 @@ def test_strangers_need_a_task(small: TaskProgram, recorded: Dataset, tmp_path: 
     assert found.code == "PD630"
     assert "task=" in found.helps[0]
     with pytest.raises(CompileError, match="its observations are not uint8"):
-        from_minari(ID, tmp_path / "a", task="sand-pushing", max_episode_steps=3, backend="arrays")
+        from_minari(ID, tmp_path / "a", task="sand-pushing", max_episode_steps=3, backend="wasm")
     with pytest.raises(TypeError, match="only with a task"):
         from_minari(ID, tmp_path / "a", shard=3)
     with pytest.raises(CompileError, match="No such file"):

@@ -43,8 +43,8 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def small(task_file: Path) -> TaskProgram:
-    """The small task on the backend `arrays`."""
+    """The small task on the backend `wasm`."""
     import torch
 
     torch.set_num_threads(1)
-    return compile_task(str(task_file), backend="arrays")
+    return compile_task(str(task_file), backend="wasm")

@@ -45,7 +45,7 @@ def test_both_checkers_pass_without_a_warning(name: str, simulators: dict[str, S
     task = load_task(name)
     simulator = simulators.get(task.ruleset.name)
     if simulator is None or simulator.ruleset != task.ruleset:
-        simulator = simulators[task.ruleset.name] = compile_rules(task.ruleset, "arrays")
+        simulator = simulators[task.ruleset.name] = compile_rules(task.ruleset, "wasm")
     program = TaskProgram(task, "train", simulator)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -60,7 +60,7 @@ def test_the_checkers_look_at_rendering_and_specs_too() -> None:
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make("powderdsl/SandPushing-v0", backend="arrays", render_mode="ansi")
+        env = gymnasium.make("powderdsl/SandPushing-v0", backend="wasm", render_mode="ansi")
         check_gymnasium(env.unwrapped)
         check_sb3(env.unwrapped, skip_render_check=False)
 

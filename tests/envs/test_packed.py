@@ -1,4 +1,4 @@
-"""Worlds that stay packed in native memory through actions, steps and restarts are those of the backend `arrays`."""
+"""Worlds that stay packed in native memory through actions, steps and restarts are those of the backend `wasm`."""
 
 from __future__ import annotations
 

@@ -65,13 +65,13 @@ def rows_of(path: Path) -> list[dict[str, float]]:
 
 
 def common(task: Path, out: Path) -> list[str]:
-    return ["--task", str(task), "--backend", "arrays", "--worlds", "32", "--out", str(out)]
+    return ["--task", str(task), "--backend", "wasm", "--worlds", "32", "--out", str(out)]
 
 
 def test_behavior_cloning_imitates_on_worlds_it_has_not_seen(
     torch: Any, task: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    record(str(task), "expert", "data", episodes=150, backend="arrays")
+    record(str(task), "expert", "data", episodes=150, backend="wasm")
     out = tmp_path / "curve.csv"
     options = ["--data", "data", "--updates", "150", "--every", "50", "--lr", "0.005"]
     found = script("behavior_cloning")([*common(task, out), *options])
@@ -97,8 +97,8 @@ def test_ppo_rises_above_random_play(torch: Any, task: Path, tmp_path: Path) -> 
 
 
 def test_iql_plays_better_than_its_data(torch: Any, task: Path, tmp_path: Path) -> None:
-    record(str(task), "random", "random", episodes=200, backend="arrays")
-    record(str(task), "expert", "expert", episodes=20, backend="arrays")
+    record(str(task), "random", "random", episodes=200, backend="wasm")
+    record(str(task), "expert", "expert", episodes=20, backend="wasm")
     out = tmp_path / "curve.csv"
     options = ["--data", "random", "expert", "--updates", "250", "--lr", "0.003"]
     found = script("iql")([*common(task, out), *options])

@@ -42,7 +42,7 @@ class SeedsType(click.ParamType):
 
 
 class BackendsType(click.ParamType):
-    """`torch,arrays`: what is compared with the reference, each once, joined by commas. The reference may be among them."""
+    """`torch,wasm`: what is compared with the reference, each once, joined by commas. The reference may be among them."""
 
     name = "NAMES"
 
@@ -119,7 +119,7 @@ def command(
 
     \b
         python -m tests.fuzz --seconds 60
-        python -m tests.fuzz --seeds 0..5000 --backends torch,arrays,native
+        python -m tests.fuzz --seeds 0..5000 --backends torch,wasm,native
         python -m tests.fuzz --replay fuzz/seed7-native.yaml
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it

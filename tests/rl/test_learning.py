@@ -42,7 +42,7 @@ expert:
 def test_a_score_for_each_bin_and_deed(tmp_path: Path) -> None:
     idle = DIG.replace("[empty, blow]", "[empty, blow, nothing]")
     for text, count in ((DIG, 160), (idle, 161)):  # 16 bins: empty, and nine ways to blow
-        env = TensorEnv(str(write_task(tmp_path, text)), 1, observation="ids", backend="arrays")
+        env = TensorEnv(str(write_task(tmp_path, text)), 1, observation="ids", backend="wasm")
         how = fcn_policy(env, 8)
         policy = BinPolicy(env.observation.space, env.single_action_space, lambda _: 1e-3, **how)
         observed, _ = env.reset(seed=0)
@@ -61,7 +61,7 @@ def test_a_score_for_each_bin_and_deed(tmp_path: Path) -> None:
 
 def test_a_policy_takes_the_expert_from_a_dataset(tmp_path: Path) -> None:
     task = write_task(tmp_path, AIM)
-    record(load_task(task), "expert", tmp_path / "data", episodes=200, backend="arrays")
+    record(load_task(task), "expert", tmp_path / "data", episodes=200, backend="wasm")
     how = {"network": "fcn", "features": 16, "init_from": str(tmp_path / "data"), "init_epochs": 160}
     run = train(quick(task, steps=1, learning_rate=1e-9, **how), tmp_path / "run")
     trained, expert, at_random, nothing = evaluate(
@@ -88,7 +88,7 @@ def test_a_run_records_the_expert_that_it_imitates(tmp_path: Path) -> None:
     assert "clone/loss" in (run.path / "metrics.jsonl").read_text()
     found = Dataset.open(run.path / "demonstrations")
     assert [int(found.episode(number).world) for number in (0, 19)] == [60, 79]  # other seeds, other worlds
-    record(load_task(task), "expert", tmp_path / "data", episodes=20, seed=60, backend="arrays")
+    record(load_task(task), "expert", tmp_path / "data", episodes=20, seed=60, backend="wasm")
     by_hand = quick(task, **how | {"init_expert": 0, "init_from": str(tmp_path / "data")})
     assert same(
         run.checkpoint().state["policy"], train(by_hand, tmp_path / "run2").checkpoint().state["policy"]
@@ -112,7 +112,7 @@ def test_what_cannot_be_imitated_is_refused(tmp_path: Path) -> None:
 def test_a_dataset_of_another_task_is_refused(tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
-    record(load_task(write_task(other, PLACE)), "random", tmp_path / "data", episodes=4, backend="arrays")
+    record(load_task(write_task(other, PLACE)), "random", tmp_path / "data", episodes=4, backend="wasm")
     config = quick(write_task(tmp_path), init_from=str(tmp_path / "data"))
     with pytest.raises(CompileError) as error:
         train(config, tmp_path / "run")
@@ -146,7 +146,7 @@ def test_shaped_tasks_are_the_same_worlds(name: str) -> None:
     other = task.with_shaped_reward()
     assert fingerprint(replace(task, goal=replace(task.goal, shaped=None))) == fingerprint(task)
     assert replace(other, goal=task.goal) == task
-    programs = [compile_task(one, backend="arrays") for one in (task, other)]
+    programs = [compile_task(one, backend="wasm") for one in (task, other)]
     seeds = torch.arange(4)
     episodes = [program.start(seeds) for program in programs]
     generator = torch.Generator().manual_seed(1)
@@ -168,7 +168,7 @@ def test_some_tasks_have_shaped_rewards() -> None:
 
 
 def test_frames_are_those_of_stable_baselines(tmp_path: Path) -> None:
-    env = PowderVecEnv(str(write_task(tmp_path, DIG)), 3, backend="arrays", actions="full")
+    env = PowderVecEnv(str(write_task(tmp_path, DIG)), 3, backend="wasm", actions="full")
     stacked, own = VecFrameStack(env, 3, channels_order="first"), FrameStack(3)
     env.seed(5)
     expected = stacked.reset()
@@ -182,7 +182,7 @@ def test_frames_are_those_of_stable_baselines(tmp_path: Path) -> None:
 
 def test_a_policy_sees_the_frames_that_it_learned_from(tmp_path: Path) -> None:
     run = train(quick(write_task(tmp_path), frames=2, steps=32), tmp_path / "run")
-    env = TensorEnv(str(tmp_path / "task.yaml"), 2, backend="arrays")
+    env = TensorEnv(str(tmp_path / "task.yaml"), 2, backend="wasm")
     policy = load_policy(run, env, deterministic=True)
     assert policy.frames == 2
     observed, _ = env.reset(seed=1)
@@ -194,7 +194,7 @@ def test_a_policy_sees_the_frames_that_it_learned_from(tmp_path: Path) -> None:
         tmp_path / "data",
         episodes=4,
         policy_name="two frames",
-        backend="arrays",
+        backend="wasm",
     )
 
 

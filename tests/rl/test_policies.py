@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 @pytest.fixture(scope="module")
 def program(run: RunFolder) -> TaskProgram:
-    return compile_task(str(run.config["task"]), backend="arrays")
+    return compile_task(str(run.config["task"]), backend="wasm")
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
@@ -85,7 +85,7 @@ def test_all_splits_are_played_unless_some_are_asked_for(run: RunFolder) -> None
 def test_the_training_split_has_the_worlds_that_were_trained_on(tmp_path: Path) -> None:
     run = train(quick(write_task(tmp_path), steps=32, worlds=2), tmp_path / "run")
     score = evaluate(run, episodes=6, splits=["train"], policies=["nothing"]).scores[0]
-    program = compile_task(str(run.config["task"]), backend="arrays")
+    program = compile_task(str(run.config["task"]), backend="wasm")
     assert score.mean == pytest.approx(float(play(program, None, torch.arange(2)).returns.mean()))
 
 
@@ -129,7 +129,7 @@ def test_a_policy_of_another_environment_is_refused(run: RunFolder, program: Tas
         load_policy(run, TensorEnv(program, 1, observation="compact"))
     assert error.value.diagnostics[0].code == "PD623"
     with pytest.raises(CompileError) as error:
-        load_policy(run, TensorEnv("keep-ice", 1, backend="arrays"))
+        load_policy(run, TensorEnv("keep-ice", 1, backend="wasm"))
     assert error.value.diagnostics[0].code == "PD623"
 
 
@@ -154,14 +154,14 @@ def test_films_show_regions(tmp_path: Path) -> None:
     path = write_task(
         tmp_path, text.replace("generate:", "regions: {pit: box rows 4:8 columns 4:8}\ngenerate:", 1)
     )
-    _, pictures = film(compile_task(str(path), backend="arrays"), None, torch.arange(1), factor=3)
+    _, pictures = film(compile_task(str(path), backend="wasm"), None, torch.arange(1), factor=3)
     assert (next(pictures) == OUTLINES[0]).all(-1).sum() == 4 * (12 - 1)
 
 
 def test_a_film_is_written(run: RunFolder, tmp_path: Path) -> None:
     from tests.cli.commands import powderdsl
 
-    result = powderdsl("watch", str(run.path), "--worlds", "2", "--backend", "arrays", "--scale", "2")
+    result = powderdsl("watch", str(run.path), "--worlds", "2", "--backend", "wasm", "--scale", "2")
     assert result.exit_code == 0, result.output
     with Image.open(run.path / "watch.gif") as image:
         assert image.n_frames == 1 + 4 * (1 + 2) + 3  # type: ignore[attr-defined]
@@ -179,7 +179,7 @@ def test_films_show_fields(tmp_path: Path) -> None:
         "agent: {may: [wall, nothing], bins: 2, brush: 4, actions: 1, steps_per_action: 2}\nreward: {each: placed}\n"
     )
     _, pictures = film(
-        compile_task(str(tmp_path / "task.yaml"), backend="arrays"), None, torch.arange(1), factor=1
+        compile_task(str(tmp_path / "task.yaml"), backend="wasm"), None, torch.arange(1), factor=1
     )
     reds = [int(frame[4, 4, 0]) for frame in pictures]
     assert reds == [48, 48, 71, 94]  # the start, the action, two steps

@@ -55,7 +55,7 @@ def quick(task: Path, **changes: Any) -> TrainConfig:
         "epochs": 2,
         "features": 8,
         "steps": 96,
-        "backend": "arrays",
+        "backend": "wasm",
         "checkpoint_minutes": 0.0,
     }
     return preset("small", str(task), **{**usual, **changes})

@@ -56,9 +56,6 @@ def run_graph(pass_: PassGraph, world: World) -> dict[int, Array]:
 
 def run_schedule(schedule: Schedule, world: World, truth: Mapping[int, Array]) -> dict[str, Array]:
     """What a schedule leaves in the slots. Every variable is compared with what it means, in `truth`."""
-    silent = not any(np.any(world.slots[slot]) for slot, var in schedule.finds if var.type == REAL)
-    if schedule.calm is not None and silent:
-        return run_schedule(schedule.calm, world, {})
     state = _State(world, truth, {var.name: world.slots[slot] for slot, var in schedule.finds})
     state.buffers = dict(schedule.buffers)
     state.block(schedule.body)
@@ -238,7 +235,7 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             return _shift(args[0], *attr)
         case "not":
             return ~args[0]
-        case "select" | "choose":
+        case "select":
             return np.where(*args)
         case "settle":
             cut = np.clip(np.where(np.isnan(args[0]), 0, args[0]), *map(np.float32, attr))
@@ -263,46 +260,12 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             return (args[0] and args[1]) if node.op == "and" else (args[0] or args[1])
         case "any":
             return bool(np.any(args[0]))
-        case "swap" | "arrive" | "swap_onto" | "leave" | "stack" | "member":
-            return _block(node, args)
-        case "cells" | "places" | "copy":
-            return args[0]
-        case "moved":
-            return _shift(args[0], *attr, True)
-        case "update":
-            places, no, other = args
-            return np.where(places, _CHANGES[attr](no, other), no)
-        case "carry":
-            source, target, no, other = args
-            change, dy, dx = attr
-            assert np.array_equal(target, _shift(source, dy, dx, True))
-            return np.where(
-                target, _CHANGES[change](no, _shift(np.broadcast_to(other, no.shape), dy, dx, True)), no
-            )
     return _SIMPLE[node.op](*args)
 
 
 def _elements(world: World) -> list[tuple[int, Array]]:
     slots = ((name.partition(":"), array) for name, array in world.slots.items())
     return [(int(bit), array) for (name, _, bit), array in slots if name == "element"]
-
-
-def _block(node: Node, args: list[Array]) -> Array:
-    """Blocks: arrays [P, H, W]."""
-    if node.op == "stack":
-        return np.stack(args)
-    if node.op == "member":
-        return args[0][node.attr]
-    dy, dx, *rest = node.attr
-    block, movers = args[:2]
-    stays = args[2] if len(args) > 2 else block.copy()
-    if node.op == "leave":
-        stays = block & ~movers
-        for plane in rest[0]:
-            stays[plane] = block[plane] | movers
-    targets = _shift(movers, -dy, -dx, True)
-    moved = np.where(targets, np.roll(block, (dy, dx), (1, 2)), stays)
-    return np.where(movers, np.roll(block, (-dy, -dx), (1, 2)), moved) if "swap" in node.op else moved
 
 
 def _limit(value: float, threshold: Threshold | None) -> int:
@@ -325,10 +288,9 @@ def _fused(a: Array, b: Array, c: Array) -> Array:
     return np.add(a, product)
 
 
-_CHANGES: dict[str, Callable[..., Any]] = {"add": np.add, "sub": np.subtract, "mul": np.multiply}
 _SIMPLE: dict[str, Callable[..., Any]] = {
     "and": np.logical_and, "when": np.logical_and, "led": np.logical_and, "or": np.logical_or, "xor": np.logical_xor, "eq": np.equal, "lt": np.less,
     "le": np.less_equal, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt, "min": np.minimum, "max": np.maximum,
     "ratio": np.divide, "fused": _fused,
-    **_CHANGES,
+    "add": np.add, "sub": np.subtract, "mul": np.multiply,
 }  # fmt: skip

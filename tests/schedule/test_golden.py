@@ -26,7 +26,6 @@ RULES = (
 )
 EMITTED = {
     "planes": ("--emit", "planes"),
-    "arrays": ("--emit", "schedule", "--backend", "arrays", "--after", "choices"),
     "native": ("--emit", "schedule", "--backend", "native"),
     "cuda": ("--emit", "schedule", "--backend", "cuda"),
 }

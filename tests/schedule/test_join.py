@@ -9,7 +9,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.ir.verify import InvalidIR
 from powderdsl.schedule.join import Read, field_reads
-from powderdsl.schedule.stages import CPP, plan
+from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Compute, Schedule, Sweeps, flat
 from powderdsl.schedule.verify import verify
 from tests.schedule.test_stages import packed_passes
@@ -18,7 +18,7 @@ from tests.schedule.test_stages import packed_passes
 def planned(name: str) -> Schedule:
     """The pass of that name in powderworld, as native code runs it."""
     (found,) = (pass_ for _, pass_ in packed_passes(load("powderworld")) if pass_.name == name)
-    return plan(found, CPP)
+    return plan(found, CPU)
 
 
 def test_box_sums_follow_choices() -> None:

@@ -65,7 +65,7 @@ def under_caret(one: Diagnostic) -> tuple[str, str]:
     return Path(span.source.name).name, span.text
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
 def test_the_rule_that_stands_first_holds(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     skip_without_compiler(backend)
     ruleset, (warning,) = load(CHANGE, GEYSER)
@@ -112,7 +112,7 @@ def test_of_two_assignments_the_last_holds(torch) -> None:  # type: ignore[no-un
     assert any("stands last" in one for one in warning.notes)
     geyser = ruleset.element("geyser")
     assert geyser is not None
-    for backend in ("reference", "torch", "arrays"):
+    for backend in ("reference", "torch", "wasm"):
         sim = powderdsl.compile(ruleset, backend=backend)
         assert sim.step(sim.world([[[geyser.id, 3, 4, 0]]]))["age"][0, 0].tolist() == [5, 3, 5, 0]
 

@@ -97,9 +97,13 @@ class Compiler:
 
 def made(seconds: float) -> tuple[AutoProgram, Compiler, list[tuple[str, int, int]]]:
     log: list[tuple[str, int, int]] = []
-    arrays = Counter("arrays", seconds, log)
+    first = Counter("wasm", seconds, log)
     compiler = Compiler(Counter("native", 0, log))
-    return AutoProgram(lambda: arrays, lambda: None, compiler), compiler, log
+    return (
+        AutoProgram(("wasm", lambda: first), lambda: Counter("torch", 0, log), lambda: None, compiler),
+        compiler,
+        log,
+    )
 
 
 def test_little_work_starts_no_compiler() -> None:
@@ -110,9 +114,9 @@ def test_little_work_starts_no_compiler() -> None:
     assert int(state["element"][0, 0, 0]) == 300
     assert program.run(job(0, 300))["element"].tolist() == [[[300, 300], [300, 300]]]
     assert compiler.asked == 0
-    assert program.running == "arrays"
-    assert program.notes == ("arrays: native is compiled from 2 s of work, or by --backend native",)
-    assert {name for name, _, _ in log} == {"arrays"}
+    assert program.running == "wasm"
+    assert program.notes == ("wasm: native is compiled from 2 s of work, or by --backend native",)
+    assert {name for name, _, _ in log} == {"wasm"}
 
 
 def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +124,7 @@ def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(auto, "SLICE", 0.02)
     program, compiler, log = made(0.005)
     threading.Timer(0.3, compiler.go.set).start()
-    state = program.run(job(5000))  # 25 s on arrays
+    state = program.run(job(5000))  # 25 s on the first backend
     assert int(state["element"][0, 0, 0]) == 5000
     assert compiler.asked == 1
     assert program.running == "native"
@@ -128,9 +132,9 @@ def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatc
     for _, start, steps in log:  # no step twice, none left out
         assert start == done
         done += steps
-    assert [name for name, _, _ in log] == ["arrays"] * (len(log) - 1) + ["native"]
+    assert [name for name, _, _ in log] == ["wasm"] * (len(log) - 1) + ["native"]
     assert log[-1][2] > 4000
-    assert program.notes[0].startswith(f"arrays for {5000 - log[-1][2]} steps while native was made ready")
+    assert program.notes[0].startswith(f"wasm for {5000 - log[-1][2]} steps while native was made ready")
     assert program.notes[0].endswith(f"then native for {log[-1][2]}")
 
 
@@ -145,23 +149,28 @@ def test_many_short_calls_are_worth_it_together(monkeypatch: pytest.MonkeyPatch)
     assert waited(lambda: program.running == "native")
 
 
-def test_given_draws_and_chosen_passes_stay_with_arrays() -> None:
+def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
     log: list[tuple[str, int, int]] = []
     program = AutoProgram(
-        lambda: Counter("arrays", 0, log), lambda: Counter("native", 0, log), lambda: Counter("", 0, log)
+        ("wasm", lambda: Counter("wasm", 0, log)),
+        lambda: Counter("torch", 0, log),
+        lambda: Counter("native", 0, log),
+        lambda: Counter("", 0, log),
     )
     program.run(job(3))
     program.run(job(4, draws={"coin": torch.zeros(1, 2, 2)}))
     program.run(job(5, passes=frozenset({"fall"})))
-    assert log == [("native", 0, 3), ("arrays", 0, 4), ("arrays", 0, 5)]
+    assert log == [("native", 0, 3), ("torch", 0, 4), ("torch", 0, 5)]
     assert program.notes == (
         "native: it was compiled before",
-        "arrays for 9 steps with given draws or chosen passes",
+        "torch for 9 steps with given draws or chosen passes",
     )
 
 
 @pytest.mark.parametrize("problem", [NoCompiler("no C++ compiler: tried g++"), ValueError("oh")])
-def test_without_native_code_arrays_go_on(problem: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_native_code_the_first_backend_continues(
+    problem: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(auto, "WORTH", 0.0)
     log: list[tuple[str, int, int]] = []
     asked = []
@@ -170,7 +179,9 @@ def test_without_native_code_arrays_go_on(problem: Exception, monkeypatch: pytes
         asked.append(1)
         raise problem
 
-    program = AutoProgram(lambda: Counter("arrays", 0.001, log), lambda: None, fails)
+    program = AutoProgram(
+        ("wasm", lambda: Counter("wasm", 0.001, log)), lambda: Counter("torch", 0, log), lambda: None, fails
+    )
     auto._tell_of_compilers.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
@@ -249,16 +260,16 @@ def test_auto_changes_over_to_the_same_worlds_and_remembers(
     monkeypatch.setattr(auto, "WORTH", 0.0)
     with building(Building("-O0", tmp_path)):
         sims = [powderdsl.compile(rules) for _ in range(3)]
-        assert [sim.running for sim in sims] == ["arrays"] * 3
+        assert [sim.running for sim in sims] == ["wasm"] * 3
         worlds = [start_of(sim) for sim in sims]
         steps, end = 0, time.monotonic() + 300
-        while any(sim.running == "arrays" for sim in sims) and time.monotonic() < end:
+        while any(sim.running == "wasm" for sim in sims) and time.monotonic() < end:
             worlds = [world.sim.step(world) for world in worlds]
             steps += 1
             time.sleep(0.05)  # the worlds need not age while the compiler is busy
         worlds = [world.sim.step(world, 5) for world in worlds]
         assert [sim.running for sim in sims] == ["native"] * 3
-        oracle = powderdsl.compile(rules, backend="arrays")
+        oracle = powderdsl.compile(rules, backend="wasm")
         expected = oracle.step(start_of(oracle), steps + 5)
         for world in worlds:
             assert find_difference(expected.state, world.state) is None
@@ -270,7 +281,7 @@ def test_auto_changes_over_to_the_same_worlds_and_remembers(
         assert again.running == "native"
         assert again.notes == ("native: it was compiled before",)
         other = powderdsl.compile(load_text(RULES.replace("0.7 +", "0.6 +"), "kettle.yaml"))
-        assert other.running == "arrays"
+        assert other.running == "wasm"
 
 
 def compiled_natively(rules: Ruleset) -> None:
@@ -289,7 +300,7 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
         for damage in (whole[:40], b"[]", b'{"library": 3}', whole.replace(b'"layout"', b'"lay"'), b"\xff"):
             for start in starts:
                 start.write_bytes(damage)
-            assert powderdsl.compile(rules).running == "arrays"
+            assert powderdsl.compile(rules).running == "wasm"
             compiled_natively(rules)
             assert [start.read_bytes() for start in starts] == [whole, whole]
             assert powderdsl.compile(rules).running == "native"
@@ -315,7 +326,7 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
             text=True,
             check=True,
         )
-        assert run.stdout == "arrays native native\n"
+        assert run.stdout == "wasm native native\n"
 
 
 @needs_compiler
@@ -337,7 +348,7 @@ with building(Building('-O0', Path(sys.argv[1]))):
     old = auto.step(auto.step(auto.world([[[0, 1]] * 3] * 33), 2), 2)   # begins to compile
     print(auto.running, flush=True)
     pid = os.fork()
-    while auto.running == 'arrays':
+    while auto.running == 'wasm':
         old = auto.step(old)
         time.sleep(0.05)
     if pid == 0:
@@ -359,7 +370,7 @@ with building(Building('-O0', Path(sys.argv[1]))):
         timeout=300,
         check=False,
     )
-    assert (run.returncode, run.stdout) == (0, "arrays\nnative\n"), run.stderr
+    assert (run.returncode, run.stdout) == (0, "wasm\nnative\n"), run.stderr
 
 
 def test_the_end_does_not_wait_for_the_compiler(tmp_path: Path) -> None:
@@ -438,8 +449,8 @@ def test_run_says_what_ran_and_why(tmp_path: Path) -> None:
         "run", "life", "--size", "8x8", "--steps", "4", "-v", "--out", tmp_path / "x.npz", CXX="no-such"
     )
     assert quick.exit_code == 0
-    assert "arrays on cpu" in quick.stderr
-    assert "  arrays: no C++ compiler: $CXX is `no-such`, which cannot be run" in quick.stderr
+    assert "wasm on cpu" in quick.stderr
+    assert "  wasm: no C++ compiler: $CXX is `no-such`, which cannot be run" in quick.stderr
     native = command("run", "life", "--size", "8x8", "--backend", "native", CXX="no-such")
     assert native.exit_code == 2
     assert "PD701" in native.stderr

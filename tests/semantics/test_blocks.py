@@ -86,7 +86,7 @@ def test_the_fix_is_named_and_works(tmp_path):
     assert codes(tmp_path, MARGOLUS, 2) == []
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
 def test_nothing_is_lost_or_doubled(tmp_path, backend):
     path = tmp_path / "blocks.yaml"
     path.write_text(HEAD.format(multiple=2) + MARGOLUS)

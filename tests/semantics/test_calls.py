@@ -1,4 +1,4 @@
-"""What is kept between calls of a simulator never shows: worlds are those of the backend `arrays`, whatever a user does."""
+"""What is kept between calls of a simulator never shows: worlds are those of the backend `wasm`, whatever a user does."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ passes:
 
 @pytest.fixture(scope="module")
 def sims(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Simulator, Simulator]]:
-    """Native code, and the arrays that it is compared with."""
+    """Native code, and the WebAssembly that it is compared with."""
     skip_without_compiler("native")
     ruleset = load_text(RULES, "rain.yaml")
     with building(Building("-O0", tmp_path_factory.mktemp("native"))):
-        yield compile_rules(ruleset, "native"), compile_rules(ruleset, "arrays")
+        yield compile_rules(ruleset, "native"), compile_rules(ruleset, "wasm")
 
 
 def start(sim: Simulator, batch: int = 1, size: tuple[int, int] = (16, 24)) -> World:
@@ -66,25 +66,25 @@ Pair = tuple[Simulator, Simulator]
 
 
 def test_single_steps_are_those_of_one_call(sims: Pair) -> None:
-    native, arrays = sims
+    native, plain = sims
     world = start(native)
     for _ in range(9):
         world = native.step(world)
-    assert_equal(world, arrays.step(start(arrays), 9))
+    assert_equal(world, plain.step(start(plain), 9))
     assert_equal(native.step(world, 0), world)
 
 
 def test_old_worlds_stay(sims: Pair) -> None:
-    native, arrays = sims
+    native, plain = sims
     kept = [start(native, 3)]
     for steps in (1, 2, 1, 3):
         kept.append(native.step(kept[-1], steps))
     again = native.step(kept[1], 5)
-    wanted = start(arrays, 3)
+    wanted = start(plain, 3)
     for world, steps in zip(kept, (1, 2, 1, 3, 0), strict=True):
         assert_equal(world, wanted)
-        wanted = arrays.step(wanted, steps)
-    assert_equal(again, arrays.step(start(arrays, 3), 6))
+        wanted = plain.step(wanted, steps)
+    assert_equal(again, plain.step(start(plain, 3), 6))
 
 
 @pytest.mark.parametrize("name", ["seed", "index", "step"])
@@ -105,7 +105,7 @@ def test_numbers_written_to_count_for_the_worlds_that_have_them(sims: Pair, name
 
 
 def test_arguments_may_be_written_to_after_the_call(sims: Pair) -> None:
-    native, arrays = sims
+    native, plain = sims
     rate, seeds = torch.tensor([0.9, 0.1], dtype=torch.float64), np.array([3, 4])
     cells = torch.ones(2, 8, 8, dtype=torch.uint8)
     world = native.world(cells, seeds)
@@ -114,9 +114,9 @@ def test_arguments_may_be_written_to_after_the_call(sims: Pair) -> None:
     seeds[:] = 0
     cells.zero_()
     second = native.step(first, params={"rain.rate": rate})
-    wanted = arrays.world(np.ones((2, 8, 8), np.uint8), [3, 4])
-    wanted = arrays.step(wanted, params={"rain.rate": [0.9, 0.1]})
-    assert_equal(second, arrays.step(wanted, params={"rain.rate": 0.5}))
+    wanted = plain.world(np.ones((2, 8, 8), np.uint8), [3, 4])
+    wanted = plain.step(wanted, params={"rain.rate": [0.9, 0.1]})
+    assert_equal(second, plain.step(wanted, params={"rain.rate": 0.5}))
 
 
 def test_parameters_change_from_call_to_call(sims: Pair) -> None:
@@ -133,37 +133,37 @@ def test_parameters_change_from_call_to_call(sims: Pair) -> None:
 
 
 def test_defaults_cannot_be_changed_through_a_copy(sims: Pair) -> None:
-    native, arrays = sims
+    native, plain = sims
     world = native.step(start(native))
     for value in native.parameters({}, 1).values():
         value.zero_()
-    assert_equal(native.step(world, 3), arrays.step(start(arrays), 4))
+    assert_equal(native.step(world, 3), plain.step(start(plain), 4))
 
 
 def test_batch_sizes_alternate(sims: Pair) -> None:
     """More of them than are kept, in strips and in lanes."""
-    native, arrays = sims
+    native, plain = sims
     sizes = [1, 9, 2, 1, 9, *range(1, BATCH_SIZES + 3), 1, 9]
     worlds = {batch: start(native, batch) for batch in set(sizes)}
     for batch in sizes:
         worlds[batch] = native.step(worlds[batch])
     for batch, world in sorted(worlds.items()):
-        assert_equal(world, arrays.step(start(arrays, batch), sizes.count(batch)))
+        assert_equal(world, plain.step(start(plain, batch), sizes.count(batch)))
 
 
 def test_one_world_in_two_simulators(sims: Pair) -> None:
     """A simulator of the same rules takes it on, and the first one again; neither sees what the other keeps."""
-    native, arrays = sims
+    native, plain = sims
     other = compile_rules(native.ruleset, "native")
     world = native.step(start(native, 2), 2)
     left, right = native.step(world, 3), other.step(world, 3)
     assert_equal(left, right)
-    for sim in (arrays, native, other, native):
+    for sim in (plain, native, other, native):
         right = sim.step(right)
         left = native.step(left)
         assert right.sim is sim
     assert_equal(left, right)
-    assert_equal(world, arrays.step(start(arrays, 2), 2))
+    assert_equal(world, plain.step(start(plain, 2), 2))
 
 
 def test_chosen_worlds_and_strided_numbers(sims: Pair) -> None:
@@ -188,26 +188,26 @@ def test_edited_worlds(sims: Pair) -> None:
 
 
 def test_reuse_takes_the_memory_and_nothing_else(sims: Pair) -> None:
-    native, arrays = sims
+    native, plain = sims
     world = native.step(start(native, 2))
     spent = native.step(world)
     later = native.step(spent, 2, reuse=True)
-    assert_equal(later, arrays.step(start(arrays, 2), 4))
-    assert_equal(world, arrays.step(start(arrays, 2), 1))
+    assert_equal(later, plain.step(start(plain, 2), 4))
+    assert_equal(world, plain.step(start(plain, 2), 1))
     assert spent.step.tolist() == [2, 2]
     with pytest.raises(RuntimeError, match="reuse"):
         native.step(spent)
 
 
 def test_copies_own_their_memory(sims: Pair) -> None:
-    native, arrays = sims
+    native, plain = sims
     world = native.step(start(native))
     shallow, deep = copy.copy(world.state), copy.deepcopy(world.state)
     del world
     gc.collect()
-    wanted = arrays.step(start(arrays), 1)
+    wanted = plain.step(start(plain), 1)
     for state in (shallow, deep):
-        assert_equal(native.step(replace(wanted, sim=native, state=state), 2), arrays.step(wanted, 2))
+        assert_equal(native.step(replace(wanted, sim=native, state=state), 2), plain.step(wanted, 2))
 
 
 def test_numbers_that_do_not_fit_are_refused(sims: Pair) -> None:

@@ -22,7 +22,7 @@ from tests.compilers import skip_without_compiler
 Cells = set[tuple[int, int]]
 
 
-@pytest.fixture(params=["reference", "arrays", "torch", "native"])
+@pytest.fixture(params=["reference", "wasm", "torch", "native"])
 def backend(request: pytest.FixtureRequest) -> str:
     skip_without_compiler(request.param)
     return str(request.param)

@@ -25,7 +25,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "wasm"])
 def test_every_density_sinks_below_every_lighter_one(weights: Path, backend: str) -> None:
     sim = powderdsl.compile(powderdsl.load(f"core+{weights}"), backend=backend)
     mixed = [25, 20, 27, 23, 26, 21, 24, 22]

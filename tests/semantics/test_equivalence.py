@@ -135,7 +135,7 @@ def claimed(rules: str, most: int):
         except (Invalid, CompileError):
             continue
         if meaning(ruleset) != original.meaning and proven_equal(original.ruleset, ruleset):
-            sim = compile(ruleset, backend="arrays")
+            sim = compile(ruleset, backend="wasm")
             wrong = any(
                 first_difference(batch.states, run_sample(sim, batch.sample, batch.steps)[0]).any()
                 for batch in original.batches()

@@ -19,7 +19,7 @@ from powderdsl.worlds.ascii import read_ascii, write_ascii
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
 
-backends = pytest.mark.parametrize("backend", ["reference", "arrays"])
+backends = pytest.mark.parametrize("backend", ["reference", "wasm"])
 
 
 @cache
@@ -55,7 +55,7 @@ def failures(rules: Ruleset, pack: str, backend: str) -> list[str]:
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "salt"])
 def test_their_own_tests_hold(name: str) -> None:
     rules = powderdsl.load("powderworld", EXAMPLES / f"{name}.yaml")
-    assert failures(rules, name, "arrays") == []
+    assert failures(rules, name, "wasm") == []
 
 
 # Shipped packs. Those of Powderworld are tested all together, and each with no more than it needs.
@@ -72,13 +72,13 @@ ALONE = [
 
 @pytest.mark.parametrize("pack", POWDERWORLD)
 def test_packs_hold_their_tests_among_all_others(pack: str) -> None:
-    assert failures(powderdsl.load("powderworld"), pack, "arrays") == []
+    assert failures(powderdsl.load("powderworld"), pack, "wasm") == []
 
 
 @pytest.mark.parametrize("rules", [*ALONE, *CLASSICS])
 def test_packs_hold_their_tests_alone(rules: str) -> None:
     loaded = powderdsl.load(rules)
-    assert failures(loaded, loaded.packs[-1], "arrays") == []
+    assert failures(loaded, loaded.packs[-1], "wasm") == []
 
 
 def test_tests_that_need_an_absent_pack_are_left_out() -> None:

@@ -78,7 +78,7 @@ def rules(tmp_path_factory):
     return package.load(path)
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
 def test_fresh_cells_have_their_elements_default(rules, backend):
     assert [result.problem for result in run_examples(rules, backend=backend)] == ["", ""]
 
@@ -135,7 +135,7 @@ def test_an_invariant_meets_every_fresh_cell(tmp_path):
         package.load(path)
 
 
-@pytest.mark.parametrize("backend", ["reference", "arrays"])
+@pytest.mark.parametrize("backend", ["reference", "wasm"])
 def test_tasks_make_fresh_cells(tmp_path, torch, backend, monkeypatch):
     """Worlds of tasks are drawn and acted on by code of their own."""
     from powderdsl.simulation.simulator import compile as compile_rules

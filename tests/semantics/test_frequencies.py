@@ -57,7 +57,7 @@ def test_backends_see_the_same_frequencies(left: str, differs: bool) -> None:
     """The worlds are the same bit for bit, so the verdict on each cell is; one in a hundred is too little to tell."""
     start: Start = Start.fresh([[0, 0, 1, 0, 0], [0, 1, 0, 0, 0]], seed=3)
     found = []
-    for backend in ("reference", "torch", "arrays"):
+    for backend in ("reference", "torch", "wasm"):
         verdict = breaks(Alike("mirrored", COPIES), Runner(drift(left), backend), start, 1)
         found.append((bool(verdict.first[0]), verdict.cell[0].tolist()))
     assert found == [found[0]] * 3

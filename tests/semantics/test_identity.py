@@ -227,7 +227,7 @@ def test_a_recorded_palette_decides_ids_but_not_what_happens() -> None:
         .choice([element.id for element in plain.elements], (2, 20, 20))
         .astype(np.uint8)
     )
-    one, two = powderdsl.compile(plain, "reference"), powderdsl.compile(other, "arrays")
+    one, two = powderdsl.compile(plain, "reference"), powderdsl.compile(other, "wasm")
     first, second = one.step(one.world(ids), steps=8), two.step(two.world(to[ids]), steps=8)
     assert (to[first.ids.numpy()] == second.ids.numpy()).all()
     assert (first["velocity"] == second["velocity"]).all()

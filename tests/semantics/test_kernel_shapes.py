@@ -50,7 +50,7 @@ def test_a_shape_has_its_cells(shape, radius):
         assert shaped_kernel(shape, 1).weights == KERNELS[shape].weights
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays", "native", "wasm"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
 def test_larger_than_life(tmp_path, backend):
     path = tmp_path / "bosco.yaml"
     path.write_text(BOSCO)

@@ -186,7 +186,7 @@ PACKS = {
     "together": TOGETHER,
     "headings": HEADINGS,
 }
-TORCH = ("torch", "arrays")
+TORCH = ("torch", "wasm")
 SIZES = ((3, 4, 5), (2, 9, 33), (1, 3, 64), (1, 17, 70))
 """Worlds smaller than the kernels, rows that end within a word, of one word and of three."""
 
@@ -204,7 +204,7 @@ def compare(ruleset: Ruleset, simulators: list[Simulator], sizes: tuple[tuple[in
         assert_same(ruleset, start, steps=4, simulators=[oracle, *simulators])
 
 
-@pytest.mark.parametrize("backend", tiered([*TORCH, "native"], ["arrays"]))
+@pytest.mark.parametrize("backend", tiered([*TORCH, "native"], ["wasm"]))
 @pytest.mark.parametrize("name", PACKS)
 def test_worlds_of_a_backend(name: str, backend: str) -> None:
     skip_without_compiler(backend)

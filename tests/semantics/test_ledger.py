@@ -240,14 +240,14 @@ def sampled(ruleset: Ruleset, batches: int, worlds: int, side: int, steps: int, 
 def test_random_worlds_do_not_contradict_the_ledger_of_shipped_rules(name: str) -> None:
     ruleset = load(name)
     batches = 10 if name == "powderworld" else 1
-    assert sampled(ruleset, batches, worlds=100, side=16, steps=3, backend="arrays") == []
+    assert sampled(ruleset, batches, worlds=100, side=16, steps=3, backend="wasm") == []
     assert watched(ruleset, range(6)).denied == []
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", compositions())
 def test_thousands_of_worlds_do_not_contradict_the_ledger_of_shipped_rules(name: str) -> None:
-    assert sampled(load(name), WORLDS // 100, worlds=100, side=16, steps=3, backend="arrays") == []
+    assert sampled(load(name), WORLDS // 100, worlds=100, side=16, steps=3, backend="wasm") == []
 
 
 def test_every_line_of_the_ledger_of_powderworld_is_seen() -> None:

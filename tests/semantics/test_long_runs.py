@@ -54,7 +54,7 @@ def run_all_backends(name: str, shape: tuple[int, int, int], moments: Sequence[i
     ruleset = load(name)
     start = random_start(ruleset, Choices.seeded(sum(shape)), shape)
     expected = dict(states(start.world(compile_ruleset(ruleset, backend="reference")), moments))
-    for backend in ("torch", "arrays", "native", "wasm"):
+    for backend in ("torch", "native", "wasm"):
         simulator = compiled(ruleset, backend)
         together = start.world(simulator)
         for step, state in states(together, moments):

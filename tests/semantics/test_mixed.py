@@ -11,9 +11,11 @@ from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, integer
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
+from powderdsl.simulation.programs import CompiledProgram
 from powderdsl.simulation.simulator import Simulator, World
-from powderdsl.targets.arrays.program import ArrayProgram
 from powderdsl.targets.torch.mixed import MixedProgram, mixed_program
+from powderdsl.targets.torch.program import TorchProgram
+from powderdsl.targets.wasm.program import WasmProgram
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
@@ -76,7 +78,7 @@ def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
     assert [any(slot.resets for slot in part.program.slots) for part in parts] == [True, False, False]
 
 
-@pytest.mark.parametrize("backend", ["arrays", "native", "wasm"])
+@pytest.mark.parametrize("backend", ["native", "wasm"])
 def test_the_oracles_worlds(backend: str) -> None:
     """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one at a time."""
     rules = spread("heavy")
@@ -127,8 +129,9 @@ def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simula
         return Carried(pass_, None, "refused here") if pass_.name in refused else found
 
     sim = powderdsl.compile(rules, backend="torch")
-    sim._program = mixed_program(segments(program, choose), sim.device, ArrayProgram)
-    assert isinstance(sim._program, MixedProgram)
+    mixed = mixed_program(segments(program, choose), sim.device, WasmProgram)
+    assert isinstance(mixed, MixedProgram)
+    sim._program = CompiledProgram(mixed, lambda: TorchProgram(program, sim.device), "wasm")
     return sim
 
 
@@ -136,7 +139,7 @@ def test_rules_without_passes(torch) -> None:  # type: ignore[no-untyped-def]
     """Nothing happens, except that fields which reset do so."""
     rules = load_text(HEAVY.split("streams:")[0])
     worlds: list[World] = []
-    for backend in ("reference", "arrays"):
+    for backend in ("reference", "wasm"):
         sim = powderdsl.compile(rules, backend=backend)
         world = sim.replace(sim.world(torch.ones(1, 2, 3, dtype=torch.uint8)), marks=7)
         worlds.append(sim.step(world, 2))

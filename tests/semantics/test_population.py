@@ -61,7 +61,7 @@ def recorded() -> tuple[npt.NDArray[np.uint8], Counts]:
 def simulated(worlds: tuple[int, ...], changed: tuple[tuple[str, float], ...] = ()) -> Counts:
     """The ruleset's counts at STEPS in these designed worlds, with the parameters `changed`."""
     rules = powderdsl.load("powderworld", params=dict(changed))
-    simulator = powderdsl.compile(rules, backend="arrays")
+    simulator = powderdsl.compile(rules, backend="wasm")
     start = recorded()[0][list(worlds)]
     world = simulator.world(np.repeat(start, RUNS, axis=0), seed=SEED)
     counts, done = [], 0

@@ -41,7 +41,7 @@ MOVEMENT = ("stone", "gravity", "piling", "flow", "wind")
 
 
 @cache
-def simulators(manner: Manner, seeds: range, backend: str = "arrays") -> tuple[Simulator, ...]:
+def simulators(manner: Manner, seeds: range, backend: str = "wasm") -> tuple[Simulator, ...]:
     """Simulators of random rulesets; texts that the static checks refuse are left out."""
     found = []
     for seed in seeds:
@@ -62,7 +62,7 @@ def assert_equal(first: World, second: World) -> None:
     assert difference is None, f"{difference}\n{first.sim.ruleset.name}"
 
 
-CASES = [("arrays", range(30)), ("torch", range(30, 45)), ("reference", range(45, 51))]
+CASES = [("wasm", range(30)), ("torch", range(30, 45)), ("reference", range(45, 51))]
 
 
 # Batches and steps
@@ -99,7 +99,7 @@ def test_steps_add_up_and_leave_their_argument_alone(backend: str, seeds: range)
 
 
 def test_a_saved_world_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
-    chosen = [compile_ruleset(load("powderworld"), backend="arrays"), *simulators(ANYTHING, range(60, 72))]
+    chosen = [compile_ruleset(load("powderworld"), backend="wasm"), *simulators(ANYTHING, range(60, 72))]
     for number, simulator in enumerate(chosen):
         middle = simulator.step(random_world(simulator, number, (2, 5, 33)), 2)
         path = tmp_path / f"world{number}.npz"
@@ -157,7 +157,7 @@ passes:
 
 @pytest.mark.parametrize("symmetry", ["mirror", "rotations", "all"])
 def test_symmetric_rules_treat_all_orientations_alike(symmetry: str) -> None:
-    simulator = compile_ruleset(load_text(SYMMETRIC.replace("SYMMETRY", symmetry)), backend="arrays")
+    simulator = compile_ruleset(load_text(SYMMETRIC.replace("SYMMETRY", symmetry)), backend="wasm")
     turns = {
         "mirror": [lambda x: x.flip(-1)],
         "rotations": [lambda x, k=k: torch.rot90(x, k, (-2, -1)) for k in (1, 2, 3)],
@@ -264,7 +264,7 @@ def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:
 @pytest.mark.parametrize("walled", [False, True])
 @pytest.mark.parametrize("shape", [(4, 16, 24), (3, 1, 40), (3, 40, 1), (2, 33, 5)])
 def test_movement_of_powderworld_conserves_every_element(shape: tuple[int, int, int], walled: bool) -> None:
-    simulator = compile_ruleset(load("powderworld"), backend="arrays")
+    simulator = compile_ruleset(load("powderworld"), backend="wasm")
     for seed in range(3):
         world = random_world(simulator, seed, shape)
         if walled:
@@ -284,7 +284,7 @@ def test_movement_of_powderworld_conserves_every_element(shape: tuple[int, int, 
 # Ranges
 
 
-@pytest.mark.parametrize(("backend", "seeds"), [("arrays", range(200, 260)), ("reference", range(260, 270))])
+@pytest.mark.parametrize(("backend", "seeds"), [("wasm", range(200, 260)), ("reference", range(260, 270))])
 def test_every_value_is_one_that_was_declared(backend: str, seeds: range) -> None:
     for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
         ruleset = simulator.ruleset
@@ -412,7 +412,7 @@ def test_the_empty_world_of_an_empty_pack_stays() -> None:
     always = "passes: {one: {do: 'a -> b, with chance 100%'}}\n"
     start = Start.fresh(np.arange(12).reshape(1, 3, 4) % 2)
     for text, changes in ((head, False), (head + never, False), (head + always, True)):
-        for backend in ("reference", "torch", "arrays"):
+        for backend in ("reference", "torch", "wasm"):
             simulator = compile_ruleset(load_text(text), backend=backend)
             world = start.world(simulator)
             ids = simulator.step(world, 4).ids

@@ -153,7 +153,7 @@ def test_draws_lie_strictly_inside_and_half_way_between_multiples() -> None:
     assert np.array_equal(np.floor(draw(clock, 5, 32, 40, 70) * 2**16), np.floor(values * 2**16))
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "arrays"])
+@pytest.mark.parametrize("backend", ["reference", "torch", "wasm"])
 def test_rules_fire_as_often_as_their_chance_says(backend: str) -> None:
     """Two rules with chances of their own: each fires as often as it says, and they know nothing of each other."""
     text = """
@@ -214,7 +214,7 @@ passes:
 )
 def test_rounds_draw_for_themselves_and_copies_of_a_symmetry_share(block: str, independent: int) -> None:
     count = 20_000
-    sim = compile_ruleset(load_text(VINES.format(block=block)), backend="arrays")
+    sim = compile_ruleset(load_text(VINES.format(block=block)), backend="wasm")
     world = sim.world([[[0, 1, 0], [1, 0, 1], [0, 1, 0]]] * count, seed=3)
     grown = float((sim.step(world, steps=1).ids[:, 1, 1] == 1).double().mean())
     expected = 1 - 0.7**independent

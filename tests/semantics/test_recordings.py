@@ -145,7 +145,7 @@ def wind_alone(backend: str, path: Path) -> State:
     return compiled(backend).run(recording.states[-2], recording.random, ("wind",))
 
 
-@pytest.fixture(params=["reference", "arrays"])
+@pytest.fixture(params=["reference", "wasm"])
 def runner(request: pytest.FixtureRequest) -> Runner:
     """The ruleset on each backend in turn."""
     return compiled(request.param)

@@ -18,7 +18,7 @@ from powderdsl.simulation.simulator import Simulator
 ROOT = Path(__file__).parents[2]
 SALT = ROOT / "docs" / "examples" / "salt.yaml"
 
-backends = pytest.mark.parametrize("backend", ["reference", "arrays"])
+backends = pytest.mark.parametrize("backend", ["reference", "wasm"])
 
 
 @cache

@@ -32,7 +32,7 @@ def program_of():
     from powderdsl.simulation.simulator import compile as compile_rules
     from powderdsl.tasks.episodes import TaskProgram
 
-    simulator = compile_rules(load("powderworld"), "arrays")
+    simulator = compile_rules(load("powderworld"), "wasm")
     return lambda text: TaskProgram(task_of(text), "train", simulator)
 
 
@@ -94,7 +94,7 @@ def test_an_element_fills_the_block_with_fresh_cells(torch, program_of):
     ]
 
 
-@pytest.mark.parametrize("backend", ["arrays", "torch"])
+@pytest.mark.parametrize("backend", ["wasm", "torch"])
 def test_reused_tensors_give_the_same_episodes(torch, backend):
     from powderdsl.tasks.episodes import compile_task
 
@@ -277,7 +277,7 @@ def test_conditions_end_an_episode(torch, program_of):
 def test_restart_touches_the_masked_worlds_only(torch):
     from powderdsl.tasks.episodes import compile_task
 
-    program = compile_task("sand-pushing", backend="arrays")
+    program = compile_task("sand-pushing", backend="wasm")
     episodes = program.start(torch.arange(5))
     for _ in range(2):
         episodes, *_ = program.act(episodes, torch.tensor([[3, 4, 0, 2, 1]]).expand(5, 5))
@@ -301,7 +301,7 @@ def test_restart_touches_the_masked_worlds_only(torch):
 def test_stands_follow_their_seeds(torch):
     from powderdsl.tasks.episodes import compile_task
 
-    program = compile_task("sand-pushing", split="handmade", backend="arrays")
+    program = compile_task("sand-pushing", split="handmade", backend="wasm")
     episodes = program.start(torch.arange(20))
     assert torch.equal(episodes.world.ids[:8], episodes.world.ids[8:16])
     assert len({one.numpy().tobytes() for one in episodes.world.ids}) == 8
@@ -311,7 +311,7 @@ def test_stands_follow_their_seeds(torch):
 def test_a_start_is_what_the_simulator_makes_of_its_ids(torch):
     from powderdsl.tasks.episodes import compile_task
 
-    program = compile_task("destroying", backend="arrays")
+    program = compile_task("destroying", backend="wasm")
     episodes = program.start(torch.tensor([5, 9, 2**40]))
     world = program.simulator.world(episodes.world.ids, seed=[5, 9, 2**40])
     for name, value in world.state.items():

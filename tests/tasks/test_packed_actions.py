@@ -33,7 +33,7 @@ def test_packed_worlds_are_acted_on_alike(torch, size, each):
 
     text = TASK.replace("SIZE", size).replace("painted + count(sand) + 100 * placed", each)
     task = read_task(Source("packed.yaml", text), Reporter())
-    native, plain = (compile_task(task, backend=backend) for backend in ("native", "arrays"))
+    native, plain = (compile_task(task, backend=backend) for backend in ("native", "wasm"))
     for batch, reuse in ((1, True), (3, False), (20, True), (20, False)):
         one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
         random = torch.Generator().manual_seed(batch)
@@ -61,7 +61,7 @@ def test_packed_worlds_restart_alike(torch, size):
     from powderdsl.tasks.episodes import compile_task
 
     task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
-    native, plain = (compile_task(task, backend=backend) for backend in ("native", "arrays"))
+    native, plain = (compile_task(task, backend=backend) for backend in ("native", "wasm"))
     for batch, reuse in ((3, True), (3, False), (20, True)):
         one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
         actions = torch.tensor([[7, 2, 14, 2, 0]]).expand(batch, 5)

@@ -30,7 +30,7 @@ class Played:
 def simulator():  # type: ignore[no-untyped-def]
     import powderdsl
 
-    return powderdsl.compile(RULES, backend="arrays")
+    return powderdsl.compile(RULES, backend="wasm")
 
 
 def play(name: str, split: str) -> dict[str, Played]:

@@ -20,7 +20,7 @@ from tests.fuzz.differential import seeded_starts
 def test_a_case_survives_being_written(seed: int, tmp_path: Path) -> None:
     text = random_ruleset_text(seed)
     for number, start in enumerate(seeded_starts(load_text(text), seed, 3)):
-        case = Case(text, start, number + 1, "arrays")
+        case = Case(text, start, number + 1, "wasm")
         write_case(tmp_path / "case.yaml", case, "differs: here\nand there")
         again = read_case(tmp_path / "case.yaml")
         assert (again.text, again.steps, again.backend) == (case.text, case.steps, case.backend)

@@ -77,7 +77,7 @@ def test_fields_are_drawn_where_elements_do_not_tell(tmp_path, mistake):
     path.write_text(FIELDS)
     original = Original.of(str(path))
     mutant = original.mutants()[0]
-    changed = compile(load_text(FIELDS.replace(old, new)), backend="arrays")
+    changed = compile(load_text(FIELDS.replace(old, new)), backend="wasm")
     found = distinguish(original.sim, changed)
     assert found is not None
     text = written_test(mutant, found, original.sim, original.packs).text

@@ -13,6 +13,7 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.output import print_json, progress
+from powderdsl.compiler import starting_backend
 from powderdsl.experiments.bench.machine import load_average, this_machine
 from powderdsl.experiments.bench.measure import measuring
 from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
@@ -41,7 +42,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     "backends",
     type=opt.BackendType(),
     multiple=True,
-    help="Backend that runs the rules.  [default: arrays and native; on a GPU, torch and cuda]",
+    help="Backend that runs the rules.  [default: wasm and native; on a GPU, torch and cuda]",
 )
 @opt.integer("--batch", 1, 1 << 20, "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
 @click.option("--size", "sizes", type=opt.SIZE, multiple=True, help="Rows and columns.  [default: 64]")
@@ -117,14 +118,15 @@ def command(
 
 def _usual_backends(device: str) -> tuple[str, ...]:
     """The default backends: the one that starts at once, and the fastest one for the device if it can be compiled."""
+    first = starting_backend(device)
     if device != "cpu":
         return ("torch", "cuda") if device.startswith("cuda") else ("torch",)
     try:
         find_compiler()
     except NoCompiler as error:
         click.echo(f"without the backend `native`: {error}", err=True)
-        return ("arrays",)
-    return ("arrays", "native")
+        return (first,)
+    return (first, "native")
 
 
 def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:

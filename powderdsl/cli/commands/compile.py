@@ -98,7 +98,7 @@ def _schedules(
     from powderdsl.schedule.stages import PLANNERS, steps
     from powderdsl.schedule.text import print_schedule
 
-    stages = PLANNERS.get("arrays" if backend == "auto" else backend)
+    stages = PLANNERS.get("wasm" if backend == "auto" else backend)
     if stages is None:
         raise BadInput(f"the {backend} backend has no schedule: it computes pass by pass what the IR says")
     names = ["lower", *(stage.name for stage in stages)]
@@ -136,20 +136,16 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
             from powderdsl.targets.cpp.source import native_source
 
             yield native_source(part.planes).text
-        elif backend == "wasm":
-            from powderdsl.targets.wasm.passes import pass_function_name
-            from powderdsl.targets.wasm.source import wasm_module
-
-            chosen = None if pass_name is None else pass_function_name(pass_name)
-            yield wasm_module(part.planes, SHOWN_WIDTH).module.listing(chosen)
         elif backend == "cuda":
             from powderdsl.targets.cuda.source import cuda_source
 
             yield cuda_source(part.planes, 64, 64, SHOWN_SHARED).text
         else:
-            from powderdsl.targets.arrays.source import kernel_source as array_source
+            from powderdsl.targets.wasm.passes import pass_function_name
+            from powderdsl.targets.wasm.source import wasm_module
 
-            yield array_source(part.planes, pass_name)
+            chosen = None if pass_name is None else pass_function_name(pass_name)
+            yield wasm_module(part.planes, SHOWN_WIDTH).module.listing(chosen)
 
 
 def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> None:

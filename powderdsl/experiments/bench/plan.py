@@ -87,7 +87,7 @@ class Plan:
 def make_plan(
     ruleset: Ruleset,
     *,
-    backends: Sequence[str] = ("arrays",),
+    backends: Sequence[str] = ("wasm",),
     batches: Sequence[int] = (1, 32),
     sizes: Sequence[Size] = ((64, 64),),
     elements: Sequence[int] = (),

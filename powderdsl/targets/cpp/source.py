@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.presence import asked_ids
-from powderdsl.schedule.stages import CPP, plan
+from powderdsl.schedule.stages import CPU, plan
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
@@ -52,7 +52,7 @@ def native_source(program: Program, words: int = 0) -> NativeSource:
         words: see `known_words`.
     """
     layout = layout_of(program)
-    schedules = [plan(pass_, CPP) for pass_ in program.passes]
+    schedules = [plan(pass_, CPU) for pass_ in program.passes]
     passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
     asked = reduce(or_, map(asked_ids, schedules), 0)
     calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))

@@ -8,7 +8,7 @@ from operator import or_
 
 from powderdsl.ir.ops import Program
 from powderdsl.schedule.presence import asked_ids
-from powderdsl.schedule.stages import WASM, plan
+from powderdsl.schedule.stages import CPU, plan
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.layout import Layout, layout_of
 from powderdsl.targets.wasm.binary import Module
@@ -38,7 +38,7 @@ class WasmModule:
 def wasm_module(program: Program, width: int, *, apart: bool = False) -> WasmModule:
     """The module of a program on planes, for grids of this width. `apart`: passes are exported too, by their numbers."""
     layout = layout_of(program)
-    schedules = [plan(pass_, WASM) for pass_ in program.passes]
+    schedules = [plan(pass_, CPU) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout)
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)

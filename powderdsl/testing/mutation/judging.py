@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from powderdsl.analysis.proofs import horizon
+from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
@@ -59,7 +60,7 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
         return Verdict("killed", "check", min(new))
     if meaning(ruleset) == original.meaning:
         return Verdict("equivalent", "the same model")
-    sim = compile(ruleset, backend="arrays")
+    sim = compile(ruleset, backend=starting_backend("cpu"))
     differs = True
     failed = failed_test(original, sim, mutant.pack, quick=True)
     if failed is None:

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from powderdsl.compiler import lower, read, set_params
+from powderdsl.compiler import lower, read, set_params, starting_backend
 from powderdsl.diagnostics import Diagnostic, Reporter, Severity, Source
 from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
@@ -102,7 +102,7 @@ class Original:
 
     @cached_property
     def sim(self) -> Simulator:
-        return compile(self.ruleset, backend="arrays")
+        return compile(self.ruleset, backend=starting_backend("cpu"))
 
     @cached_property
     def failing(self) -> frozenset[str]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from powderdsl.compiler import starting_backend
 from powderdsl.simulation.simulator import compile
 from powderdsl.system.crew import Done, work_through
 from powderdsl.testing.mutation.distinguishing import distinguish
@@ -112,7 +113,7 @@ def work(task: Task, tell: Callable[[Any], None]) -> Outcome:
         return Outcome(task.number, verdict)
     ruleset, _ = original.mutated(mutant)
     focus = focused(original, mutant)
-    found = distinguish(original.sim, compile(ruleset, backend="arrays"), focus, task.seed)
+    found = distinguish(original.sim, compile(ruleset, backend=starting_backend("cpu")), focus, task.seed)
     if found is None:
         return Outcome(task.number, verdict)
     rows, columns = found.sample.shape

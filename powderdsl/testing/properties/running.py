@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference
 from powderdsl.model.expressions.operands import TRUE
@@ -27,9 +28,9 @@ MARK = "happened "
 class Runner:
     """Runs a ruleset on one backend. `happened` collects the lines of rules that changed or claimed some cell."""
 
-    def __init__(self, ruleset: Ruleset, backend: str = "arrays"):
+    def __init__(self, ruleset: Ruleset, backend: str | None = None):
         self.ruleset = ruleset
-        self.backend = backend
+        self.backend = backend or starting_backend("cpu")
         self.lines = rule_spans(ruleset)
         self.happened: set[Span] = set()
         self.worlds_run = 0
@@ -37,7 +38,7 @@ class Runner:
             compile,  # brings torch, which `powderdsl check` does without
         )
 
-        self.sim = compile(marked(ruleset), backend=backend)
+        self.sim = compile(marked(ruleset), backend=self.backend)
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         """The state at the start and after each step, in storage dtypes. `random`: draws for all streams."""

@@ -1,1 +1,0 @@
-"""Bit planes on NumPy's arrays."""
