@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +64,17 @@ def current_backend(name: str) -> str:
 def starting_backend(device: str) -> str:
     """The backend that runs rules on a torch device at once, without a compiler of C++."""
     on_cpu = str(device).partition(":")[0] == "cpu"
-    return "wasm" if on_cpu and find_spec("wasmtime") is not None else "torch"
+    return "wasm" if on_cpu and has_wasmtime() else "torch"
+
+
+@cache
+def has_wasmtime() -> bool:
+    """Whether wasmtime runs on this machine: on some it can be installed, but not imported."""
+    try:
+        import wasmtime  # noqa: F401
+    except (ImportError, OSError, RuntimeError):
+        return False
+    return True
 
 
 MAX_BASES = 8

@@ -168,7 +168,7 @@ THIRD_PARTIES: dict[str, Home] = {
     "minari": Home(("datasets.minari",), ()),
     "h5py": Home(("datasets.minari",), ()),
     "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
-    "wasmtime": Home(("targets.wasm.wasmtime_host",), ("targets.wasm.wasmtime_host",)),
+    "wasmtime": Home(("compiler", "targets.wasm.wasmtime_host"), ("targets.wasm.wasmtime_host",)),
     "js": Home(("targets.wasm.browser_host",), ()),
     "pyodide": Home(("targets.wasm.browser_host",), ()),
     "click": Home(("cli",), ("cli",)),

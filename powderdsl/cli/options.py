@@ -241,7 +241,7 @@ def renamed_backend(name: str) -> str:
     return new
 
 
-def backend(default: str, about: str = "Backend that runs the rules.") -> Option:
+def backend(default: str | None, about: str = "Backend that runs the rules.") -> Option:
     return click.option("--backend", type=BackendType(), default=default, help=about)
 
 

@@ -46,7 +46,7 @@ class TestingReport:
     `picture`: where the first counterexample is drawn.
     """
 
-    backend: str
+    backend: str | None
     plan: SearchPlan
     drawn: int
     keep: bool | None

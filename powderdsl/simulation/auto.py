@@ -14,12 +14,13 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextvars import copy_context
 from functools import cache
+from math import prod
 
 from torch import Tensor
 
 from powderdsl.simulation.widths import ByWidth
 from powderdsl.targets.cpp.compilers import INSTALL, MISSING, NoCompiler, NoCompilerWarning
-from powderdsl.targets.job import Job, Runnable
+from powderdsl.targets.job import Job, Runnable, shape_of
 
 WORTH = 2.0
 """Native code is compiled once work on the first backend, done or expected in the current call, exceeds this many seconds.
@@ -128,38 +129,36 @@ class AutoProgram:
             return self._asked().run(job)
         if job.timing is not None:
             return (self._arrived() or self._first()).run(job)
-        clock, part, done = job.clock, job, 0
+        clock, part, done, cells = job.clock, job, 0, prod(shape_of(job.state))
         while True:
             native = self._arrived()
             if native is not None:
                 self._steps["native"] += part.steps
                 return native.run(part)
-            count = self._slice(job, job.steps - done)
+            count = self._slice(cells, job.steps - done)
             began = time.perf_counter()
             state = self._first().run(part._replace(steps=count))
             done += count
             later = clock._replace(since=clock.since + done)
             part = part._replace(state=state, clock=later, steps=job.steps - done)
-            self._account(job, count, job.steps - done, time.perf_counter() - began)
+            self._account(cells, count, job.steps - done, time.perf_counter() - began)
             if done == job.steps:
                 return state
 
-    def _slice(self, job: Job, left: int) -> int:
+    def _slice(self, cells: int, left: int) -> int:
         """The number of steps to run on the first backend before the next check: one until their speed is known."""
         if self._problem:
             return left
-        cells = job.state["element"].numel()
         if self._pace is None or self._pace[0] != cells:
             return min(left, 1)
         return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
 
-    def _account(self, job: Job, count: int, left: int, seconds: float) -> None:
+    def _account(self, cells: int, count: int, left: int, seconds: float) -> None:
         """Count steps that ran on the first backend, and start to compile once that is worth it."""
         if count == 0:
             return
         self._steps["first"] += count
         self._spent += seconds
-        cells = job.state["element"].numel()
         # The first step makes what later ones reuse: its duration does not predict theirs.
         first = self._pace is None or self._pace[0] != cells
         self._pace = (cells, seconds / count)

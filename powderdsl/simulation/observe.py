@@ -22,6 +22,7 @@ from powderdsl.model.state import Slot, slot_name, slots, storage
 from powderdsl.model.types import MatrixChannel, Property, Ruleset
 from powderdsl.simulation.draw import Ramp, palette, ramps
 from powderdsl.targets.cpp.program import PackedState, address
+from powderdsl.targets.job import shape_of
 from powderdsl.targets.words import pack, word_count
 
 State = Mapping[str, Tensor]
@@ -248,13 +249,6 @@ class Observer:
                 f"each world of out must be contiguous, and worlds apart; found the strides {list(out.stride())}"
             )
         return out
-
-
-def shape_of(state: State) -> tuple[int, int, int]:
-    """(worlds, rows, columns), without unpacking anything."""
-    like = getattr(state, "like", None)
-    batch, height, width = state["element"].shape if like is None else like["element"][1]
-    return batch, height, width
 
 
 def _write_slot(state: State, name: str, out: Tensor) -> Tensor:

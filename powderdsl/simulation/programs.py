@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
-from importlib.util import find_spec
 
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import lower, starting_backend
+from powderdsl.compiler import has_wasmtime, lower, starting_backend
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
 from powderdsl.model import reference
@@ -127,8 +126,8 @@ def _wasm_program(program: Program, device: torch.device) -> Runnable:
     """On the CPU only; passes that do not fit bit planes run on torch tensors."""
     if device.type != "cpu":
         raise _refusal("wasm", "wasmtime runs on the CPU", _ELSEWHERE.format(device))
-    if find_spec("wasmtime") is None:
-        problem = "the package `wasmtime` is missing, which has no wheel for some machines"
+    if not has_wasmtime():
+        problem = "the package `wasmtime` is missing, or does not run on this machine"
         raise _refusal("wasm", problem, "`pip install wasmtime`, or run on the backend `torch` or `native`")
     from powderdsl.targets.tensor_kind import Tensors
     from powderdsl.targets.torch.mixed import packed_program

@@ -16,7 +16,7 @@ from torch import Tensor
 from powderdsl.compiler import BACKENDS, current_backend, load, starting_backend
 from powderdsl.model.state import Slot, check_sides
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.observe import Observer, shape_of
+from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.parameters import Parameters
 from powderdsl.simulation.programs import find_device, make_program
 from powderdsl.simulation.state_checks import (
@@ -29,7 +29,7 @@ from powderdsl.simulation.state_checks import (
     unknown_name,
 )
 from powderdsl.system.writing import failure
-from powderdsl.targets.job import Clock, Job
+from powderdsl.targets.job import Clock, Job, shape_of
 from powderdsl.targets.profiling import profile_of
 
 MAX_CELLS = 1 << 31

@@ -8,9 +8,8 @@ from typing import Generic, TypeVar
 from torch import Tensor
 
 from powderdsl.targets.cpp.build import building, current
-from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.cpp.source import known_words
-from powderdsl.targets.job import Job, Runnable
+from powderdsl.targets.job import Job, Runnable, shape_of
 
 Program_ = TypeVar("Program_", bound=Runnable)
 
@@ -35,9 +34,7 @@ class ByWidth(Generic[Program_]):
 
     def for_job(self, job: Job) -> Program_:
         """The program that runs a job."""
-        state = job.state
-        shape = state.like["element"][1] if isinstance(state, PackedState) else state["element"].shape
-        return self.of(known_words(shape[-1]))
+        return self.of(known_words(shape_of(job.state)[-1]))
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""

@@ -28,6 +28,13 @@ class Clock(NamedTuple):
         return self.start + self.since if self.since else self.start
 
 
+def shape_of(state: Mapping[str, Array]) -> tuple[int, int, int]:
+    """(worlds, rows, columns) of a state, without unpacking anything."""
+    like = getattr(state, "like", None)  # what packed states know of their tensors
+    batch, height, width = state["element"].shape if like is None else like["element"][1]
+    return batch, height, width
+
+
 class Job(NamedTuple):  # made faster than a frozen dataclass, at each call
     """Steps of a batch of worlds.
 

@@ -10,14 +10,14 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.output import print_json
-from powderdsl.compiler import shipped_tests, starting_backend
+from powderdsl.compiler import shipped_tests
 
 MAX_SECONDS = 24 * 3600
 
 
 @click.command("test")
 @click.argument("rules", nargs=-1, metavar="[RULES]...")
-@opt.backend(starting_backend("cpu"))
+@opt.backend(None, "Backend that runs the rules.  [default: wasm]")
 @opt.parameters
 @opt.integer("--examples", 0, 10_000_000, "Random worlds on which each invariant is tried.", 1000)
 @opt.integer("--drawn", 0, 1_000_000, "Additional worlds, drawn by Hypothesis.", 100)
@@ -48,7 +48,7 @@ MAX_SECONDS = 24 * 3600
 )
 def command(
     rules: tuple[str, ...],
-    backend: str,
+    backend: str | None,
     settings: dict[str, str],
     examples: int,
     drawn: int,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from powderdsl.ir.ops import Program
 from powderdsl.targets.array_kind import Array, ArrayKind
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Job, shape_of
 from powderdsl.targets.wasm.host import this_host
 from powderdsl.targets.wasm.instances import Loaded, WasmState
 
@@ -38,8 +38,7 @@ class WasmProgram:
         assert not job.draws
         assert job.passes is None
         state = job.state
-        shape = state.like["element"][1] if isinstance(state, WasmState) else state["element"].shape
-        worlds, rows, width = shape
+        worlds, rows, width = shape_of(state)
         instance = self.loaded(width, apart=job.timing is not None).instance(worlds, rows)
         if isinstance(state, WasmState) and state.instance is not instance:
             state = dict(state)
