@@ -13,6 +13,7 @@ from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import CompiledProgram
 from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.torch.mixed import MixedProgram, mixed_program
 from powderdsl.targets.torch.program import TorchProgram
 from powderdsl.targets.wasm.program import WasmProgram
@@ -129,7 +130,9 @@ def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simula
         return Carried(pass_, None, "refused here") if pass_.name in refused else found
 
     sim = powderdsl.compile(rules, backend="torch")
-    mixed = mixed_program(segments(program, choose), sim.device, WasmProgram)
+    mixed = mixed_program(
+        segments(program, choose), sim.device, lambda *parts: WasmProgram(*parts, Tensors())
+    )
     assert isinstance(mixed, MixedProgram)
     sim._program = CompiledProgram(mixed, lambda: TorchProgram(program, sim.device), "wasm")
     return sim

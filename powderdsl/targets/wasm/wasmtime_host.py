@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 from typing import Any
 
@@ -18,6 +19,7 @@ class WasmtimeHost:
 
     def __init__(self) -> None:
         self._engine = wasmtime.Engine()
+        atexit.register(self._engine.close)  # later, when Python has taken wasmtime apart, it would complain
 
     def compile(self, code: bytes) -> wasmtime.Module:
         return wasmtime.Module(self._engine, code)
