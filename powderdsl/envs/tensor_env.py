@@ -253,8 +253,8 @@ class TensorEnv:
             raise TypeError(f"params takes a mapping from names to values, found {type(given).__name__}")
         whole = self.simulator.parameters(given, self.num_envs)
         names = given.keys() if bool(mask.all()) else {**given, **self.params}.keys()
-        usual = self.simulator.parameters({}, self.num_envs)
-        return {name: torch.where(mask, whole[name], self.params.get(name, usual[name])) for name in names}
+        old = {**self.simulator.parameters({}, self.num_envs), **self.params}
+        return {name: torch.where(mask, whole[name], old[name]) for name in names}
 
     # Saving
 

@@ -69,6 +69,24 @@ def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
     return tuple(sorted(found, key=lambda slot: place.get(slot.name, -1)))
 
 
+def property_dtype(prop: Property) -> str:
+    """The dtype in which a property is read that follows from the element."""
+    if prop.kind.name == "chance":
+        return "float32"
+    if prop.kind.name == "int":
+        return "int32" if storage(prop.kind) == "int32" else "int16"
+    return "uint8"
+
+
+def property_values(ruleset: Ruleset, name: str) -> list[float]:
+    """A property's values by id, parameters at their defaults: 256 of them, 0 for ids that no element has."""
+    prop = ruleset.property(name)
+    assert prop is not None
+    defaults = {param.name: param.default for param in ruleset.params}
+    values = [float(defaults[value]) if isinstance(value, str) else float(value) for value in prop.values]  # type: ignore[arg-type]
+    return values + [0.0] * (256 - len(values))
+
+
 def scratch_slots(pass_: Pass) -> dict[str, Slot]:
     """The slots of a pass's scratch fields by name. They live in the pass and are not stored."""
     return {

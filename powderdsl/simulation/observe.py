@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.diagnostics import suggest
 from powderdsl.ir.gates import width as width_of
 from powderdsl.ir.lower.rules import ir_type, slot_names
 from powderdsl.ir.ops import component_of
-from powderdsl.model.state import Slot, slot_name, slots, storage
-from powderdsl.model.types import MatrixChannel, Property, Ruleset
+from powderdsl.model.state import Slot, property_dtype, property_values, slot_name, slots
+from powderdsl.model.types import MatrixChannel, Ruleset
 from powderdsl.simulation.draw import Ramp, palette, ramps
+from powderdsl.simulation.state_checks import unknown_slot
 from powderdsl.targets.cpp.program import PackedState, address
 from powderdsl.targets.job import shape_of
 from powderdsl.targets.words import pack, word_count
@@ -75,11 +75,8 @@ class Observer:
             return _write_slot(state, name, self._buffer(out, shape, getattr(torch, slot.dtype)))
         prop = self.ruleset.property(name)
         if prop is None:
-            known = [*self.slots, *(p.name for p in self.ruleset.properties)]
-            raise KeyError(
-                f"{self.ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}"
-            )
-        out = self._buffer(out, (batch, height, width), _dtype(prop))
+            raise unknown_slot(self.ruleset, name)
+        out = self._buffer(out, (batch, height, width), getattr(torch, property_dtype(prop)))
         return out.copy_(self.table(name)[state["element"].int()])
 
     @torch.no_grad()
@@ -164,11 +161,7 @@ class Observer:
     def table(self, name: str) -> Tensor:
         """A property's values by id, parameters at their defaults: float64 [256]."""
         if name not in self._tables:
-            prop = self.ruleset.property(name)
-            assert prop is not None
-            defaults = {param.name: param.default for param in self.ruleset.params}
-            values = [float(defaults[v]) if isinstance(v, str) else float(v) for v in prop.values]  # type: ignore[arg-type]
-            values += [0.0] * (256 - len(values))
+            values = property_values(self.ruleset, name)
             self._tables[name] = torch.tensor(values, dtype=torch.float64, device=self.device)
         return self._tables[name]
 
@@ -229,7 +222,7 @@ class Observer:
         prop = self.ruleset.property(name)
         if prop is None:
             return Channel("zero")
-        tables.append(self.table(name).to(_dtype(prop)).float())
+        tables.append(self.table(name).to(getattr(torch, property_dtype(prop))).float())
         return Channel("table", "element", len(tables) - 1)
 
     def _buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -384,12 +377,3 @@ def _write_planes(state: State, names: Sequence[tuple[str, int]], out: Tensor) -
         return
     for i, (name, bit) in enumerate(names):
         out[:, i] = pack((state[name] >> bit) & 1 != 0)
-
-
-def _dtype(prop: Property) -> torch.dtype:
-    """The dtype in which a property is read."""
-    if prop.kind.name == "chance":
-        return torch.float32
-    if prop.kind.name == "int":
-        return torch.int32 if storage(prop.kind) == "int32" else torch.int16
-    return torch.uint8

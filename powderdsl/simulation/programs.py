@@ -12,38 +12,12 @@ from torch import Tensor
 from powderdsl.compiler import has_wasmtime, lower, starting_backend
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
-from powderdsl.model import reference
 from powderdsl.model.types import Ruleset
+from powderdsl.simulation.reference_program import ReferenceProgram
 from powderdsl.system.writing import failure
 from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
 from powderdsl.targets.job import Job, Runnable
-
-
-class ReferenceProgram:
-    """The oracle behind the common signature."""
-
-    def __init__(self, ruleset: Ruleset):
-        self.ruleset = ruleset
-        self._bits = {stream.name: stream.bits for stream in ruleset.streams}
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later. The time before a step's first pass counts for that pass."""
-        device = job.state["element"].device
-        seed, index = (part.cpu().numpy() for part in job.clock[:2])
-        start = job.clock.step.cpu().numpy()
-        arrays = {name: value.cpu().numpy() for name, value in job.state.items()}
-        given_params = {name: value.cpu().numpy() for name, value in job.params.items()}
-        numbers = reference.parameters(self.ruleset, len(seed), given_params)
-        given = {
-            name: (value.cpu().numpy() + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()
-        }
-        for i in range(job.steps):
-            at = reference.Clock(seed, index, start + i)
-            job.tick("")
-            arrays = reference.step(
-                self.ruleset, arrays, at, numbers, passes=job.passes, draws=given, tick=job.tick
-            )
-        return {name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()}
+from powderdsl.targets.tensor_kind import Tensors
 
 
 def find_device(name: str | torch.device) -> torch.device:
@@ -78,7 +52,7 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         CompileError: PD701 if the backend is not available.
     """
     if backend == "reference":
-        return ReferenceProgram(ruleset)
+        return ReferenceProgram(ruleset, Tensors(device))
     # Both are made when first needed: code that was compiled before needs neither.
     lowered = cache(lambda: lower(ruleset))
     cells = cache(lambda: _torch_program(lowered(), device))
@@ -129,11 +103,10 @@ def _wasm_program(program: Program, device: torch.device) -> Runnable:
     if not has_wasmtime():
         problem = "the package `wasmtime` is missing, or does not run on this machine"
         raise _refusal("wasm", problem, "`pip install wasmtime`, or run on the backend `torch` or `native`")
-    from powderdsl.targets.tensor_kind import Tensors
     from powderdsl.targets.torch.mixed import packed_program
     from powderdsl.targets.wasm.program import WasmProgram
 
-    kind = Tensors()
+    kind = Tensors(device)
     return packed_program(program, device, lambda numbers, planes: WasmProgram(numbers, planes, kind))
 
 

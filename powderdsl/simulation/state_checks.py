@@ -5,27 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from powderdsl.diagnostics import suggest
-from powderdsl.model.state import SNAP, Slot
+from powderdsl.model.state import SNAP, Slot, slots
 from powderdsl.model.types import Ruleset
+from powderdsl.targets.array_kind import Array, ArrayKind
 
 CHUNK = 1 << 20
 """Cells that are looked at together."""
-
-
-def given_tensor(value: Any, name: str, device: torch.device) -> Tensor:
-    """Values from outside as a tensor, which may share their memory. Raises TypeError."""
-    flags = getattr(value, "flags", None)
-    if getattr(flags, "writeable", True) is False:
-        value = value.copy()  # torch warns of arrays that it could write to and may not
-    try:
-        return torch.as_tensor(value, device=device)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
 
 
 def given_mapping(name: str, given: Any) -> Mapping[str, Any]:
@@ -40,54 +26,75 @@ def unknown_name(kind: str, name: str, known: Iterable[str], kinds: str = "") ->
     return KeyError(f"no {kind} `{name}`; {'; '.join(suggest(name, known, kinds or f'{kind}s'))}")
 
 
-def check_ids(ids: Tensor, name: str, ruleset: Ruleset) -> None:
+def unknown_slot(ruleset: Ruleset, name: str) -> KeyError:
+    """The error for a name that is neither a field nor a property."""
+    known = [*(slot.name for slot in slots(ruleset)), *(prop.name for prop in ruleset.properties)]
+    return KeyError(
+        f"{ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}"
+    )
+
+
+def check_ids(kind: ArrayKind, ids: Array, name: str, ruleset: Ruleset) -> None:
     """Raises ValueError for ids that a ruleset does not have."""
-    known = torch.zeros(256, dtype=torch.bool, device=ids.device)
-    known[[element.id for element in ruleset.elements]] = True
+    xp, known = kind.xp, _holders(kind, (element.id for element in ruleset.elements))
     flat = ids.reshape(-1)
     for start in range(0, len(flat), CHUNK):
-        values = flat[start : start + CHUNK].to(torch.int64)
-        good = (values >= 0) & (values < 256) & known[values.clamp(0, 255)]
+        values = xp.asarray(flat[start : start + CHUNK], dtype=xp.int64)
+        good = (values >= 0) & (values < 256) & known[xp.clip(values, 0, 255)]
         if not bool(good.all()):
-            at = int((~good).nonzero()[0])
-            place = [int(one) for one in np.unravel_index(start + at, tuple(ids.shape))]
+            at = good.tolist().index(False)
+            place = _place(start + at, tuple(ids.shape))
             raise ValueError(f"{name}{place} is {int(values[at])}: no element of {ruleset.name} has this id")
 
 
-def looked_up(table: Tensor, ids: Tensor, dtype: torch.dtype) -> Tensor:
+def _holders(kind: ArrayKind, ids: Iterable[int]) -> Array:
+    """Flags by id: bool [256]."""
+    some = set(ids)
+    return kind.put([number in some for number in range(256)])
+
+
+def _place(index: int, shape: tuple[int, ...]) -> list[int]:
+    """The place of the n-th cell in C order."""
+    found = []
+    for side in reversed(shape):
+        index, rest = divmod(index, side)
+        found.append(rest)
+    return found[::-1]
+
+
+def looked_up(kind: ArrayKind, table: Array, ids: Array, dtype: Any) -> Array:
     """The entry of a table [256] or [256, 2] for each of the ids [B, H, W]: of `dtype`, [B, H, W] or [B, 2, H, W]."""
     vectors = table.ndim == 2
-    shape = (len(ids), 2, *ids.shape[1:]) if vectors else ids.shape
-    out = torch.empty(shape, dtype=dtype, device=ids.device)
-    for rows in _rows(ids):
-        found = table[ids[:, rows].int()]
-        if vectors:
-            out[:, :, rows] = found.movedim(-1, 1)
-        else:
-            out[:, rows] = found
+    shape = tuple(ids.shape)
+    out = kind.empty(dtype, (shape[0], 2, *shape[1:]) if vectors else shape)
+    for rows in _rows(shape):
+        found = table[kind.as_index(ids[:, rows])]
+        out[..., rows, :] = kind.xp.moveaxis(found, -1, 1) if vectors else found
     return out
 
 
-def _rows(ids: Tensor) -> Iterator[slice]:
-    """The rows of worlds [B, H, W] in parts."""
-    batch, height, width = ids.shape
-    step = max(1, CHUNK // max(1, batch * width))
-    return (slice(start, start + step) for start in range(0, height, step))
+def _rows(shape: tuple[int, ...]) -> Iterator[slice]:
+    """The rows of worlds [B, H, W] or [B, 2, H, W] in parts."""
+    step = max(1, CHUNK // max(1, shape[0] * shape[-1]))
+    return (slice(start, start + step) for start in range(0, shape[-2], step))
 
 
-def checked_floats(tensor: Tensor, slot: Slot) -> Tensor:
+def checked_floats(kind: ArrayKind, array: Array, slot: Slot) -> Array:
     """Values as a float32 slot holds them, in memory of their own. Raises ValueError."""
-    if not bool(torch.isfinite(tensor).all()):
+    xp = kind.xp
+    if not bool(xp.isfinite(array).all()):
         raise ValueError(f"{slot.name} has values that are not finite")
-    floats = tensor.to(torch.float32).clamp(slot.kind.lo, slot.kind.hi).contiguous()
-    for part in floats.view(-1).split(CHUNK):
-        part.masked_fill_(part.abs() < SNAP, 0)
+    inside = xp.clip(xp.asarray(array, dtype=xp.float32), slot.kind.lo, slot.kind.hi)
+    floats = kind.contiguous(inside)
+    for rows in _rows(floats.shape):
+        part = floats[..., rows, :]
+        floats[..., rows, :] = xp.where(xp.abs(part) < SNAP, 0, part)
     return floats
 
 
 def checked_integers(
-    tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, ruleset: Ruleset
-) -> Tensor:
+    kind: ArrayKind, array: Array, ids: Array, slot: Slot, usual: Array | None, ruleset: Ruleset
+) -> Array:
     """Values [B, H, W] as a slot of integers holds them, in memory of their own.
 
     Args:
@@ -97,28 +104,30 @@ def checked_integers(
     Raises:
         TypeError, ValueError: values that the slot cannot hold, or not in these cells.
     """
-    out = torch.empty(tensor.shape, dtype=getattr(torch, slot.dtype), device=ids.device)
-    for rows in _rows(ids):
-        out[:, rows] = _integers(tensor[:, rows], ids[:, rows], slot, usual, ruleset)
+    out = kind.empty(getattr(kind.xp, slot.dtype), tuple(array.shape))
+    for rows in _rows(out.shape):
+        out[:, rows] = _integers(kind, array[:, rows], ids[:, rows], slot, usual, ruleset)
     return out
 
 
-def _integers(tensor: Tensor, ids: Tensor, slot: Slot, usual: Tensor | None, ruleset: Ruleset) -> Tensor:
-    kind = slot.kind
-    if tensor.dtype.is_floating_point and not bool((tensor == tensor.round()).all()):
-        raise TypeError(f"{slot.name} takes integers, found {tensor.dtype}")
-    values = tensor.to(torch.int64)
+def _integers(
+    arrays: ArrayKind, array: Array, ids: Array, slot: Slot, usual: Array | None, ruleset: Ruleset
+) -> Array:
+    xp, kind = arrays.xp, slot.kind
+    if arrays.sort(array) == "float" and not bool((array == xp.round(array)).all()):
+        raise TypeError(f"{slot.name} takes integers, found {array.dtype}")
+    values = xp.asarray(array, dtype=xp.int64)
     if kind.name == "element":
-        check_ids(values, slot.name, ruleset)
+        check_ids(arrays, values, slot.name, ruleset)
     lo, hi = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(kind.name, (kind.lo, kind.hi))
     if bool(((values < lo) | (values > hi)).any()):
         raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {int(values.min())}..{int(values.max())}")
     prop = ruleset.property(slot.name)
     limited = prop.stored if prop is not None else slot.of
     if limited is not None:
-        default = torch.full_like(values, int(slot.default)) if usual is None else usual[ids.int()].long()
-        holders = torch.isin(ids.long(), torch.tensor(sorted(limited), device=ids.device))
-        if bool(((values != default) & ~holders).any()):
+        places = arrays.as_index(ids)
+        default = int(slot.default) if usual is None else xp.asarray(usual[places], dtype=xp.int64)
+        if bool(((values != default) & ~_holders(arrays, limited)[places]).any()):
             names = ", ".join(e.name for e in ruleset.elements if e.id in limited)
             raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
     return values

@@ -1,4 +1,4 @@
-"""Torch tensors in the memory of this process, as programs take and return them."""
+"""Torch tensors on one device, as worlds and programs use them."""
 
 from __future__ import annotations
 
@@ -8,19 +8,59 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.arrays import np
+
 
 class Tensors:
-    """An `array_kind.ArrayKind`: tensors on the CPU."""
+    """An `array_kind.ArrayKind`."""
 
     xp: Any = torch
 
-    def empty(self, dtype: torch.dtype, shape: tuple[int, ...]) -> tuple[Tensor, Any]:
+    def __init__(self, device: torch.device | str = "cpu"):
+        self.device = torch.device(device)
+
+    def given(self, value: Any, name: str) -> Tensor:
+        flags = getattr(value, "flags", None)
+        if getattr(flags, "writeable", True) is False:
+            value = value.copy()  # torch warns of arrays that it could write to and may not
+        try:
+            return torch.as_tensor(value, device=self.device)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
+
+    def put(self, values: Any, dtype: str | None = None) -> Tensor:
+        return torch.tensor(
+            values, dtype=None if dtype is None else getattr(torch, dtype), device=self.device
+        )
+
+    def empty(self, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=self.device)
+
+    def copied(self, array: Tensor) -> Tensor:
+        return array.clone(memory_format=torch.contiguous_format)
+
+    def contiguous(self, array: Tensor) -> Tensor:
+        return array.contiguous()
+
+    def as_index(self, ids: Tensor) -> Tensor:
+        return ids.int()
+
+    def sort(self, array: Tensor) -> str:
+        dtype = array.dtype
+        if dtype.is_complex:
+            return "complex"
+        return "float" if dtype.is_floating_point else "bool" if dtype == torch.bool else "int"
+
+    def to_numpy(self, array: Tensor) -> Any:
+        return array.detach().cpu().numpy()
+
+    def from_numpy(self, array: Any) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+    def writable(self, dtype: torch.dtype, shape: tuple[int, ...]) -> tuple[Tensor, Any]:
         made = torch.empty(shape, dtype=dtype)
         return made, self.bytes_of(made)
 
     def bytes_of(self, array: Tensor) -> Any:
         """A view: the tensor must live longer."""
         return (ctypes.c_ubyte * array.nbytes).from_address(array.data_ptr())
-
-    def contiguous(self, array: Tensor) -> Tensor:
-        return array.contiguous()

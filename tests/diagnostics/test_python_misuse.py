@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -12,19 +12,42 @@ import pytest
 import powderdsl
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.simulation.array_worlds import ArraySimulator
 
 NAN = float("nan")
 SHAPE = (2, 4, 5)
 
 
-@cache
+LIBRARY = ["torch"]
+"""The library of the arrays that calls are made with."""
+
+
 def simulator() -> Any:
-    return powderdsl.compile(powderdsl.load("powderworld"), backend="reference")
+    return simulator_of(LIBRARY[0])
 
 
 @cache
+def simulator_of(library: str) -> Any:
+    ruleset = powderdsl.load("powderworld")
+    if library == "arrays":
+        return ArraySimulator(ruleset, backend="reference")
+    return powderdsl.compile(ruleset, backend="reference")
+
+
 def world() -> Any:
-    return simulator().world(np.zeros(SHAPE, np.uint8))
+    return world_of(LIBRARY[0])
+
+
+@cache
+def world_of(library: str) -> Any:
+    return simulator_of(library).world(np.zeros(SHAPE, np.uint8))
+
+
+@pytest.fixture(params=["torch", "arrays"])
+def library(request: pytest.FixtureRequest) -> Iterator[None]:
+    LIBRARY[0] = request.param
+    yield
+    LIBRARY[0] = "torch"
 
 
 def full(value: Any, *shape: int) -> np.ndarray:
@@ -156,6 +179,7 @@ DIAGNOSTICS: list[tuple[str, Callable[[], Any], str]] = [
 ]
 
 
+@pytest.mark.usefixtures("library")
 @pytest.mark.parametrize(("call", "kind", "words"), [pytest.param(*row[1:], id=row[0]) for row in ROWS])
 def test_a_wrong_argument_is_named(call: Callable[[], Any], kind: type[Exception], words: str) -> None:
     with pytest.raises((ValueError, TypeError, KeyError)) as caught:
@@ -172,6 +196,7 @@ def test_a_wrong_value_from_outside_is_a_diagnostic(call: Callable[[], Any], cod
     assert [one.code for one in caught.value.diagnostics] == [code]
 
 
+@pytest.mark.usefixtures("library")
 def test_values_that_look_odd_and_are_right() -> None:
     sim = simulator()
     ids = np.broadcast_to(np.uint16(0), (1, 2, 2))

@@ -1,37 +1,20 @@
-"""Programs of several parts that take turns within each step: bit planes where they can represent a pass, else torch."""
+"""Programs on bit planes where they can represent a pass, and on torch tensors elsewhere."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
-from torch import Tensor
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
 from powderdsl.system.memory import collection_paused
-from powderdsl.targets.job import Job, Runnable
+from powderdsl.targets.job import Runnable
+from powderdsl.targets.mixed import MixedProgram
 from powderdsl.targets.torch.program import TorchProgram
 
 MakePacked = Callable[[Program, Program], Runnable]
 """Makes a runnable part from a program on numbers and the same program on bit planes."""
-
-
-class MixedProgram:
-    """Parts that take turns. The whole state is unpacked and packed again between them."""
-
-    def __init__(self, parts: Sequence[Runnable]):
-        self.parts = tuple(parts)
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        clock, state = job.clock, job.state
-        for i in range(job.steps):
-            for part in self.parts:
-                state = part.run(
-                    job._replace(state=state, clock=clock._replace(since=clock.since + i), steps=1)
-                )
-        return state
 
 
 @collection_paused()

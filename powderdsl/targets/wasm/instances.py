@@ -98,7 +98,7 @@ class Instance:
 
     def read(self, batch: int, name: str, like: Like) -> Array:
         """One slot as a new array of its storage dtype."""
-        out, memory = self.kind.empty(*like[name])
+        out, memory = self.kind.writable(*like[name])
         with self as call:
             at = call("scratch", out.nbytes)
             for one in self.transfers(name, out.itemsize, like[name][1]):

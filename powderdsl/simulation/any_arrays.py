@@ -1,0 +1,405 @@
+"""Worlds and simulators, whatever library their arrays are of: state in, state out.
+
+Worlds are immutable; every method returns a new one. Arrays are in the storage dtypes of `model.state`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import index
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
+
+from powderdsl.model.state import Slot, check_sides, property_values, slots
+from powderdsl.model.types import Ruleset
+from powderdsl.simulation.parameters import Parameters
+from powderdsl.simulation.state_checks import (
+    check_ids,
+    checked_floats,
+    checked_integers,
+    given_mapping,
+    looked_up,
+    unknown_name,
+)
+from powderdsl.targets.array_kind import Array, ArrayKind
+from powderdsl.targets.job import Clock, Job, Runnable, shape_of
+
+MAX_CELLS = 1 << 31
+
+
+@dataclass(frozen=True)
+class AnyWorld:
+    """A batch of worlds of one ruleset.
+
+    `state` has one array a slot; `seed`, `index` and `step` (int64 [B]) decide the random numbers: the same three
+    give the same future, alone or in any batch.
+    """
+
+    sim: Any
+    state: Mapping[str, Array]
+    seed: Array
+    index: Array
+    step: Array
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Array:
+            """The step of a world that a simulator has made, counted when it is first read."""
+            clock = self.__dict__.get("_clock")
+            if name != "step" or clock is None:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            return self.__dict__.setdefault("step", clock.start + clock.since)
+
+    @property
+    def ids(self) -> Array:
+        """Element ids, uint8 [B, H, W]."""
+        return self.state["element"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(worlds, rows, columns)."""
+        return shape_of(self.state)
+
+    def __len__(self) -> int:
+        return int(self.seed.shape[0])  # without unpacking anything, nor torch's Python
+
+    def __getitem__(self, name: str) -> Array:
+        """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""
+        return self.read(name)
+
+    def read(self, name: str) -> Array:
+        """`world[name]`."""
+        raise NotImplementedError
+
+    def with_state(self, state: Mapping[str, Array]) -> Self:
+        """These worlds in another state, at the same step with the same random futures."""
+        world = object.__new__(type(self))
+        world.__dict__.update(self.__dict__, state=state)
+        return world
+
+    def select(self, worlds: int | slice | Sequence[int] | Array) -> Self:
+        """Some worlds of the batch, with their random futures unchanged."""
+        keys = [worlds] if isinstance(worlds, int) else worlds
+        chosen = {name: value[keys] for name, value in self.state.items()}
+        return replace(self, state=chosen, seed=self.seed[keys], index=self.index[keys], step=self.step[keys])
+
+
+W = TypeVar("W", bound=AnyWorld)
+
+
+class AnySimulator(Generic[W]):
+    """Runs one ruleset. What its library of arrays decides is in `kind`, and in the program."""
+
+    world_type: type[W]
+    backend: str
+    _program: Runnable
+
+    def __init__(self, ruleset: Ruleset, kind: ArrayKind):
+        self.ruleset = ruleset
+        self.kind = kind
+        self._slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
+        self._params = Parameters(ruleset, kind)
+        self._tables: dict[str, Array] = {}
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The elements' names in id order."""
+        return tuple(element.name for element in self.ruleset.elements)
+
+    @property
+    def passes(self) -> tuple[str, ...]:
+        """The passes' names in the order they run."""
+        return tuple(p.name for p in self.ruleset.passes)
+
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        """The arrays of a world's state."""
+        return tuple(self._slots.values())
+
+    def table(self, name: str) -> Array:
+        """A property's values by id, parameters at their defaults: float64 [256]."""
+        if name not in self._tables:
+            self._tables[name] = self.kind.put(property_values(self.ruleset, name), "float64")
+        return self._tables[name]
+
+    # Making worlds
+
+    def world(self, ids: Any, seed: Any = 0, *, index: Any = None) -> W:
+        """Fresh worlds from element ids.
+
+        Args:
+            ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
+            seed: one integer for all, or one a world.
+            index: which world of its seed each is; 0, 1, … for one common seed, 0 for seeds of their own.
+
+        Raises:
+            TypeError: ids are not integers. ValueError: wrong shape, or ids that the ruleset does not have.
+        """
+        given, xp = self._integers(ids, "ids"), self.kind.xp
+        if given.ndim == 2:
+            given = given[None]
+        shape = tuple(given.shape)
+        if given.ndim != 3 or 0 in shape:
+            raise ValueError(f"ids must have the shape [worlds, rows, columns], found {list(shape)}")
+        batch, height, width = shape
+        check_sides(self.ruleset, (height, width))
+        if batch * height * width > MAX_CELLS:
+            raise ValueError(f"{batch * height * width:,} cells are more than {MAX_CELLS:,}")
+        check_ids(self.kind, given, "ids", self.ruleset)
+        element = xp.asarray(given, dtype=xp.uint8)
+        seeds = self._integers(seed, "seed")
+        if index is None:
+            index = range(batch) if seeds.ndim == 0 else [0] * batch
+        return self.world_type(
+            self,
+            {name: self._fresh(slot, element) for name, slot in self._slots.items()},
+            self._numbers(seeds, "seed", batch),
+            self._numbers(self._integers(index, "index"), "index", batch),
+            self.kind.put([0] * batch, "int64"),
+        )
+
+    def _fresh(self, slot: Slot, ids: Array) -> Array:
+        """A slot's values in new cells of these elements."""
+        if slot.name == "element":
+            return self.kind.copied(ids)
+        dtype = getattr(self.kind.xp, slot.dtype)
+        if self.ruleset.property(slot.name) is not None:
+            return looked_up(self.kind, self.table(slot.name), ids, dtype)
+        values = self.kind.put([slot.fresh(i) for i in range(256)], slot.dtype)
+        return looked_up(self.kind, values, ids, dtype)
+
+    def _renewed(self, state: Mapping[str, Array], ids: Array, cells: Array) -> dict[str, Array]:
+        """A state with fresh cells of the elements `ids`, uint8 [B, H, W], where `cells` is set."""
+        return {
+            name: self._where(slot, cells, self._fresh(slot, ids), state[name])
+            if slot.travels
+            else state[name]
+            for name, slot in self._slots.items()
+        }
+
+    def _where(self, slot: Slot, cells: Array, yes: Array, no: Array) -> Array:
+        """The values of a slot, by cells bool [B, H, W]."""
+        return self.kind.xp.where(cells[:, None] if slot.planes == 2 else cells, yes, no)
+
+    def _integers(self, value: Any, name: str) -> Array:
+        array = self.kind.given(value, name)
+        if self.kind.sort(array) != "int":
+            raise TypeError(f"{name} must be integers, found {array.dtype}")
+        return array
+
+    def _numbers(self, array: Array, name: str, batch: int) -> Array:
+        """Integers of 0 or more, one a world: int64 [B] in memory of their own."""
+        xp = self.kind.xp
+        array = xp.asarray(array, dtype=xp.int64)
+        if array.ndim == 0:
+            array = xp.broadcast_to(array, (batch,))
+        if tuple(array.shape) != (batch,) or bool((array < 0).any()):
+            raise ValueError(
+                f"{name} must be one number of 0 or more, or {batch} of them, found shape {list(array.shape)}"
+            )
+        return self.kind.copied(array)
+
+    # Changing worlds
+
+    def replace(self, world: W, **fields: Any) -> W:
+        """The world with these fields set. New ids make fresh cells; other fields are set after that.
+
+        Args:
+            fields: by name: [B, H, W] (or [H, W], or one number for all); vectors [B, 2, H, W] as (rows, columns).
+
+        Raises:
+            KeyError: an unknown field. TypeError, ValueError: wrong dtype, shape, range, NaN, or a value where the
+                element cannot hold one.
+        """
+        state, xp = dict(world.state), self.kind.xp
+        if "ids" in fields or "element" in fields:
+            given = fields.pop("ids", None) if "ids" in fields else fields.pop("element")
+            ids = self._shaped(self._integers(given, "ids"), "ids", world.shape, False)
+            check_ids(self.kind, ids, "ids", self.ruleset)
+            element = xp.asarray(ids, dtype=xp.uint8)
+            state = self._renewed(state, element, element != state["element"])
+        for name, value in fields.items():
+            if name not in self._slots:
+                if self.ruleset.property(name) is None:
+                    world.read(name)
+                wanted = self._shaped(value, name, world.shape, False)
+                held = self.table(name)[self.kind.as_index(state["element"])]
+                if not bool((xp.asarray(wanted, dtype=xp.float64) == held).all()):
+                    raise ValueError(
+                        f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
+                    )
+                continue
+            state[name] = self._checked(self._slots[name], value, state["element"])
+        return replace(world, state=state)
+
+    def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool) -> Array:
+        array = self.kind.given(value, name)
+        target = (shape[0], 2, *shape[1:]) if vector else shape
+        if vector and array.ndim == 1 and len(array) == 2:
+            array = array[None, :, None, None]
+        try:
+            return self.kind.xp.broadcast_to(array, target)
+        except (RuntimeError, ValueError):
+            raise ValueError(
+                f"{name} must have the shape {list(target)}, found {list(array.shape)}"
+            ) from None
+
+    def _checked(self, slot: Slot, value: Any, ids: Array) -> Array:
+        array = self._shaped(value, slot.name, tuple(ids.shape), slot.planes == 2)
+        if self.kind.sort(array) == "complex":
+            raise TypeError(f"{slot.name} takes floats, found {array.dtype}")
+        if slot.is_real:
+            return checked_floats(self.kind, array, slot)
+        usual = None if self.ruleset.property(slot.name) is None else self.table(slot.name)
+        return checked_integers(self.kind, array, ids, slot, usual, self.ruleset)
+
+    def paint(self, world: W, *, where: Any, element: str | None = None, **fields: Any) -> W:
+        """Set cells of a mask: fresh cells of an element, and values of fields.
+
+        Args:
+            where: bool [B, H, W] or [H, W].
+            element: the element's name, plain or qualified.
+            fields: values by field name; vectors as (rows, columns).
+
+        Raises:
+            KeyError: an unknown element or field. ValueError: a wrong shape or value.
+        """
+        xp = self.kind.xp
+        mask = self._shaped(where, "where", world.shape, False)
+        if self.kind.sort(mask) != "bool":
+            raise TypeError(f"where must be a bool mask, found {mask.dtype}")
+        if element is not None:
+            found = self.ruleset.element(element)
+            if found is None:
+                raise unknown_name("element", element, self.elements)
+            element_ids = xp.full_like(world.ids, found.id)
+            world = replace(world, state=self._renewed(world.state, element_ids, mask))
+        for name, value in fields.items():
+            if name not in self._slots:
+                world.read(name)
+                raise ValueError(f"`{name}` follows from the element: it cannot be painted")
+            slot = self._slots[name]
+            new = self._shaped(value, name, world.shape, slot.planes == 2)
+            both = (xp.asarray(one, dtype=xp.float64) for one in (new, world.state[name]))
+            world = self.replace(world, **{name: self._where(slot, mask, *both)})
+        return world
+
+    # Running
+
+    def step(
+        self,
+        world: W,
+        steps: int = 1,
+        *,
+        random: Mapping[str, Any] | None = None,
+        passes: Sequence[str] | None = None,
+        params: Mapping[str, Any] | None = None,
+        reuse: bool = False,
+    ) -> W:
+        """The world some steps later; the argument stays as it was.
+
+        Args:
+            steps: how many, 0 or more.
+            random: draws to use instead of our own, by stream: [B, H, W] in [0, 1). A draw r counts as the draw of
+                the stream's resolution that it falls into. The same draws serve every step.
+            passes: run only these passes, in the ruleset's order.
+            params: parameter values for this call, one number each or [B] values, one a world.
+            reuse: the memory of `world` may be written to, and it must not be used afterwards: saves a copy.
+
+        Raises:
+            KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
+        """
+        self.check(world)
+        steps = whole_count(steps, "steps")
+        draws: Mapping[str, Array] = _NOTHING
+        chosen = None
+        clock = clock_of(world)
+        batch = clock.seed.shape[0]
+        if params is None:
+            values = self._params.defaults(batch)
+        else:
+            values = self._params.checked(given_mapping("params", params), batch)
+        if random is not None:
+            draws = self._draws(given_mapping("random", random), world)
+        if passes is not None:
+            chosen = self._chosen(passes)
+        state = self._program.run(Job(world.state, clock, steps, values, draws, chosen, reuse))
+        return self._stepped(state, clock, steps)
+
+    def _stepped(self, state: Mapping[str, Array], clock: Clock, steps: int) -> W:
+        """The world of a state that is some steps after a clock; made without the calls that a frozen dataclass takes."""
+        world = object.__new__(self.world_type)
+        known = world.__dict__
+        known["sim"], known["state"], known["seed"], known["index"] = self, state, clock.seed, clock.world
+        known["_clock"] = Clock(clock.seed, clock.world, clock.start, clock.since + steps)
+        return world
+
+    def _chosen(self, passes: Sequence[str]) -> frozenset[str]:
+        if isinstance(passes, str):
+            raise TypeError(f"passes takes a list of names: [{passes!r}]")
+        unknown = [name for name in passes if name not in self.passes]
+        if unknown:
+            raise unknown_name("pass", unknown[0], self.passes, "passes")
+        return frozenset(passes)
+
+    def check(self, world: Any) -> None:
+        """Raises TypeError for what is not a world, ValueError for a world of other rules."""
+        if not isinstance(world, self.world_type):
+            raise TypeError(f"world must be a World, found {type(world).__name__}")
+        if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
+            raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
+
+    def _draws(self, random: Mapping[str, Any], world: W) -> dict[str, Array]:
+        """Given draws as integers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
+        bits = {stream.name: stream.bits for stream in self.ruleset.streams}
+        draws, xp = {}, self.kind.xp
+        for name, value in random.items():
+            if name not in bits:
+                raise unknown_name("stream", name, bits)
+            given = self._shaped(value, f"random[{name!r}]", world.shape, False)
+            array = xp.asarray(given, dtype=xp.float64)
+            if not bool(((array >= 0) & (array < 1)).all()):
+                raise ValueError(f"random[{name!r}] must lie in [0, 1)")
+            draws[name] = xp.asarray(xp.floor(array * float(1 << bits[name])), dtype=xp.int64)
+        return draws
+
+    def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Array]:
+        """All parameters as float64 [B]: given values, and defaults. Raises KeyError, TypeError, ValueError."""
+        checked = self._params.checked(params, batch)
+        return {name: self.kind.copied(value) for name, value in checked.items()}
+
+
+_NOTHING: Mapping[str, Array] = {}
+
+
+def clock_of(world: AnyWorld) -> Clock:
+    """What decides the random numbers of a world's next step. Raises ValueError for arrays that do not fit.
+
+    A world that a simulator has made has a clock whose `start` nobody else sees, until its `step` is read: that array
+    may have been written to, so it counts from then on.
+    """
+    known = world.__dict__
+    clock: Clock | None = known.get("_clock")
+    if clock is not None and "step" not in known:
+        return clock
+    kind, batch = world.sim.kind, shape_of(world.state)[0]
+    device = getattr(world.seed, "device", None)
+    for name in ("seed", "index", "step"):
+        array = getattr(world, name)
+        fits = tuple(array.shape) == (batch,) and array.dtype == kind.xp.int64
+        if not fits or getattr(array, "device", None) != device:
+            raise ValueError(
+                f"a world's {name} must be int64 [{batch}], found {array.dtype} {list(array.shape)}"
+            )
+    return Clock(world.seed, world.index, kind.copied(world.step))
+
+
+def whole_count(value: Any, name: str) -> int:
+    """An integer of 0 or more, Python's or NumPy's."""
+    try:
+        number = index(value)
+    except TypeError:
+        number = -1
+    if number < 0 or isinstance(value, bool):
+        raise ValueError(f"{name} must be an integer of 0 or more, found {value!r}")
+    return number

@@ -1,0 +1,119 @@
+"""Simulators without torch give the worlds of those with torch, bit for bit, whatever is done with them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import powderdsl
+from powderdsl.compiler import shipped_tests
+from powderdsl.model.types import Ruleset
+from powderdsl.simulation.array_worlds import ArraySimulator, ArrayWorld
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import compile as compile_rules
+from powderdsl.targets.mixed import MixedProgram
+from powderdsl.targets.wasm.instances import WasmState
+from powderdsl.testing.generators.cases import load_text
+from tests.semantics.test_mixed import HEAVY
+from tests.tiers import tiered
+
+Both = tuple[ArrayWorld, World]
+
+
+def assert_same(found: ArrayWorld, wanted: World) -> None:
+    assert list(found.state) == list(wanted.state)
+    for name in (*found.state, "seed", "index", "step"):
+        kept = name in found.state
+        a = found.state[name] if kept else getattr(found, name)
+        b = (wanted.state[name] if kept else getattr(wanted, name)).numpy()
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), name
+        assert a.tobytes() == b.tobytes(), name
+
+
+def simulators(ruleset: Ruleset, backend: str = "wasm") -> tuple[ArraySimulator, Simulator]:
+    return ArraySimulator(ruleset, backend), compile_rules(ruleset, backend)
+
+
+def starts(sims: tuple[ArraySimulator, Simulator], shape: tuple[int, ...], **how: Any) -> Both:
+    """Random elements, and random values of fields that every cell has."""
+    ruleset, random = sims[0].ruleset, np.random.default_rng(1)
+    ids = np.array([one.id for one in ruleset.elements])[random.integers(0, len(ruleset.elements), shape)]
+    fields: dict[str, Any] = {}
+    for slot in sims[0].slots:
+        free = slot.of is None and ruleset.property(slot.name) is None
+        if slot.is_real and free:
+            fields[slot.name] = random.normal(0, 4, (shape[0], 2, *shape[1:]) if slot.planes == 2 else shape)
+        elif slot.kind.name == "int" and free:
+            fields[slot.name] = random.integers(slot.kind.lo, slot.kind.hi + 1, shape)
+    first, second = (sim.replace(sim.world(ids, **how), **fields) for sim in sims)
+    return first, second
+
+
+@pytest.mark.parametrize("name", tiered(shipped_tests(), ["powderworld", "life"]))
+def test_shipped_rules_give_the_same_worlds(name: str) -> None:
+    sims = simulators(powderdsl.load(name))
+    for shape in ((3, 18, 70), (1, 16, 64)):
+        found, wanted = starts(sims, shape, seed=5)
+        assert_same(found, wanted)
+        for steps in (0, 1, 199):
+            found, wanted = sims[0].step(found, steps), sims[1].step(wanted, steps)
+            assert_same(found, wanted)
+
+
+@pytest.fixture(scope="module")
+def powderworld() -> tuple[ArraySimulator, Simulator]:
+    return simulators(powderdsl.load("powderworld"))
+
+
+def test_worlds_are_changed_alike(powderworld: tuple[ArraySimulator, Simulator]) -> None:
+    shape = (2, 9, 33)
+    mask = np.random.default_rng(2).random(shape) < 0.3
+    worlds = starts(powderworld, shape, seed=[4, 1 << 62], index=[0, 7])
+    for change in (
+        lambda sim, world: sim.paint(world, where=mask, element="sand", velocity=(0.1, -2)),
+        lambda sim, world: sim.paint(world, where=mask[0], momentum=-3),
+        lambda sim, world: sim.replace(world, ids=np.flip(world.ids, 1) if sim is powderworld[0] else world.ids.flip(1)),
+        lambda sim, world: sim.replace(world, velocity=(1e-7, 99)),
+        lambda sim, world: sim.step(world, 3, reuse=True),
+        lambda sim, world: sim.step(world, 2, params={"water.melt": 0.1, "fire.spread": [0.0, 0.7]}),
+        lambda sim, world: sim.step(world, 2, passes=sim.passes[1:6:2]),
+        lambda sim, world: sim.step(world, random={"movement": mask * 0.3}),
+        lambda sim, world: world.select([1]),
+        lambda sim, world: sim.step(world, 2),
+        lambda sim, world: world.select(slice(0, 1)),
+    ):  # fmt: skip
+        worlds = tuple(change(sim, world) for sim, world in zip(powderworld, worlds, strict=True))  # type: ignore[no-untyped-call]
+        assert_same(*worlds)
+    for name in ("density", "velocity", "core.density"):
+        first, second = (world[name] for world in worlds)
+        assert (first.dtype, first.tobytes()) == (second.numpy().dtype, second.numpy().tobytes())
+
+
+def test_a_world_stays_as_it_was(powderworld: tuple[ArraySimulator, Simulator]) -> None:
+    sim = powderworld[0]
+    first = sim.step(starts(powderworld, (2, 8, 40))[0])
+    before = {name: value.copy() for name, value in first.state.items()}
+    second = sim.step(first, 5)
+    assert isinstance(second.state, WasmState)
+    assert all((first.state[name] == value).all() for name, value in before.items())
+    assert (second.step == 6).all()
+    assert sim.step(first, 5).ids.tobytes() == second.ids.tobytes()
+
+
+def test_passes_that_fit_no_planes_run_on_the_oracle() -> None:
+    sims = simulators(load_text(HEAVY, "heavy.yaml"))
+    found, wanted = starts(sims, (2, 7, 40))
+    for _ in range(3):
+        found, wanted = sims[0].step(found), sims[1].step(wanted)
+        assert_same(found, wanted)
+    assert any(isinstance(one, MixedProgram) for one in sims[0]._program._made.values())  # type: ignore[attr-defined]
+
+
+def test_the_oracle_gives_the_same_worlds() -> None:
+    sims = simulators(powderdsl.load("core+water+sand"), "reference")
+    found, wanted = starts(sims, (2, 7, 9), seed=[1, 2])
+    assert_same(sims[0].step(found, 3), sims[1].step(wanted, 3))
+    assert torch.equal(torch.from_numpy(found.ids), wanted.ids)
