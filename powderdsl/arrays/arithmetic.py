@@ -78,6 +78,8 @@ _FLAGS = {
     "multiply": "bitwise_and",
     "minimum": "bitwise_and",
     "maximum": "bitwise_or",
+    "lowered": "bitwise_and",
+    "raised": "bitwise_or",
     "bitwise_and": "bitwise_and",
     "bitwise_or": "bitwise_or",
     "bitwise_xor": "bitwise_xor",
@@ -86,6 +88,10 @@ _FLAGS = {
 
 def combined(op: str, a: Memory, b: Memory, kind: dtype, count: int) -> Memory:
     """An arithmetic operation on elements of one type; the result has it too. Raises TypeError if it has no such one."""
+    if count == 0:
+        one = Memory(bytes(kind.itemsize), kind)
+        combined(op, one, one, kind, 1)  # raises what it would raise
+        return Memory(b"", kind)
     if a.single and b.single:
         count = 1
     if kind.kind == "f":
@@ -96,6 +102,7 @@ def combined(op: str, a: Memory, b: Memory, kind: dtype, count: int) -> Memory:
         found = _narrow(_FLAGS[op], filled(a, count).raw, filled(b, count).raw, uint8, count)
         assert found is not None
         return Memory(found.raw, bool_)
+    op = {"raised": "maximum", "lowered": "minimum"}.get(op, op)
     if op not in _INTEGER:
         raise TypeError(f"{op} of integers is not there without NumPy")
     if op.endswith("shift") and min(numbers(b), default=0) < 0:
@@ -114,6 +121,8 @@ def combined(op: str, a: Memory, b: Memory, kind: dtype, count: int) -> Memory:
 
 def compared(op: str, a: Memory, b: Memory, kind: dtype, count: int) -> bytes:
     """A comparison of elements of one type: a byte of 0 or 1 for each, or one for all."""
+    if count == 0:
+        return b""
     if a.single and b.single:
         count = 1
     if kind.kind == "f":
@@ -136,6 +145,8 @@ def compared(op: str, a: Memory, b: Memory, kind: dtype, count: int) -> bytes:
 
 def chosen(flags: bytes, a: Memory, b: Memory, kind: dtype, count: int) -> Memory:
     """The elements of `a` where a flag is 1, those of `b` elsewhere."""
+    if count == 0:
+        return Memory(b"", kind)
     if len(flags) == 1:
         return a if flags[0] else b
     if a.single and b.single and a == b:
@@ -277,6 +288,10 @@ def _floats(op: str, a: Memory, b: Memory, kind: dtype, count: int) -> Memory:
         values = [p if p < q or p != p else q for p, q in zip(x, y, strict=False)]
     elif op == "maximum":
         values = [p if p > q or p != p else q for p, q in zip(x, y, strict=False)]
+    elif op == "raised":  # to a lower bound; of two zeros the first one stays
+        values = [p if p >= q or p != p else q for p, q in zip(x, y, strict=False)]
+    elif op == "lowered":
+        values = [p if p <= q or p != p else q for p, q in zip(x, y, strict=False)]
     elif op == "true_divide":
         try:
             values = [*map(operator.truediv, x, y)]

@@ -57,7 +57,7 @@ class dtype:
         return 8 * self.itemsize
 
     def __call__(self, value: Any = 0) -> Any:
-        from powderdsl.arrays.functions import scalar
+        from powderdsl.arrays.making import scalar
 
         return scalar(value, self)
 

@@ -2,149 +2,24 @@
 
 from __future__ import annotations
 
-import operator
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from itertools import accumulate
 from math import prod as _product
 from typing import Any
 
 from powderdsl.arrays import arithmetic
-from powderdsl.arrays.dtypes import bool_, dtype, float32, float64, int64, promoted, result_type
+from powderdsl.arrays.dtypes import bool_, float32, float64, int64, promoted
 from powderdsl.arrays.indexing import broadcast
+from powderdsl.arrays.making import asarray, broadcast_to, zeros
 from powderdsl.arrays.memories import Memory, checked, converted, number, numbers, own
 from powderdsl.arrays.movement import Shape, expanded, joined, repeated, rolled
-from powderdsl.arrays.ndarray import Numbers, array_of, binary, generic, made, ndarray, operands, result
+from powderdsl.arrays.ndarray import Numbers, array_of, binary, made, ndarray, operands, result
 from powderdsl.arrays.reductions import axes_of
 
 inf, nan, pi = float("inf"), float("nan"), 3.141592653589793
 newaxis = None
-
-
-# Making arrays
-
-
-def asarray(values: Any, dtype: Any = None) -> ndarray:
-    """An array of anything that is one, or of nested lists."""
-    kind = None if dtype is None else _type(dtype)
-    if isinstance(values, ndarray):
-        return values if kind is None or kind is values.dtype else values.astype(kind)
-    if isinstance(values, generic):
-        wanted = kind or values.dtype
-        return made((), wanted, converted(values.memory, values.dtype, wanted))
-    if not isinstance(values, (list, tuple, range)):
-        if not isinstance(values, (bool, int, float)):
-            raise TypeError(f"there are no arrays of {type(values).__name__} without NumPy")
-        wanted = kind or result_type([], [values])
-        return made((), wanted, checked([values], wanted))
-    shape, leaves = _nested(values)
-    found = [one.dtype for one in leaves if isinstance(one, Numbers)]
-    weak = [one for one in leaves if not isinstance(one, Numbers)]
-    if kind is None:  # Python's numbers in a list are as strong as others
-        found += {result_type([], [one]) for one in weak}
-        kind = reduce(promoted, sorted(found, key=str)) if found else float64
-    if not weak:
-        raw = [converted(one.full, one.dtype, kind) for one in leaves]
-        memory = _joined(raw, kind) if raw else Memory(b"", kind)
-    else:
-        memory = checked([one.item() if isinstance(one, Numbers) else one for one in leaves], kind)
-    return made(shape, kind, memory)
-
-
-def _type(given: Any) -> dtype:
-    return given if isinstance(given, dtype) else dtype(given)
-
-
-def array(values: Any, dtype: Any = None) -> ndarray:
-    """Like `asarray`, in memory of its own."""
-    found = asarray(values, dtype)
-    return found.copy() if found is values else found
-
-
-def ascontiguousarray(values: Any, dtype: Any = None) -> ndarray:
-    return asarray(values, dtype)
-
-
-def scalar(value: Any, kind: dtype) -> Any:
-    """A number, or a text of one, as a scalar of a type."""
-    if isinstance(value, str):
-        value = float(value) if kind.kind == "f" else int(value)
-    if isinstance(value, (list, tuple, ndarray)):
-        return asarray(value).astype(kind)
-    if isinstance(value, Numbers):
-        return result((), kind, converted(value.memory, value.dtype, kind))
-    return result((), kind, checked([value], kind))
-
-
-def _nested(values: Any) -> tuple[Shape, list[Any]]:
-    """The shape of nested lists, and their parts: numbers, or arrays of one shape."""
-    if isinstance(values, Numbers):
-        return values.shape, [values]
-    if not isinstance(values, (list, tuple, range)):
-        if not isinstance(values, (bool, int, float)):
-            raise TypeError(f"there are no arrays of {type(values).__name__} without NumPy")
-        return (), [values]
-    if values and all(type(one) in (int, float, bool) for one in values):
-        return (len(values),), list(values)
-    parts = [_nested(one) for one in values]
-    if len({shape for shape, _ in parts}) > 1:
-        raise ValueError("setting an array element with a sequence: the array has an inhomogeneous shape")
-    return (len(values), *(parts[0][0] if parts else ())), [leaf for _, leaves in parts for leaf in leaves]
-
-
-def _shape(shape: Any) -> Shape:
-    return tuple(map(operator.index, shape)) if isinstance(shape, Iterable) else (operator.index(shape),)
-
-
-def full(shape: Any, fill_value: Any, dtype: Any = None) -> ndarray:
-    value = asarray(fill_value, dtype)
-    return broadcast_to(value, _shape(shape)).copy()
-
-
-def zeros(shape: Any, dtype: Any = float64) -> ndarray:
-    return full(shape, 0, dtype)
-
-
-def ones(shape: Any, dtype: Any = float64) -> ndarray:
-    return full(shape, 1, dtype)
-
-
-empty = zeros
-
-
-def zeros_like(values: Any, dtype: Any = None) -> ndarray:
-    return full_like(values, 0, dtype)
-
-
-def ones_like(values: Any, dtype: Any = None) -> ndarray:
-    return full_like(values, 1, dtype)
-
-
-def full_like(values: Any, fill_value: Any, dtype: Any = None) -> ndarray:
-    like = asarray(values)
-    return full(like.shape, fill_value, dtype or like.dtype)
-
-
-def arange(start: int, stop: int | None = None, step: int = 1, dtype: Any = None) -> ndarray:
-    first, last = (0, start) if stop is None else (start, stop)
-    if any(isinstance(one, float) for one in (first, last, step)):
-        raise TypeError("ranges of floats are not there without NumPy")
-    return array_of(range(int(first), int(last), int(step)), _type(dtype or int64))
-
-
-def frombuffer(buffer: Any, dtype: Any = float64, count: int = -1, offset: int = 0) -> ndarray:
-    """Elements in the memory of an object, which is read again in each operation if it is a `bytearray`."""
-    kind = _type(dtype)
-    raw: Any = buffer if isinstance(buffer, (bytes, bytearray)) else bytes(buffer)
-    if offset or count >= 0:
-        end = offset + count * kind.itemsize if count >= 0 else len(raw)
-        if end > len(raw):
-            raise ValueError("buffer is smaller than requested size")
-        raw = bytes(raw[offset:end])
-    if len(raw) % kind.itemsize:
-        raise ValueError("buffer size must be a multiple of element size")
-    return made((len(raw) // kind.itemsize,), kind, Memory(raw, kind), fixed=True)
 
 
 class _Grid:
@@ -176,16 +51,6 @@ mgrid, s_ = _Grid(), _Index()
 # The same elements elsewhere
 
 
-def broadcast_to(values: Any, shape: Any) -> ndarray:
-    found, target = asarray(values), _shape(shape)
-    if broadcast([found.shape, target]) != target:
-        raise ValueError(f"operands could not be broadcast together with shapes {found.shape} {target}")
-    raw, held = found.memory
-    if not found.memory.single:
-        raw = expanded(raw, held.itemsize, found.shape, target)
-    return made(target, found.dtype, Memory(raw, held), found.owner, True)
-
-
 def broadcast_arrays(*values: Any) -> list[ndarray]:
     found = [asarray(one) for one in values]
     shape = broadcast([one.shape for one in found])
@@ -213,8 +78,9 @@ def swapaxes(values: Any, first: int, second: int) -> ndarray:
 
 def moveaxis(values: Any, source: int, destination: int) -> ndarray:
     found = asarray(values)
-    order = [axis for axis in range(found.ndim) if axis != source % found.ndim]
-    order.insert(destination % found.ndim, source % found.ndim)
+    (first,), (last,) = axes_of(source, found.ndim), axes_of(destination, found.ndim)
+    order = [axis for axis in range(found.ndim) if axis != first]
+    order.insert(last, first)
     return found.transpose(order)
 
 
@@ -259,11 +125,10 @@ def roll(values: Any, shift: Any, axis: Any = None) -> ndarray:
     if axis is None:
         return roll(found.ravel(), shift, 0).reshape(found.shape)
     shifts, axes = ([one] if isinstance(one, int) else list(one) for one in (shift, axis))
+    axes = [axes_of(one, found.ndim)[0] for one in axes]
     raw, held = found.memory
-    axes_of(tuple(axes), found.ndim)
     if not found.memory.single and raw:
-        for places, at in zip(shifts, axes, strict=True):
-            place = at % found.ndim
+        for places, place in zip(shifts, axes, strict=True):
             outer, inner = _product(found.shape[:place]), _product(found.shape[place + 1 :])
             raw = rolled(raw, held.itemsize, outer, found.shape[place], inner, places)
     return made(found.shape, found.dtype, Memory(raw, held))
@@ -274,7 +139,7 @@ def concatenate(arrays: Sequence[Any], axis: int = 0) -> ndarray:
     if not found:
         raise ValueError("need at least one array to concatenate")
     kind = reduce(promoted, [one.dtype for one in found])
-    place = axis % found[0].ndim
+    (place,) = axes_of(axis, found[0].ndim)
     rests = {(*one.shape[:place], *one.shape[place + 1 :]) for one in found}
     if len(rests) > 1:
         raise ValueError(
@@ -291,12 +156,6 @@ def concatenate(arrays: Sequence[Any], axis: int = 0) -> ndarray:
     return made(tuple(shape), kind, Memory(raw, held))
 
 
-def _joined(memories: Sequence[Memory], kind: dtype) -> Memory:
-    held = kind if any(one.type.itemsize > 1 for one in memories) else memories[0].type
-    raws = [own(one, held) if held.kind != "f" else one.raw for one in memories]
-    return Memory(b"".join(raws), held)
-
-
 def stack(arrays: Sequence[Any], axis: int = 0) -> ndarray:
     found = [asarray(one) for one in arrays]
     if len({one.shape for one in found}) != 1:
@@ -311,13 +170,15 @@ def repeat(values: Any, repeats: int, axis: int | None = None) -> ndarray:
     shape = list(found.shape)
     shape[axis] *= repeats
     held = found.memory.type
-    raw = repeated(found.full.raw, _product(found.shape[axis % found.ndim + 1 :]) * held.itemsize, repeats)
+    raw = repeated(
+        found.full.raw, _product(found.shape[axes_of(axis, found.ndim)[0] + 1 :]) * held.itemsize, repeats
+    )
     return made(tuple(shape), found.dtype, Memory(raw, held))
 
 
 def take(values: Any, indices: Any, axis: int) -> ndarray:
     found = asarray(values)
-    return found[(slice(None),) * (axis % found.ndim) + (asarray(indices),)]
+    return found[(slice(None),) * axes_of(axis, found.ndim)[0] + (asarray(indices),)]
 
 
 def delete(values: Any, obj: int, axis: int | None = None) -> ndarray:
@@ -325,7 +186,8 @@ def delete(values: Any, obj: int, axis: int | None = None) -> ndarray:
     if axis is None:
         found, axis = found.ravel(), 0
     side = found.shape[axis]
-    return take(found, [place for place in range(side) if place != range(side)[obj]], axis)
+    gone = range(side)[obj]
+    return take(found, array_of([one for one in range(side) if one != gone], int64), axis)
 
 
 def pad(values: Any, pad_width: int) -> ndarray:
@@ -382,8 +244,9 @@ def isin(values: Any, test_elements: Any) -> Any:
 
 
 def clip(values: Any, low: Any, high: Any) -> Any:
-    found = binary("maximum", values, low)
-    return binary("minimum", found, high)
+    if isnan(low).any() or isnan(high).any():
+        raise TypeError("clip to NaN is not there without NumPy")
+    return binary("lowered", binary("raised", values, low), high)
 
 
 def minimum(x: Any, y: Any) -> Any:
@@ -517,6 +380,8 @@ def unique(values: Any) -> ndarray:
 def searchsorted(values: Any, wanted: Any, side: str = "left") -> Any:
     call = bisect_left if side == "left" else bisect_right
     listed, found = asarray(values).tolist(), _array(wanted)
+    if isnan(found).any():
+        raise TypeError("searchsorted of NaN is not there without NumPy")
     places = [
         call(listed, one) for one in (bool(v) if found.dtype is bool_ else v for v in numbers(found.full))
     ]

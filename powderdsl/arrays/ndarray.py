@@ -180,7 +180,7 @@ class Numbers:
 
     def _reduced(self, name: str, axis: Any, keepdims: bool = False) -> Any:
         memory, kind = reduced(name, self.memory, self.dtype, self.shape, axis)
-        axes = axes_of(axis, self.ndim)
+        axes = axes_of(axis, self.ndim) if self.shape else ()
         sides = [
             1 if at in axes else side for at, side in enumerate(self.shape) if keepdims or at not in axes
         ]
@@ -222,15 +222,8 @@ class Numbers:
         return tuple(array_of(one, int64) for one in reversed(found))
 
     def clip(self, min: Any = None, max: Any = None) -> Any:
-        found: Any = self
-        if min is not None:
-            found = binary("maximum", found, min)
-        return found if max is None else binary("minimum", found, max)
-
-    def searchsorted(self, values: Any, side: str = "left") -> Any:
-        from powderdsl.arrays.functions import searchsorted
-
-        return searchsorted(self, values, side)
+        found = self if min is None else binary("raised", self, min)
+        return found if max is None else binary("lowered", found, max)
 
     # Indexing
 
@@ -290,7 +283,7 @@ class ndarray(Numbers):
         places = all_places(found, self.shape) if isinstance(found, Ranges) else found.places
         sides = given.shape
         if isinstance(found, Ranges) and found.shape == () != sides and ... not in parts:
-            raise ValueError("setting an array element with a sequence.")
+            raise ValueError("setting one element with an array is not there without NumPy")
         if len(sides) > 1 and len(parts) == 1 and isinstance(parts[0], Mask):
             raise ValueError("boolean array indexing assignment requires a 0 or 1-dimensional input")
         while len(sides) > len(found.shape) and sides[0] == 1:
@@ -379,7 +372,7 @@ def _index(one: Any) -> Any:
 
 
 def _listed(values: Any) -> ndarray:
-    from powderdsl.arrays.functions import asarray
+    from powderdsl.arrays.making import asarray
 
     if isinstance(values, str):
         raise IndexError("only integers, slices, ellipsis, None and arrays are valid indices")
@@ -387,7 +380,7 @@ def _listed(values: Any) -> ndarray:
 
 
 def _given(value: Any, kind: dtype) -> Numbers:
-    from powderdsl.arrays.functions import asarray
+    from powderdsl.arrays.making import asarray
 
     return asarray(value, kind)
 

@@ -22,27 +22,18 @@ from powderdsl.arrays.dtypes import (
 )
 from powderdsl.arrays.functions import (
     absolute,
-    arange,
     argwhere,
-    array,
     array_equal,
-    asarray,
-    ascontiguousarray,
     atleast_1d,
     broadcast_arrays,
-    broadcast_to,
     clip,
     concatenate,
     cumsum,
     delete,
-    empty,
     expand_dims,
     flatnonzero,
     flip,
     floor,
-    frombuffer,
-    full,
-    full_like,
     hypot,
     inf,
     isfinite,
@@ -60,8 +51,6 @@ from powderdsl.arrays.functions import (
     newaxis,
     nextafter,
     nonzero,
-    ones,
-    ones_like,
     pad,
     pi,
     ravel,
@@ -80,8 +69,6 @@ from powderdsl.arrays.functions import (
     unique,
     unravel_index,
     where,
-    zeros,
-    zeros_like,
 )
 from powderdsl.arrays.functions import (
     absolute as abs,
@@ -97,6 +84,21 @@ from powderdsl.arrays.functions import (
 )
 from powderdsl.arrays.functions import (
     sum_of as sum,
+)
+from powderdsl.arrays.making import (
+    arange,
+    array,
+    asarray,
+    ascontiguousarray,
+    broadcast_to,
+    empty,
+    frombuffer,
+    full,
+    full_like,
+    ones,
+    ones_like,
+    zeros,
+    zeros_like,
 )
 from powderdsl.arrays.ndarray import generic, ndarray
 

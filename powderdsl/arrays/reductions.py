@@ -20,9 +20,7 @@ def reduced(
     name: str, memory: Memory, kind: dtype, shape: Shape, axis: int | tuple[int, ...] | None
 ) -> tuple[Memory, dtype]:
     """A reduction along some axes, or all of them: its values in the order of the axes that remain, and their type."""
-    axes = axes_of(axis, len(shape))
-    if name == "mean" and not shape and axis is not None:
-        raise IndexError(f"axis {axis} is out of bounds for array of dimension 0")
+    axes = () if shape == () and axis in (0, -1) and name != "mean" else axes_of(axis, len(shape))
     count = prod(shape)
     if memory.single and count and name in ("any", "all", "min", "max"):
         return (Memory(nonzero(memory), bool_), bool_) if name in ("any", "all") else (memory, kind)
@@ -37,6 +35,8 @@ def reduced(
     elif name in ("sum", "prod", "mean"):
         if kind.kind == "f":
             raise TypeError(f"{name} of floats is not there without NumPy: its rounding depends on an order")
+        if name == "mean" and kind is not bool_:
+            raise TypeError("mean of integers is not there without NumPy")
         wanted = uint64 if kind.kind == "u" and name != "mean" else int64
         full, kind = converted(full, kind, wanted), wanted
     elif length == 0:
@@ -58,8 +58,6 @@ def axes_of(axis: int | tuple[int, ...] | None, count: int) -> tuple[int, ...]:
     if axis is None:
         return tuple(range(count))
     found = axis if isinstance(axis, tuple) else (axis,)
-    if count == 0 and found in ((0,), (-1,)):
-        return ()
     for one in found:
         if not -count <= one < count:
             raise IndexError(f"axis {one} is out of bounds for array of dimension {count}")
