@@ -35,7 +35,8 @@ def check_private(folder: Path) -> None:
 
 def _root() -> Path:
     """Where caches of this user live. Raises OSError if there is no home folder."""
-    if platform.system() == "Linux":  # what platformdirs says too, without the time its import takes
+    # What platformdirs says too, without the time its import takes; browsers have a file system of their own in memory.
+    if platform.system() in ("Linux", "Emscripten"):
         try:
             return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         except RuntimeError as error:
