@@ -21,6 +21,11 @@ def _bits(value: float) -> int:
     return int.from_bytes(struct.pack("<f", value), "little")
 
 
+def all_ones(value: float) -> bool:
+    """Whether all bits of the fraction of its float32 are ones."""
+    return _bits(value) & 0x7FFFFF == 0x7FFFFF
+
+
 def following(value: float) -> float:
     """The next larger float32 after one that is 0 or more and finite."""
     found: float = struct.unpack("<f", struct.pack("<I", _bits(abs(value)) + 1))[0]

@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from powderdsl.compiler import BACKENDS
+
 BLOCKED = """
 import sys
 
@@ -24,12 +26,16 @@ main()
 """
 
 
+PRINTED = [name for name in BACKENDS if name not in ("auto", "reference")]
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
         ("check", "powderworld", "--quick"),
         *(("compile", "powderworld", "--emit", stage) for stage in ("tree", "model", "ir", "planes")),
         ("compile", "powderworld", "--emit", "schedule", "--backend", "native"),
+        *(("compile", "powderworld", "--emit", "kernels", "--backend", name) for name in PRINTED),
         ("explain", "PD301"),
     ],
     ids=" ".join,

@@ -120,7 +120,7 @@ SHOWN_WIDTH = 64
 def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[str]:
     """The generated source of a backend: part by part, where planes cannot carry all passes."""
     from powderdsl.ir.segments import segments
-    from powderdsl.targets.torch.program import kernel_source
+    from powderdsl.targets.torch.source import kernel_source
 
     if backend == "reference":
         raise BadInput("the reference backend runs the checked model: it has no kernels")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping
 
-import numpy as np
-
 from powderdsl.ir.ops import REAL, Node
+from powderdsl.ir.single import all_ones, divided, single
 from powderdsl.schedule.types import Out, ordered
 from powderdsl.targets.layout import Layout, literal, param_key
 from powderdsl.targets.values import CellValues
@@ -167,8 +166,7 @@ class Chunks(CellValues[str]):
 
 def quotient(value: str, divisor: float, *, near: bool) -> str:
     """A division by a constant; a product, unless the divisor's fraction is all ones (Markstein 1990, theorem 8)."""
-    short = np.float32(divisor)
-    if short.view(np.uint32) & 0x7FFFFF == 0x7FFFFF or not 2.0**-60 < abs(divisor) < 2.0**60:
+    if all_ones(divisor) or not 2.0**-60 < abs(divisor) < 2.0**60:
         return f"{value} / splatf({literal(divisor)})"
     function = "divide_near" if near else "divide_by"
-    return f"{function}({value}, {literal(divisor)}, {literal(float(np.float32(1) / short))})"
+    return f"{function}({value}, {literal(divisor)}, {literal(divided(1.0, single(divisor)))})"

@@ -154,13 +154,6 @@ class Kernels:
         return torch.where(x.abs() < SNAP, zero, x)
 
 
-def kernel_source(program: Program, only: str | None = None) -> str:
-    """The generated source of all passes (or one), as `--emit kernels` prints it."""
-    return "\n\n".join(
-        pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
-    )
-
-
 class TorchProgram:
     """A program whose passes are generated torch functions."""
 

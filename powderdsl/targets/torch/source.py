@@ -218,3 +218,10 @@ def load_source(source: str, name: str, constants: Mapping[str, object]) -> Call
     namespace: dict[str, Any] = dict(constants)
     exec(compile(source, filename, "exec"), namespace)
     return namespace[name]
+
+
+def kernel_source(program: Program, only: str | None = None) -> str:
+    """The generated source of all passes (or one), as `--emit kernels` prints it."""
+    return "\n\n".join(
+        pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
+    )
