@@ -19,7 +19,7 @@ test test-all golden: export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all check lint types format golden wheel clean distclean mutation fuzz
+.PHONY: help setup demo test test-all check lint types format golden web wheel clean distclean mutation fuzz
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
@@ -41,11 +41,18 @@ $(VENV)/.ready: $(VENV)/.core
 	@$(INSTALL) --no-build-isolation --editable '.[dev,minari,ray,rl,sb3-contrib,torchrl,video]'
 	@touch $@
 
+tests/web/node_modules: tests/web/package-lock.json
+	@command -v npm >/dev/null || { echo "npm is missing: install Node.js 20 or newer" >&2; exit 1; }
+	@npm ci --prefix tests/web --no-audit --no-fund --loglevel error
+	@touch $@
+
 setup: $(VENV)/.ready  ## make .venv with everything a developer needs
 
 demo: $(VENV)/.core  ## run a designed world and write demo.gif
 	@$(BIN)/powderdsl run powderworld --world garden --steps 240 --out demo.gif
 	@echo "$(CURDIR)/demo.gif"
+
+web: tests/web/node_modules  ## fetch Pyodide for the tests in Node.js
 
 test: $(VENV)/.ready  ## run the tests (ARGS=... for pytest, JOBS=0 for one process)
 	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 $(ARGS)

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import gzip
-import hashlib
-import json
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +17,7 @@ from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.wasm.instances import Instance, WasmState
 from powderdsl.targets.wasm.program import WasmProgram
 from powderdsl.targets.wasm.source import WasmModule, wasm_module
-
-HOST = Path(__file__).with_name("host.mjs")
+from tests.wasm.jobs import hashes, hashes_in_v8, write_job
 
 
 def module_of(name: str, width: int) -> WasmModule:
@@ -134,22 +130,6 @@ def test_v8_computes_the_same_worlds(batch: int, rows: int, width: int, tmp_path
     ids = torch.randint(0, 14, (batch, rows, width), generator=generator)
     speed = 8 * torch.randn((batch, 2, rows, width), generator=generator)
     world = sim.step(sim.replace(sim.world(ids, seed=3), velocity=speed))
-    instance, _ = packed(world)
-    code = module_of("powderworld", width).code
-    (tmp_path / "module.wasm").write_bytes(code)
-    calls = []
-    for name, value in world.state.items():
-        (tmp_path / name).write_bytes(value.contiguous().numpy().tobytes())
-        calls += [{"slot": name, **one} for one in instance.transfers(name, value.itemsize, value.shape)]
-    inputs = instance.input_bytes(sim.parameters({}, batch), batch)
-    clock = torch.stack([world.seed, world.index, world.step])
-    (tmp_path / "inputs").write_bytes(clock.numpy().tobytes() + inputs)
-    job = {"worlds": batch, "rows": rows, "steps": 20, "calls": calls}
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    done = subprocess.run([node, str(HOST), str(tmp_path)], capture_output=True, text=True, check=True)
-    expected = sim.step(world, 20)
-    hashes = {
-        name: hashlib.sha256(value.contiguous().numpy().tobytes()).hexdigest()
-        for name, value in expected.state.items()
-    }
-    assert json.loads(done.stdout) == hashes
+    write_job(tmp_path, sim, world, 20)
+    (tmp_path / "module.wasm").write_bytes(module_of("powderworld", width).code)
+    assert hashes_in_v8(node, tmp_path) == hashes(sim.step(world, 20))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 from zlib import crc32
 
-from powderdsl.ir.ops import Node, PassGraph, nodes_of
+from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of
 
 _INFIX = {
     "and": "&",
