@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_FRONT = ("diagnostics", "system", "syntax", "model")
+_FRONT = ("arrays", "diagnostics", "system", "syntax", "model")
 _COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
 _TARGETS = ("targets", "targets.torch", "targets.cpp", "targets.wasm", "targets.cuda")
 _BACK = (*_COMPILER, "model.reference", *_TARGETS)

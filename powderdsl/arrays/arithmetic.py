@@ -149,7 +149,7 @@ def chosen(flags: bytes, a: Memory, b: Memory, kind: dtype, count: int) -> Memor
         return Memory(b"", kind)
     if len(flags) == 1:
         return a if flags[0] else b
-    if a.single and b.single and a == b:
+    if a.single and b.single and a.type is b.type and a.raw == b.raw:
         return a
     if kind.kind != "f" and a.type.code == b.type.code == "B":
         if a.single and b.single:

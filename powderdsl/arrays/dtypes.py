@@ -63,12 +63,11 @@ class dtype:
 
     def __eq__(self, other: object) -> bool:
         try:
-            return dtype(other) is self
+            return other is self or dtype(other) is self
         except TypeError:
             return False
 
-    def __hash__(self) -> int:
-        return hash(self.name)
+    __hash__ = object.__hash__
 
     def __str__(self) -> str:
         return self.name

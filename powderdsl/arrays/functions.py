@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import accumulate
 from math import prod as _product
 from typing import Any
@@ -15,7 +15,8 @@ from powderdsl.arrays.indexing import broadcast
 from powderdsl.arrays.making import asarray, broadcast_to, zeros
 from powderdsl.arrays.memories import Memory, checked, converted, number, numbers, own
 from powderdsl.arrays.movement import Shape, expanded, joined, repeated, rolled
-from powderdsl.arrays.ndarray import Numbers, array_of, binary, made, ndarray, operands, result
+from powderdsl.arrays.ndarray import Numbers, array_of, made, ndarray, result
+from powderdsl.arrays.operations import binary, operands
 from powderdsl.arrays.reductions import axes_of
 
 inf, nan, pi = float("inf"), float("nan"), 3.141592653589793
@@ -126,7 +127,7 @@ def roll(values: Any, shift: Any, axis: Any = None) -> ndarray:
         return roll(found.ravel(), shift, 0).reshape(found.shape)
     shifts, axes = ([one] if isinstance(one, int) else list(one) for one in (shift, axis))
     axes = [axes_of(one, found.ndim)[0] for one in axes]
-    raw, held = found.memory
+    raw, held = found.memory.raw, found.memory.type
     if not found.memory.single and raw:
         for places, place in zip(shifts, axes, strict=True):
             outer, inner = _product(found.shape[:place]), _product(found.shape[place + 1 :])
@@ -237,10 +238,15 @@ def isin(values: Any, test_elements: Any) -> Any:
         raise TypeError("isin of floats is not there without NumPy")
     wanted = set(tests.ravel().tolist())
     if found.memory.type.itemsize == 1 and found.memory.type.code == "B":
-        raw = found.memory.raw.translate(bytes(one in wanted for one in range(256)))
+        raw = found.memory.raw.translate(_members(frozenset(wanted)))
     else:
         raw = bytes(map(wanted.__contains__, numbers(found.memory)))
     return result(found.shape, bool_, Memory(raw, bool_), False)
+
+
+@lru_cache(maxsize=256)
+def _members(wanted: frozenset[int]) -> bytes:
+    return bytes(one in wanted for one in range(256))
 
 
 def clip(values: Any, low: Any, high: Any) -> Any:

@@ -149,9 +149,11 @@ def _added(chosen: list[tuple[Shape, list[int]]]) -> tuple[Shape, list[int]]:
 
 def broadcast(shapes: Sequence[Shape]) -> Shape:
     """The shape of arrays together. Raises ValueError if they do not fit."""
-    first = shapes[0]
-    if all(shape == first for shape in shapes):
+    first, last = shapes[0], shapes[-1]
+    if first == last and (len(shapes) <= 2 or all(shape == first for shape in shapes)):
         return first
+    if len(shapes) == 2 and not (first and last):  # a scalar
+        return first or last
     found = [1] * max(map(len, shapes))
     for shape in shapes:
         for place, side in enumerate(shape, len(found) - len(shape)):

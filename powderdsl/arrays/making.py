@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from functools import reduce
 from typing import Any
 
@@ -22,6 +23,8 @@ def asarray(values: Any, dtype: Any = None) -> ndarray:
     if isinstance(values, generic):
         wanted = kind or values.dtype
         return made((), wanted, converted(values.memory, values.dtype, wanted))
+    if isinstance(values, Fraction) and kind is not None:
+        values = float(values)
     if not isinstance(values, (list, tuple, range)):
         if not isinstance(values, (bool, int, float)):
             raise TypeError(f"there are no arrays of {type(values).__name__} without NumPy")
@@ -140,10 +143,12 @@ def broadcast_to(values: Any, shape: Any) -> ndarray:
     found, target = asarray(values), sides_of(shape)
     if broadcast([found.shape, target]) != target:
         raise ValueError(f"operands could not be broadcast together with shapes {found.shape} {target}")
-    raw, held = found.memory
+    raw, held = found.memory.raw, found.memory.type
     if not found.memory.single:
         raw = expanded(raw, held.itemsize, found.shape, target)
-    return made(target, found.dtype, Memory(raw, held), found.owner, True)
+    view = found.viewed(target, Memory(raw, held))
+    view.fixed = True
+    return view
 
 
 def together(memories: Sequence[Memory], kind: dtype) -> Memory:

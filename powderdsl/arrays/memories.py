@@ -11,7 +11,7 @@ from array import array
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import repeat
-from typing import Any, NamedTuple
+from typing import Any
 
 from powderdsl.arrays.dtypes import bool_, dtype, float32, float64, uint8
 from powderdsl.arrays.lanes import lanes
@@ -21,16 +21,16 @@ _SIGNS = bytes(128) + b"\xff" * 128
 _EXACT = 1 << 53
 
 
-class Memory(NamedTuple):
+class Memory:
     """Elements in C order. `type` is that of their array, or uint8 for integers that are held as bytes."""
 
-    raw: bytes
-    type: dtype
+    __slots__ = ("raw", "single", "type")
 
-    @property
-    def single(self) -> bool:
+    def __init__(self, raw: bytes, kind: dtype):
+        self.raw = raw
+        self.type = kind
+        self.single = len(raw) == kind.itemsize
         """Whether there is one element."""
-        return len(self.raw) == self.type.itemsize
 
 
 def numbers(memory: Memory) -> Sequence[Any]:
@@ -188,7 +188,7 @@ def _float_bytes(new: dtype) -> list[bytes | None]:
 
 
 def _between_integers(memory: Memory, new: dtype) -> Memory:
-    raw, held = memory
+    raw, held = memory.raw, memory.type
     if held.code == "B":
         return Memory(raw, uint8 if new.itemsize > 1 else new)
     old_size, size = held.itemsize, new.itemsize

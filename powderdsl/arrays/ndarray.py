@@ -13,23 +13,17 @@ from math import prod
 from typing import Any, ClassVar
 
 from powderdsl.arrays.arithmetic import (
-    COMPARISONS,
     absolute,
     chosen,
-    combined,
-    compared,
     inverted,
     negated,
 )
-from powderdsl.arrays.dtypes import bool_, dtype, float64, int64, result_type
+from powderdsl.arrays.dtypes import bool_, dtype, int64
 from powderdsl.arrays.indexing import Mask, Picks, Ranges, all_places, broadcast, selected
 from powderdsl.arrays.memories import Memory, checked, converted, filled, number, numbers, own
 from powderdsl.arrays.movement import Shape, expanded, permuted, put, sliced, taken
 from powderdsl.arrays.reductions import axes_of, reduced
 from powderdsl.arrays.shown import shown
-
-ORDER = "biuf"
-"""Kinds of types: an array can be changed in place by what stands not after its own."""
 
 
 class Numbers:
@@ -42,7 +36,7 @@ class Numbers:
     dtype: dtype
     memory: Memory
     owner: Any
-    """Shared with arrays that NumPy would give the same memory."""
+    """Shared with arrays that NumPy would give the same memory; None while there are none."""
     fixed: bool
     """Whether it must not be written to."""
 
@@ -138,7 +132,10 @@ class Numbers:
 
     # The same elements in another form
 
-    def _like(self, shape: Shape, memory: Memory) -> ndarray:
+    def viewed(self, shape: Shape, memory: Memory) -> ndarray:
+        """An array that is a view of this one in NumPy."""
+        if self.owner is None:
+            self.owner = object()
         return made(shape, self.dtype, memory, self.owner, self.fixed)
 
     def copy(self) -> ndarray:
@@ -159,7 +156,7 @@ class Numbers:
             sides[sides.index(-1)] = self.size // rest if rest else -1
         if prod(sides) != self.size or min(sides, default=0) < 0:
             raise ValueError(f"cannot reshape array of size {self.size} into shape {tuple(sides)}")
-        return self._like(tuple(map(operator.index, sides)), self.memory)
+        return self.viewed(tuple(map(operator.index, sides)), self.memory)
 
     def ravel(self) -> ndarray:
         return self.reshape(-1)
@@ -172,9 +169,9 @@ class Numbers:
         order = [one % self.ndim for one in given] or [*reversed(range(self.ndim))]
         shape = tuple(self.shape[axis] for axis in order)
         if self.memory.single:
-            return self._like(shape, self.memory)
-        raw, held = self.memory
-        return self._like(shape, Memory(permuted(raw, held.itemsize, self.shape, order), held))
+            return self.viewed(shape, self.memory)
+        raw, held = self.memory.raw, self.memory.type
+        return self.viewed(shape, Memory(permuted(raw, held.itemsize, self.shape, order), held))
 
     # Reductions
 
@@ -221,10 +218,6 @@ class Numbers:
             places = [place // side for place in places]
         return tuple(array_of(one, int64) for one in reversed(found))
 
-    def clip(self, min: Any = None, max: Any = None) -> Any:
-        found = self if min is None else binary("raised", self, min)
-        return found if max is None else binary("lowered", found, max)
-
     # Indexing
 
     def _key(self, key: Any) -> tuple[Any, ...]:
@@ -233,13 +226,13 @@ class Numbers:
     def __getitem__(self, key: Any) -> Any:
         parts = self._key(key)
         found = selected(parts, self.shape)
-        raw, held = self.memory
+        raw, held = self.memory.raw, self.memory.type
         if isinstance(found, Ranges):
             if not self.memory.single:
                 raw = sliced(raw, held.itemsize, self.shape, found.parts)
             if found.shape == () and ... not in parts:
                 return result((), self.dtype, Memory(raw, held))
-            return self._like(found.shape, Memory(raw, held))
+            return self.viewed(found.shape, Memory(raw, held))
         if not self.memory.single:
             raw = taken(raw, held.itemsize, found.places)
         return made(found.shape, self.dtype, Memory(raw, held))
@@ -273,7 +266,7 @@ class ndarray(Numbers):
         found = selected(parts, self.shape)
         given = value if isinstance(value, Numbers) else _given(value, self.dtype)
         memory = converted(given.memory, given.dtype, self.dtype)
-        self._check_writable()
+        self.check_writable()
         whole = isinstance(key, ndarray) and key.dtype is bool_ and key.shape == self.shape
         if whole and memory.single:
             flags = key.full.raw
@@ -301,25 +294,11 @@ class ndarray(Numbers):
         ]
         self.memory = Memory(put(raws[0], size, places, raws[1]), held)
 
-    def _check_writable(self) -> None:
+    def check_writable(self) -> None:
         if self.fixed:
             raise ValueError("assignment destination is read-only")
-        if sys.getrefcount(self.owner) > 2:
+        if self.owner is not None and sys.getrefcount(self.owner) > 2:
             raise ValueError("writing to an array that has views is not there without NumPy: copy it first")
-
-    def _changed(self, op: str, other: Any) -> ndarray:
-        """Change the array in place."""
-        found = binary(op, self, other)
-        if found is NotImplemented:
-            raise TypeError(f"{op} takes arrays and numbers, found {type(other).__name__}")
-        if found.shape != self.shape:
-            raise ValueError(f"non-broadcastable output operand with shape {self.shape}")
-        kinds = [ORDER.index(one.dtype.kind) for one in (found, self)]
-        if kinds[0] > kinds[1] or (found.dtype.kind, self.dtype.kind) == ("i", "u"):
-            raise TypeError(f"cannot cast the result of {op} from {found.dtype} to {self.dtype}")
-        self._check_writable()
-        self.memory = converted(found.memory, found.dtype, self.dtype)
-        return self
 
 
 class generic(Numbers):
@@ -335,7 +314,7 @@ def made(shape: Shape, kind: dtype, memory: Memory, owner: Any = None, fixed: bo
     """An array on some memory; with an owner of its own unless one is given."""
     found = object.__new__(ndarray)
     found.shape, found.dtype, found.memory, found.fixed = shape, kind, memory, fixed
-    found.owner = object() if owner is None else owner
+    found.owner = owner
     return found
 
 
@@ -385,110 +364,7 @@ def _given(value: Any, kind: dtype) -> Numbers:
     return asarray(value, kind)
 
 
-# Operations on two operands
-
-
-def _weak(value: Any) -> bool:
-    return isinstance(value, (bool, int, float))
-
-
 def _spread(memory: Memory, shape: Shape, target: Shape) -> Memory:
     if memory.single or shape == target:
         return memory
     return Memory(expanded(memory.raw, memory.type.itemsize, shape, target), memory.type)
-
-
-def operands(values: Sequence[Any]) -> tuple[list[Memory], dtype, Shape]:
-    """Arrays and Python's numbers in one type and shape; memories of one element stand for any number.
-
-    Raises:
-        OverflowError: an integer of Python's that the type cannot hold.
-    """
-    arrays = [one for one in values if isinstance(one, Numbers)]
-    weak = [one for one in values if not isinstance(one, Numbers)]
-    kind = result_type([one.dtype for one in arrays], weak)
-    shape = broadcast([one.shape for one in arrays]) if arrays else ()
-    memories = [
-        _spread(converted(one.memory, one.dtype, kind), one.shape, shape)
-        if isinstance(one, Numbers)
-        else checked([one], kind)
-        for one in values
-    ]
-    return memories, kind, shape
-
-
-def binary(op: str, x: Any, y: Any) -> Any:
-    """An operation on two arrays or numbers; NotImplemented for others."""
-    values = []
-    for one in (x, y):
-        if not isinstance(one, Numbers) and not _weak(one):
-            if not isinstance(one, (list, tuple)):
-                return NotImplemented
-            one = _listed(one)
-        values.append(one)
-    if op in COMPARISONS:
-        return _comparison(op, values)
-    if op == "power" and any(isinstance(one, bool) or getattr(one, "dtype", None) is bool_ for one in values):
-        raise TypeError("power of flags is not there without NumPy")
-    if op == "true_divide":
-        kinds = [one.dtype for one in values if isinstance(one, Numbers)]
-        kind = result_type(kinds, [one for one in values if not isinstance(one, Numbers)])
-        if kind.kind != "f":
-            values = [one.astype(float64) if isinstance(one, Numbers) else float(one) for one in values]
-    (a, b), kind, shape = operands(values)
-    return result(shape, kind, combined(op, a, b, kind, prod(shape)))
-
-
-def _comparison(op: str, values: list[Any]) -> Any:
-    try:
-        (a, b), kind, shape = operands(values)
-    except OverflowError:  # an integer that the type cannot hold compares by its value
-        (a, b), kind, shape = _beyond(values)
-    mixed = {one.dtype.kind for one in values if isinstance(one, Numbers)}
-    if kind is float64 and mixed == {"i", "u"}:
-        raise TypeError("comparing uint64 with signed integers is not there without NumPy")
-    return result(shape, bool_, Memory(compared(op, a, b, kind, prod(shape)), bool_))
-
-
-def _beyond(values: list[Any]) -> tuple[list[Memory], dtype, Shape]:
-    """Operands of which one is an integer beyond the range of the other: 0 or 1 in its place, the other way round."""
-    place = next(at for at, one in enumerate(values) if not isinstance(one, Numbers))
-    shape = values[1 - place].shape
-    low = values[place] < 0
-    pair = [checked([int(not low)], int64), checked([int(low)], int64)]
-    return (pair if place == 0 else pair[::-1]), int64, shape
-
-
-def _operator(op: str, swapped: bool = False) -> Any:
-    def call(self: Numbers, other: Any) -> Any:
-        return binary(op, other, self) if swapped else binary(op, self, other)
-
-    return call
-
-
-def _in_place(op: str) -> Any:
-    def call(self: ndarray, other: Any) -> ndarray:
-        return self._changed(op, other)
-
-    return call
-
-
-for _word, _op in (
-    ("add", "add"),
-    ("sub", "subtract"),
-    ("mul", "multiply"),
-    ("truediv", "true_divide"),
-    ("floordiv", "floor_divide"),
-    ("mod", "remainder"),
-    ("pow", "power"),
-    ("and", "bitwise_and"),
-    ("or", "bitwise_or"),
-    ("xor", "bitwise_xor"),
-    ("lshift", "left_shift"),
-    ("rshift", "right_shift"),
-):
-    setattr(Numbers, f"__{_word}__", _operator(_op))
-    setattr(Numbers, f"__r{_word}__", _operator(_op, swapped=True))
-    setattr(ndarray, f"__i{_word}__", _in_place(_op))
-for _word, _op in zip(("eq", "ne", "lt", "le", "gt", "ge"), COMPARISONS, strict=True):
-    setattr(Numbers, f"__{_word}__", _operator(_op))

@@ -10,8 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.model.state import SNAP, Slot, scratch_slots, slots
 from powderdsl.model.types import (
     Assign,

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.model.types import ColorRamp, Element
 
 Array = Any

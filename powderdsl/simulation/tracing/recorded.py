@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.model import reference
 from powderdsl.model.reference import Array
 from powderdsl.model.state import Slot, scratch_slots, slots

@@ -8,8 +8,7 @@ from functools import cached_property
 from itertools import islice
 from typing import Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model import reference
 from powderdsl.model.expressions.operands import look

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl

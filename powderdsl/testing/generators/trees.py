@@ -7,9 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml

@@ -13,9 +13,7 @@ from dataclasses import replace
 from math import ceil, log
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.model import reference
 from powderdsl.model.types import Often
 from powderdsl.simulation.draw import to_numpy

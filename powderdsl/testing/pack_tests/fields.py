@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.model.fields.words import direction_word
 from powderdsl.model.text import show_number, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset

@@ -6,9 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.diagnostics import Span
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.restrict import Cause, Difference, without

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.model import reference
 from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging

@@ -8,8 +8,7 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset

@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.diagnostics import Span
 from powderdsl.model.fields.words import direction_word
 from powderdsl.model.restrict import Difference

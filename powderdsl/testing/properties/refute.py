@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from powderdsl.analysis.changes import RuleLine
 from powderdsl.analysis.ledger import Ledger
+from powderdsl.arrays import np
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
 from powderdsl.model.restrict import Cause, Difference
 from powderdsl.model.text import place_of

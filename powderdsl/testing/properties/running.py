@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from powderdsl.analysis.reactions import unchanging_ids
+from powderdsl.arrays import np
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import Array, Start, clamped_to_holders, fresh, random_start

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from time import monotonic
 
-import numpy as np
-
 from powderdsl.analysis.changes import RuleLine
 from powderdsl.analysis.ledger import Ledger, NotProven, Proven
 from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
+from powderdsl.arrays import np
 from powderdsl.model.expressions.operands import ELEMENT_HERE, member
 from powderdsl.model.restrict import restricted
 from powderdsl.model.text import one_line

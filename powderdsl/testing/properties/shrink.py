@@ -10,8 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.breaks import Agreement, Alike, Runs, Tested, breaks, is_paired, steps_for
