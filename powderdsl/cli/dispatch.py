@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "cache": ("cache", "List or remove cached compiled code."),
     "new": ("new", "Create a starter pack: an element, a rule and a test."),
     "render": ("render", "Draw a world as a picture, without running it."),
+    "export": ("export", "Write rules as a WebAssembly module, for a page or a game."),
     "explain": ("explain", "Explain a diagnostic code and how to fix it."),
 }
 

@@ -125,6 +125,7 @@ _ROWS = (
     ("PD640", "invalid-setting", _ERROR),
     # PD7xx: limits of a backend
     ("PD701", "backend-not-available", _ERROR),
+    ("PD702", "too-large-for-webassembly", _ERROR),
     # PD8xx: tasks
     ("PD801", "unknown-task", _ERROR),
     ("PD802", "unknown-task-name", _ERROR),

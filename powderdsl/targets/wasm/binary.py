@@ -24,16 +24,22 @@ _NUMBERED = (
     (0x41, "i32.const i64.const f32.const f64.const"),
     (0x45, "i32.eqz i32.eq i32.ne i32.lt_s i32.lt_u i32.gt_s i32.gt_u i32.le_s i32.le_u i32.ge_s i32.ge_u"),
     (0x50, "i64.eqz i64.eq i64.ne i64.lt_s i64.lt_u i64.gt_s i64.gt_u i64.le_s i64.le_u i64.ge_s i64.ge_u"),
-    (0x5B, "f32.eq f32.ne f32.lt f32.gt f32.le f32.ge"),
+    (0x5B, "f32.eq f32.ne f32.lt f32.gt f32.le f32.ge f64.eq f64.ne"),
     (0x67, "i32.clz i32.ctz i32.popcnt i32.add i32.sub i32.mul i32.div_s i32.div_u i32.rem_s i32.rem_u i32.and"),
     (0x72, "i32.or i32.xor i32.shl i32.shr_s i32.shr_u i32.rotl i32.rotr"),
     (0x79, "i64.clz i64.ctz i64.popcnt i64.add i64.sub i64.mul i64.div_s i64.div_u i64.rem_s i64.rem_u i64.and"),
     (0x84, "i64.or i64.xor i64.shl i64.shr_s i64.shr_u i64.rotl i64.rotr"),
-    (0xA0, "f64.add f64.sub f64.mul f64.div"),
+    (0x8B, "f32.abs"),
+    (0x96, "f32.min f32.max"),
+    (0x9B, "f64.ceil f64.floor"),
+    (0xA0, "f64.add f64.sub f64.mul f64.div f64.min f64.max"),
     (0xA7, "i32.wrap_i64"),
     (0xAC, "i64.extend_i32_s i64.extend_i32_u"),
     (0xB6, "f32.demote_f64"),
+    (0xB7, "f64.convert_i32_s"),
     (0xBA, "f64.convert_i64_u"),
+    (0xFC02, "i32.trunc_sat_f64_s"),
+    (0xFC06, "i64.trunc_sat_f64_s"),
     (0xFC0A, "memory.copy memory.fill"),
     (0xFD00, "v128.load"),
     (0xFD09, "v128.load32_splat v128.load64_splat v128.store v128.const i8x16.shuffle i8x16.swizzle"),
@@ -370,6 +376,8 @@ class Module:
         self._names: list[str] = []
         self._globals: list[tuple[str, int]] = []
         self._exports: list[bytes] = [_text("memory") + b"\x02\x00"]
+        self._data: list[bytes] = []
+        self._custom: list[bytes] = []
 
     def add(self, function: Function, name: str, *, export: bool = False) -> Callee:
         kind = b"\x60" + _vector([bytes([TYPES[t]]) for t in function.params])
@@ -389,6 +397,20 @@ class Module:
         self._globals.append((type, start))
         return Global(len(self._globals) - 1, type)
 
+    def restart(self, variable: Global, start: int) -> None:
+        """Another value that a variable begins with."""
+        self._globals[variable.index] = (variable.type, start)
+
+    def data(self, address: int, octets: bytes) -> None:
+        """Bytes that the memory of an instance begins with."""
+        self._data.append(
+            b"\0" + const("i32", address).code + OPCODES["end"] + unsigned(len(octets)) + octets
+        )
+
+    def custom(self, name: str, octets: bytes) -> None:
+        """A custom section: hosts can read it, and running ignores it."""
+        self._custom.append(_text(name) + octets)
+
     def code(self) -> bytes:
         """The module in the binary format."""
         functions = list(self._functions)
@@ -401,10 +423,13 @@ class Module:
             (6, variables),
             (7, self._exports),
             (10, [unsigned(len(code)) + code for _, code in functions]),
+            *([(11, self._data)] if self._data else []),
         )
         found = [b"\0asm\1\0\0\0"]
-        for number, items in sections:
-            inner = _vector(items)
+        for number, inner in (
+            *((number, _vector(items)) for number, items in sections),
+            *((0, one) for one in self._custom),
+        ):
             found.append(bytes([number]) + unsigned(len(inner)) + inner)
         return b"".join(found)
 

@@ -32,19 +32,27 @@ from powderdsl.targets.wasm.transfer import Transfer
 
 
 def add_driver(
-    library: Library, program: Program, passes: Sequence[Callee], asked: int, *, apart: bool
-) -> None:
-    """Add the functions that a host calls.
+    library: Library,
+    program: Program,
+    passes: Sequence[Callee],
+    asked: int,
+    *,
+    apart: bool = False,
+    export: bool = True,
+) -> dict[str, Callee]:
+    """Add the functions that a host calls, and give them by name.
 
     Args:
         program: on bit planes.
         asked: the ids whose presence passes ask for.
         apart: export passes too, by their numbers, and what comes before and after them.
+        export: whether hosts see these functions.
     """
     module, batches, cells = library.module, Batches(library), Transfer(library)
-    allocate = module.add(batches.allocate(Grid(library).setup()), "allocate", export=True)
-    module.add(batches.copy(allocate), "copy", export=True)
+    allocate = module.add(batches.allocate(Grid(library).setup()), "allocate", export=export)
+    added = {"allocate": allocate}
     for function, name in (
+        (batches.copy(allocate), "copy"),
         (batches.release(), "release"),
         (batches.scratch(), "scratch"),
         (batches.inputs(), "inputs"),
@@ -56,7 +64,8 @@ def add_driver(
         (cells.fill(), "fill"),
         (cells.fill_real(), "fill_real"),
     ):
-        module.add(function, name, export=True)
+        added[name] = module.add(function, name, export=export)
+    return added
 
 
 class Steps(Batches):

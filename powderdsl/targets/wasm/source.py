@@ -16,6 +16,7 @@ from powderdsl.targets.wasm.driver import add_driver
 from powderdsl.targets.wasm.library import PAGE, Library
 from powderdsl.targets.wasm.memory import Memory, extent_of
 from powderdsl.targets.wasm.passes import pass_function
+from powderdsl.targets.wasm.standalone import Face, Standalone
 
 PAGES = 1 << 14
 """The most pages of 64 KiB that a module's memory has: 1 GiB."""
@@ -35,13 +36,21 @@ class WasmModule:
 
 
 @collection_paused()
-def wasm_module(program: Program, width: int, *, apart: bool = False) -> WasmModule:
-    """The module of a program on planes, for grids of this width. `apart`: passes are exported too, by their numbers."""
+def wasm_module(program: Program, width: int, *, apart: bool = False, face: Face | None = None) -> WasmModule:
+    """The module of a program on planes, for grids of this width.
+
+    Args:
+        apart: passes are exported too, by their numbers.
+        face: the module is a world by itself (`standalone`), and exports only what that has.
+    """
     layout = layout_of(program)
     schedules = [plan(pass_, CPU) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout)
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
-    add_driver(library, program, passes, reduce(or_, map(asked_ids, schedules), 0), apart=apart)
+    asked = reduce(or_, map(asked_ids, schedules), 0)
+    added = add_driver(library, program, passes, asked, apart=apart, export=face is None)
+    if face is not None:
+        Standalone(library, face, added).add()
     return WasmModule(module, layout, width)

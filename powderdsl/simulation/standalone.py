@@ -1,0 +1,137 @@
+"""Rulesets as WebAssembly modules that stand alone, for pages and games: `powderdsl export`. Needs neither torch nor NumPy."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from powderdsl.compiler import lower
+from powderdsl.ir.segments import carry, segments
+from powderdsl.model.state import SNAP, Slot, size_problem, slots, storage
+from powderdsl.model.state import fits as sides_fit
+from powderdsl.model.types import Param, Ruleset
+from powderdsl.system.writing import failure
+from powderdsl.targets.codec import Piece, pieces
+from powderdsl.targets.wasm.source import wasm_module
+from powderdsl.targets.wasm.standalone import Face, Knob, Stored
+
+FORMAT = 1
+MAX_CELLS = 1 << 22
+"""The largest world: 2048×2048 cells, whose planes and fields fit into the memory of a module."""
+
+_BYTES = {"uint8": 1, "int8": 1, "int16": 2, "int32": 4, "float32": 4}
+
+
+def standalone_module(ruleset: Ruleset, size: tuple[int, int]) -> bytes:
+    """A module that is a world of `size` (rows, columns), as `targets.wasm.standalone` describes it.
+
+    Raises:
+        CompileError: PD607 if the world is too large or its sides do not fit the rules, PD702 if the rules have a pass
+            that WebAssembly cannot run.
+    """
+    if not sides_fit(ruleset, size):
+        raise failure("PD607", size_problem(ruleset, size))
+    if size[0] * size[1] > MAX_CELLS:
+        helps = (f"a module holds at most {MAX_CELLS:,} cells",)
+        raise failure("PD607", f"a world of {size[0]}×{size[1]} cells", helps=helps)
+    program = lower(ruleset)
+    parts = segments(program)
+    if len(parts) > 1 or parts[0].planes is None:
+        raise _cannot_run(ruleset)
+    held = pieces(program)
+    return wasm_module(parts[0].planes, size[1], face=_face(ruleset, size, held)).code
+
+
+def _cannot_run(ruleset: Ruleset) -> Exception:
+    program = lower(ruleset)
+    refused = [found for found in (carry(program, one) for one in program.passes) if found.planes is None]
+    notes = tuple(f"{one.place}: the pass `{one.cells.name}` needs {one.why}" for one in refused)
+    helps = ("use smaller numbers or kernels there",)
+    return failure("PD702", f"{ruleset.name} does not fit into WebAssembly", notes=notes, helps=helps)
+
+
+def _face(ruleset: Ruleset, size: tuple[int, int], held: dict[str, tuple[Piece, ...]]) -> Face:
+    ids = tuple(sorted(element.id for element in ruleset.elements))
+    element, *fields = (_stored(slot, ruleset, held[slot.name]) for slot in slots(ruleset))
+    knobs = tuple(_knob(param) for param in ruleset.params)
+    about = json.dumps(_about(ruleset, size), separators=(",", ":"), ensure_ascii=False).encode()
+    return Face(size[0], ids, element, tuple(fields), knobs, about)
+
+
+def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
+    prop = ruleset.property(slot.name)
+    if slot.name == "element":
+        usual: list[Any] = [0.0]
+    elif prop is not None:
+        defaults = {param.name: param.default for param in ruleset.params}
+        usual = [defaults[one] if isinstance(one, str) else one for one in prop.values]
+        usual += [0] * (256 - len(usual))
+    else:
+        usual = [slot.fresh(identity) for identity in range(256)]
+    by_component = zip(*usual, strict=True) if slot.planes == 2 else [usual]
+    low, high = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(
+        slot.kind.name, (slot.kind.lo, slot.kind.hi)
+    )
+    return Stored(
+        slot.name,
+        parts,
+        _BYTES[slot.dtype],
+        tuple(tuple(map(float, one)) for one in by_component),
+        float(low),
+        float(high),
+        prop.stored if prop is not None else slot.of,
+        slot.travels,
+        slot.kind.name == "element",
+        SNAP,
+    )
+
+
+def _range(param: Param) -> tuple[float, float]:
+    return (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
+
+
+def _knob(param: Param) -> Knob:
+    return Knob(param.name, float(param.default), *_range(param), param.kind.name in ("int", "flag"))
+
+
+def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
+    """What a page needs to know, in the order of the numbers that functions take."""
+    elements = []
+    for one in sorted(ruleset.elements, key=lambda one: one.id):
+        row = {
+            "id": one.id,
+            "name": one.name,
+            "qualified": one.qualified,
+            "color": one.color,
+            "glyph": one.glyph,
+        }
+        if one.ramp is not None:
+            ramp = one.ramp
+            row["ramp"] = {
+                "field": ramp.field,
+                "start": ramp.start,
+                "end": ramp.end,
+                "low": ramp.lo,
+                "high": ramp.hi,
+            }
+        elements.append(row)
+    fields = [
+        {"name": slot.name, "kind": slot.kind.name, "type": storage(slot.kind), "components": slot.planes}
+        for slot in slots(ruleset)
+        if slot.name != "element"
+    ]
+    parameters = [
+        {"name": one.name, "kind": one.kind.name, "value": float(one.default)}
+        | dict(zip(("low", "high"), _range(one), strict=True))
+        | {"about": one.about}
+        for one in ruleset.params
+    ]
+    return {
+        "format": FORMAT,
+        "ruleset": ruleset.name,
+        "rows": size[0],
+        "columns": size[1],
+        "elements": elements,
+        "fields": fields,
+        "parameters": parameters,
+    }
