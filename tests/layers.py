@@ -84,6 +84,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "simulation.state_checks",
     ),
     "simulation.simulator": (*_BACK, "simulation.programs", "simulation.observe", "simulation.any_arrays"),
+    "simulation.standalone": _BACK,
     "simulation.provenance": (*_FRONT, "simulation.simulator"),
     "simulation.tracing": (
         *_FRONT,
@@ -113,7 +114,15 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "worldmodel": (*_SCREEN, *_LEARNING[:7]),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
-    "cli": (*_SCREEN, *_TESTING, "testing.mutation", *_LEARNING, "experiments.bench", "experiments.studies"),
+    "cli": (
+        *_SCREEN,
+        "simulation.standalone",
+        *_TESTING,
+        "testing.mutation",
+        *_LEARNING,
+        "experiments.bench",
+        "experiments.studies",
+    ),
     "__init__": ("moved", *_SCREEN),  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }

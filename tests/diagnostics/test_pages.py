@@ -38,6 +38,7 @@ from powderdsl.experiments.studies.file import load_study, read_study
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import TEXT
 from powderdsl.rl import preset
+from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.writing import replacing
 from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics
 from powderdsl.testing.properties.refute import refuted
@@ -46,6 +47,7 @@ from powderdsl.worldmodel.training import diverged
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.scene import find_scene, load_scene
+from tests.semantics.test_mixed import spread
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ROOT / "powderdsl" / "diagnostics" / "pages"
@@ -313,6 +315,7 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD631": record_with_another_seed,
     "PD640": lambda: preset("paper", "sand-pushing", batch=1),
     "PD801": lambda: load_task("sand-pulling"),
+    "PD702": lambda: standalone_module(spread("heavy"), (64, 64)),
     "PD701": lambda: powderdsl.compile(paper_rules(), backend="reference", device="cuda:99"),
 }
 """How to bring about each message that a page shows."""

@@ -1,0 +1,162 @@
+"""Modules that stand alone, in wasmtime; and jobs for hosts in JavaScript (`alone.mjs`)."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import struct
+import subprocess
+import threading
+from collections.abc import Mapping, Sequence
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from powderdsl.model.state import slots
+from powderdsl.model.types import Ruleset
+from powderdsl.simulation.standalone import standalone_module
+from powderdsl.targets.wasm.host import this_host
+
+Arrays = Mapping[str, np.ndarray]
+JOBS = Path(__file__).with_name("alone.mjs")
+
+PAGE = """<!doctype html><meta charset="utf-8"><pre id="out">none</pre>
+<script>
+%s
+try { document.getElementById("out").textContent = JSON.stringify(runJobs(%s)); }
+catch (error) { document.getElementById("out").textContent = String(error); }
+</script>
+"""
+
+
+class StandaloneWorld:
+    """A module in wasmtime, with its fields by name."""
+
+    def __init__(self, ruleset: Ruleset, size: tuple[int, int]):
+        host = this_host()
+        self.running = host.instantiate(host.compile(standalone_module(ruleset, size)))
+        self.call, self.size = self.running.call, size
+        self.slots = {slot.name: (number, slot) for number, slot in enumerate(slots(ruleset)[1:])}
+
+    def begin(self, ids: np.ndarray, seed: int) -> None:
+        self.running.write(self.call("cells"), ids.astype(np.uint8).tobytes())
+        self.call("begin", seed)
+
+    def ids(self) -> np.ndarray:
+        return self._read(self.call("show"), self.size, np.dtype(np.uint8))
+
+    def field(self, name: str) -> np.ndarray:
+        number, slot = self.slots[name]
+        shape = self.size if slot.planes == 1 else (2, *self.size)
+        return self._read(self.call("field", number), shape, np.dtype(slot.dtype))
+
+    def take(self, name: str, values: np.ndarray) -> None:
+        number, slot = self.slots[name]
+        self.running.write(self.call("field", number), values.astype(slot.dtype).tobytes())
+        self.call("take", number)
+
+    def paint(self, element: int, *box: int) -> None:
+        self.call("paint", element, *box)
+
+    def set(self, name: str, component: int, box: Sequence[int], value: float) -> None:
+        self.call("set", self.slots[name][0], component, *box, pattern(value))
+
+    def parameter(self, number: int, value: float) -> None:
+        self.call("parameter", number, pattern(value))
+
+    def _read(self, at: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray:
+        memory = bytearray(int(np.prod(shape)) * dtype.itemsize)
+        self.running.read(at, memory)
+        return np.frombuffer(memory, dtype).reshape(shape)
+
+
+def pattern(value: float) -> int:
+    """An f64 argument, as the host takes bits."""
+    return int(struct.unpack("<Q", struct.pack("<d", value))[0])
+
+
+def fnv(data: bytes) -> int:
+    found = 0x811C9DC5
+    for byte in data:
+        found = (found ^ byte) * 0x01000193 & 0xFFFFFFFF
+    return found
+
+
+def job(ruleset: Ruleset, ids: np.ndarray, fields: Arrays, seed: int, steps: int) -> dict[str, Any]:
+    """A world, ids [H, W], for hosts in JavaScript."""
+    return {
+        "module": text(standalone_module(ruleset, ids.shape)),
+        "cells": text(ids.astype(np.uint8).tobytes()),
+        "fields": {name: text(np.ascontiguousarray(value).tobytes()) for name, value in fields.items()},
+        "seed": seed,
+        "steps": steps,
+    }
+
+
+def text(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def node() -> str | None:
+    return shutil.which("node")
+
+
+def chromium() -> str | None:
+    return next(
+        filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
+    )
+
+
+def in_node(jobs: list[dict[str, Any]], folder: Path) -> list[dict[str, Any]]:
+    file = folder / "jobs.json"
+    file.write_text(json.dumps(jobs))
+    command = [str(node()), str(JOBS), str(file)]
+    found: list[dict[str, Any]] = json.loads(
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    )
+    return found
+
+
+def in_chromium(jobs: list[dict[str, Any]], folder: Path) -> list[dict[str, Any]]:
+    """The same in a page."""
+    file = folder / "page.html"
+    script = JOBS.read_text().partition("\nif (typeof process")[0].replace("export ", "")
+    file.write_text(PAGE % (script, json.dumps(jobs)))
+    command = [
+        str(chromium()),
+        "--no-sandbox",
+        "--disable-gpu",
+        "--dump-dom",
+        "--timeout=120000",
+        file.as_uri(),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    shown = done.stdout.partition('<pre id="out">')[2].partition("</pre>")[0]
+    found: list[dict[str, Any]] = json.loads(shown)
+    return found
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def screenshot(folder: Path, size: tuple[int, int]) -> Image.Image:
+    """What Chromium shows of a folder's page after ten seconds of its own time."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    file = folder / "page.png"
+    options = ["--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--screenshot={file}"]
+    options += [f"--window-size={size[1]},{size[0]}", "--virtual-time-budget=10000"]
+    command = [str(chromium()), *options, f"http://127.0.0.1:{server.server_port}/index.html"]
+    try:
+        subprocess.run(command, capture_output=True, check=True, timeout=120)
+    finally:
+        server.shutdown()
+        server.server_close()
+    return Image.open(file)

@@ -1,0 +1,267 @@
+"""Modules that stand alone are worlds: the same as the simulator's, on every host, whatever a page does with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import wasmtime
+
+import powderdsl
+from powderdsl.compiler import load
+from powderdsl.diagnostics import CompileError
+from powderdsl.model.types import Ruleset
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.simulation.standalone import standalone_module
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from tests.cli.commands import powderdsl as command
+from tests.semantics.test_long_runs import RULESETS
+from tests.semantics.test_mixed import spread
+from tests.wasm.standalone_world import (
+    StandaloneWorld,
+    chromium,
+    fnv,
+    in_chromium,
+    in_node,
+    job,
+    node,
+    screenshot,
+)
+
+DOCS = Path(__file__).parents[2] / "docs" / "export.md"
+SIZES = [(9, 70), (16, 64)]
+
+HOLDERS = """
+pack: holders
+elements:
+  air: {id: 3, color: '#000000'}
+  jar: {id: 5, color: '#808080'}
+  lid: {id: 9, color: '#F0F0F0'}
+fields:
+  fill: {type: -3..20, at: element, of: jar, default: 2}
+  open: {type: flag, at: element}
+  seen: {type: element, at: place, default: lid}
+  warm: {type: real(-2..2), at: place, default: 1}
+params:
+  rate: {type: chance, default: 50%}
+streams: [coin]
+passes:
+  go:
+    do:
+      - fill += 1 where jar and coin < rate
+      - seen := jar where right is jar
+      - warm := warm / 2 + 0.25 where open
+"""
+
+
+def states(ruleset: Ruleset, size: tuple[int, int], seed: int) -> tuple[Simulator, World, Any]:
+    """A random world of the simulator, and its state as arrays without the axis of worlds."""
+    sim = compile_ruleset(ruleset, backend="wasm")
+    start = random_start(ruleset, Choices.seeded(seed), (1, *size)).seeded()
+    world = sim.world(start.ids, 7)
+    world = sim.replace(world, **start.fields)
+    return sim, world, {name: value[0].numpy() for name, value in world.state.items()}
+
+
+def compare(alone: StandaloneWorld, world: World) -> None:
+    assert np.array_equal(alone.ids(), world.ids[0].numpy())
+    for name in alone.slots:
+        assert np.array_equal(alone.field(name), world.state[name][0].numpy()), name
+
+
+@pytest.mark.parametrize("name", RULESETS)
+def test_steps(name: str) -> None:
+    ruleset = load(name)
+    for number, size in enumerate(SIZES):
+        sim, world, state = states(ruleset, size, number)
+        alone = StandaloneWorld(ruleset, size)
+        alone.begin(state["element"], 7)
+        compare(alone, sim.world(state["element"], 7))
+        for slot in alone.slots:
+            alone.take(slot, state[slot])
+        for steps in (0, 1, 30):
+            world = sim.step(world, steps)
+            alone.call("step", steps)
+            compare(alone, world)
+
+
+def test_painting_is_that_of_the_simulator() -> None:
+    ruleset = load("powderworld")
+    sim, world, state = states(ruleset, (20, 64), 3)
+    alone = StandaloneWorld(ruleset, (20, 64))
+    alone.begin(state["element"], 7)
+    for slot in alone.slots:
+        alone.take(slot, state[slot])
+    boxes = ((0, 5, 3, 9), (-4, 2, 60, 99), (19, 20, 0, 64), (7, 7, 0, 9), (30, 40, 0, 9))
+    for number, (top, bottom, left, right) in enumerate(boxes):
+        element = ruleset.elements[number + 1]
+        mask = np.zeros((20, 64), bool)
+        mask[max(top, 0) : bottom, max(left, 0) : right] = True
+        alone.paint(element.id, *(bound & 0xFFFFFFFF for bound in (top, bottom, left, right)))
+        world = sim.paint(world, where=mask, element=element.name)
+        compare(alone, world)
+    for known in (99, 256, 0xFFFFFFFF):  # not elements
+        alone.paint(known, 0, 9, 0, 9)
+    compare(alone, world)
+    wind = world["velocity"].clone()
+    wind[0, 1, 2:9, 60:64] = 1.25
+    world = sim.replace(world, velocity=wind)
+    alone.set("velocity", 1, (2, 9, 60, 90), 1.25)
+    alone.set("velocity", 2, (2, 9, 60, 90), 9.0)  # it has two components
+    compare(alone, world)
+    alone.call("step", 20)
+    compare(alone, sim.step(world, 20))
+
+
+def test_fields_hold_only_what_rules_allow() -> None:
+    """A page may write anything: it is cut to the range, and stays away from cells that cannot have it."""
+    ruleset = load_text(HOLDERS, "holders.yaml")
+    alone = StandaloneWorld(ruleset, (3, 4))
+    alone.begin(np.array([[3, 5, 9, 5], [0, 1, 250, 5], [3, 3, 3, 3]]), 1)
+    assert alone.ids().tolist() == [[3, 5, 9, 5], [3, 3, 3, 5], [3, 3, 3, 3]]
+    assert alone.field("fill").tolist()[0] == [2, 2, 2, 2]
+    alone.take("fill", np.full((3, 4), 90))
+    assert alone.field("fill").tolist() == [[2, 20, 2, 20], [2, 2, 2, 20], [2, 2, 2, 2]]
+    alone.set("fill", 0, (0, 1, 0, 2), -1e300)
+    assert alone.field("fill").tolist()[0] == [2, -3, 2, 20]
+    alone.set("open", 0, (0, 1, 0, 4), 7)
+    assert alone.field("open").tolist()[0] == [1, 1, 1, 1]
+    alone.set("seen", 0, (0, 1, 0, 1), 5)
+    alone.set("seen", 0, (0, 1, 1, 2), 77)
+    assert alone.field("seen").tolist()[0][:3] == [5, 3, 9]
+    given = np.array(
+        [[np.nan, np.inf, -np.inf, 2.0**-21], [-0.0, 1, 2, -2], [3, -3, 0.5, 2.0**-20]], np.float32
+    )
+    alone.take("warm", given)
+    wanted = np.array([[0, 2, -2, 0], [0, 1, 2, -2], [2, -2, 0.5, 2.0**-20]], np.float32)
+    assert alone.field("warm").tobytes() == wanted.tobytes()
+    assert alone.call("field", 99) == 0
+    alone.call("take", 99)
+    sim = compile_ruleset(ruleset, backend="reference")
+    world = sim.replace(sim.world(alone.ids(), 1), **{name: alone.field(name)[None] for name in alone.slots})
+    for rate in (0.0, 1.0, 0.3, np.nan, -5.0):
+        if not np.isnan(rate):
+            params = {"holders.rate": min(max(rate, 0.0), 1.0)}
+        alone.parameter(0, rate)
+        alone.call("step", 3)
+        world = sim.step(world, 3, params=params)
+        compare(alone, world)
+
+
+def test_parameters_of_powderworld() -> None:
+    ruleset = load("powderworld")
+    sim, world, state = states(ruleset, (12, 64), 5)
+    alone = StandaloneWorld(ruleset, (12, 64))
+    alone.begin(state["element"], 7)
+    for slot in alone.slots:
+        alone.take(slot, state[slot])
+    generator = np.random.default_rng(1)
+    params = {}
+    for number, param in enumerate(ruleset.params):
+        lo, hi = (0, 1) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
+        value = lo + (min(hi, 9) - lo) * float(generator.random())
+        params[param.name] = float(round(value)) if param.kind.name in ("int", "flag") else value
+        alone.parameter(number, params[param.name])
+    alone.call("step", 12)
+    compare(alone, sim.step(world, 12, params=params))
+
+
+def test_the_clock_continues_a_world() -> None:
+    """Cells, fields, seed and step are all that the future depends on."""
+    ruleset = load("core+sand+water")
+    _, _, state = states(ruleset, (12, 64), 5)
+    one, two = (StandaloneWorld(ruleset, (12, 64)) for _ in range(2))
+    one.begin(state["element"], 3)
+    one.call("step", 9)
+    two.begin(one.ids(), 0)
+    clock = bytearray(24)
+    one.running.read(one.call("clock"), clock)
+    assert np.frombuffer(clock, np.int64).tolist() == [3, 0, 9]
+    two.running.write(two.call("clock"), bytes(clock))
+    for name in two.slots:
+        two.take(name, one.field(name))
+    for world in (one, two):
+        world.call("step", 20)
+    assert np.array_equal(one.ids(), two.ids())
+
+
+def hosts() -> list[Any]:
+    return [
+        pytest.param(in_node, id="node", marks=pytest.mark.skipif(node() is None, reason="no Node.js")),
+        pytest.param(
+            in_chromium, id="chromium", marks=pytest.mark.skipif(chromium() is None, reason="no Chromium")
+        ),
+    ]
+
+
+@pytest.mark.parametrize("host", hosts())
+def test_hosts_give_the_same_worlds(host: Any, tmp_path: Path) -> None:
+    """Every shipped ruleset, 200 steps: ids, fields and velocity as native code and the reference have them."""
+    jobs, expected = [], []
+    for number, name in enumerate(RULESETS):
+        ruleset = load(name)
+        _, world, state = states(ruleset, SIZES[number % 2], number)
+        fields = {slot: values for slot, values in state.items() if slot != "element"}
+        jobs.append(job(ruleset, state["element"], fields, 7, 200))
+        sim = compile_ruleset(ruleset, backend="auto")
+        later = sim.step(World(sim, world.state, world.seed, world.index, world.step), 200)
+        expected.append({slot: fnv(value[0].numpy().tobytes()) for slot, value in later.state.items()})
+    assert [one["hashes"] for one in host(jobs, tmp_path)] == expected
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium")
+def test_the_page_of_the_documentation_shows_falling_sand(tmp_path: Path) -> None:
+    page = DOCS.read_text(encoding="utf-8")
+    html = page.partition("```html\n")[2].partition("```")[0]
+    assert len(html.partition("<script")[2].strip().splitlines()) <= 17  # fifteen, and the two of the element
+    (tmp_path / "index.html").write_text(f"<!doctype html><body style='margin: 0'>{html}")
+    assert command("export", "powderworld", "--out", str(tmp_path / "rules.wasm")).exit_code == 0
+    picture = np.asarray(screenshot(tmp_path, (512, 512)).convert("RGB"))
+    sand = powderdsl.load("powderworld").element("sand")
+    assert sand is not None
+    grains = (picture == np.array([int(sand.color[i : i + 2], 16) for i in (1, 3, 5)])).all(-1)
+    assert grains[16:].sum() >= 4 * 64  # cells of 8×8 pixels that have fallen
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CompileError, match="heavy does not fit into WebAssembly") as found:
+        standalone_module(spread("heavy"), (8, 8))
+    assert "heavy.yaml:" in str(found.value)
+    out, pack = str(tmp_path / "world.wasm"), tmp_path / "holders.yaml"
+    pack.write_text(HOLDERS.replace("pack: holders", "pack: holders\nside_multiple: 2"))
+    for given, words in (
+        ((str(pack), "--out", out, "--size", "63"), "must be a multiple of 2"),
+        (("life", "--out", out, "--size", "4096"), "PD607"),
+        (("life", "--out", str(tmp_path / "world.js")), "must end in .wasm"),
+        (("life",), "--out"),
+    ):
+        done = command("export", *given)
+        assert done.exit_code == 2
+        assert words in done.stderr
+    assert list(tmp_path.iterdir()) == [pack]
+
+
+def test_the_command_writes_a_module_that_says_what_it_is(tmp_path: Path) -> None:
+    out = tmp_path / "world.wasm"
+    done = command("export", "powderworld", "--out", str(out), "--size", "24x40", "--set", "water.melt=0.25")
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert "powderworld, 24×40 cells" in done.stdout
+    code = out.read_bytes()
+    assert len(code) <= 300_000
+    module = wasmtime.Module(wasmtime.Engine(), code)
+    assert not module.imports
+    names = {one.name for one in module.exports}
+    assert names == {
+        *("memory", "cells", "begin", "step", "show", "field", "take", "paint", "set", "parameter", "clock")
+    }
+    about = json.loads(code[code.index(b'{"format"') :].decode())
+    assert (about["rows"], about["columns"], about["ruleset"]) == (24, 40, "powderworld")
+    assert [one["name"] for one in about["elements"]] == [
+        one.name for one in powderdsl.load("powderworld").elements
+    ]
+    assert next(one["value"] for one in about["parameters"] if one["name"] == "water.melt") == 0.25
