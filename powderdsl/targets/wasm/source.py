@@ -39,20 +39,15 @@ class WasmModule:
 
 
 @collection_paused()
-<<<<<<< HEAD
-def wasm_module(program: Program, width: int, *, apart: bool = False, face: Face | None = None) -> WasmModule:
-=======
-def wasm_module(program: Program, width: int, *, apart: bool = False, memo: Memo | None = None) -> WasmModule:
->>>>>>> 9e395f9 (Memos: compiling an edited ruleset again makes only what has changed)
+def wasm_module(
+    program: Program, width: int, *, apart: bool = False, face: Face | None = None, memo: Memo | None = None
+) -> WasmModule:
     """The module of a program on planes, for grids of this width.
 
     Args:
         apart: passes are exported too, by their numbers.
-<<<<<<< HEAD
         face: the module is a world by itself (`standalone`), and exports only what that has.
-=======
         memo: where schedules of passes that have not changed are found.
->>>>>>> 9e395f9 (Memos: compiling an edited ruleset again makes only what has changed)
     """
     layout = layout_of(program)
     schedules = [_schedule(pass_, memo) for pass_ in program.passes]
