@@ -19,7 +19,7 @@ find_old_names()
 
 _HOMES = {
     "load": "powderdsl.compiler",
-    "compile": "powderdsl.simulation.simulator",
+    "compile": "powderdsl.simulation.compiling",
     "CompileError": "powderdsl.diagnostics",
     "ledger": "powderdsl.analysis.ledger",
     "Simulator": "powderdsl.simulation.simulator",

@@ -18,6 +18,7 @@ _STEPS = (
     "simulation.programs",
     "simulation.observe",
     "simulation.simulator",
+    "simulation.compiling",
 )
 _SIMULATION = (*_STEPS, "simulation.provenance", "simulation.tracing", "simulation.media")
 _WORLDS = ("worlds", "worlds.store")
@@ -45,7 +46,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "moved": (),
     "arrays": (),
     "diagnostics": (),
-    "system": ("diagnostics",),
+    "system": ("arrays", "diagnostics"),
     "syntax": ("diagnostics", "system"),
     "model": ("diagnostics", "system", "syntax"),
     "model.reference": _FRONT,  # never ir: an oracle that shares the lowering cannot see a bug in it
@@ -85,16 +86,23 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "simulation.simulator": (*_BACK, "simulation.programs", "simulation.observe", "simulation.any_arrays"),
     "simulation.standalone": _BACK,
-    "simulation.provenance": (*_FRONT, "simulation.simulator"),
+    "simulation.compiling": (
+        *_FRONT,
+        "compiler",
+        "simulation.any_arrays",
+        "simulation.array_worlds",
+        "simulation.simulator",
+    ),
+    "simulation.provenance": (*_FRONT, "targets", "simulation.any_arrays"),
     "simulation.tracing": (
         *_FRONT,
         "model.reference",
         "simulation.provenance",
-        "simulation.simulator",
+        "simulation.any_arrays",
     ),  # explains by what the oracle does
     "simulation.media": ("system", "simulation.draw"),
     "worlds": (*_FRONT, "analysis", "simulation.draw"),
-    "worlds.store": (*_FRONT, "worlds", "simulation.simulator"),  # saved worlds are values of the simulator
+    "worlds.store": (*_FRONT, "worlds", "simulation.any_arrays"),  # saved worlds are values of the simulator
     "testing.generators": _SCREEN,
     "testing": ("testing.generators",),  # the public names
     "testing.pack_tests": (*_SCREEN, "testing.generators"),
@@ -153,7 +161,6 @@ _TORCH = (
     "simulation.programs",
     "simulation.observe",
     "simulation.simulator",
-    "simulation.provenance",
     "testing.generators",
     "testing.mutation",
     "tasks.tensors",
@@ -173,7 +180,6 @@ THIRD_PARTIES: dict[str, Home] = {
             *_TORCH,
             "system.random",
             "targets.profiling",
-            "worlds.store",
             "simulation.draw",
             "simulation.media",
             "testing.pack_tests",

@@ -5,21 +5,19 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.cli.exits import BadInput
 from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale, to_numpy
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import World
+    from powderdsl.simulation.any_arrays import AnyWorld
 
 USUAL_SIDE = 400
 MAX_SIDE = 16_384
 """Pixels a side. More would take gigabytes before the first one is written."""
 
 
-def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8]:
+def pictures(world: AnyWorld, *, most: int, factor: int | None) -> NDArray[np.uint8]:
     """A batch as one picture, uint8 [H', W', 3]: up to `most` worlds side by side, cells of `factor` pixels.
 
     Cells that a vector field moves are tinted. Without a factor a side has about USUAL_SIDE pixels. Raises
@@ -38,19 +36,19 @@ def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8
     return images[0] if shown == 1 else contact_sheet(images, columns=columns)
 
 
-def first_world(world: World) -> dict[str, Any]:
+def first_world(world: AnyWorld) -> dict[str, Any]:
     """The first world of a batch, as `LiveView.show` takes it: `ids` [H, W], `motion` [2, H, W] or None, `fields`."""
     motion = motion_of(world)
     fields = {name: values[0] for name, values in shown_fields(world).items()}
     return {"ids": world.ids[0], "motion": None if motion is None else motion[0], "fields": fields}
 
 
-def shown_fields(world: World) -> dict[str, Any]:
+def shown_fields(world: AnyWorld) -> dict[str, Any]:
     """The fields that colors follow, [B, H, W] each, by name."""
     return {ramp.field: world[ramp.field] for ramp in ramps(world.sim.ruleset.elements)}
 
 
-def motion_of(world: World) -> Any:
+def motion_of(world: AnyWorld) -> Any:
     """The first vector field, float32 [B, 2, H, W], which pictures show as a tint; None if there is none."""
     names = [item.name for item in world.sim.ruleset.fields if item.kind.name == "vec2"]
     return world[names[0]] if names else None

@@ -6,8 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
@@ -17,7 +16,7 @@ from powderdsl.worlds.scene import Start, load_start
 from powderdsl.worlds.strewn import check_cells, strew
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import World
+    from powderdsl.simulation.any_arrays import AnyWorld
 
 DEFAULT_SIZE: Size = (64, 64)
 
@@ -26,19 +25,19 @@ KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipp
 
 def start(
     ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None, **how: Any
-) -> World:
+) -> AnyWorld:
     """The worlds that a run starts from; each has random numbers of its own.
 
     Args:
-        how: passed on to `compile`.
+        how: passed on to `compiling.compile_any`.
 
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
     """
-    # A drawn world comes first: compiling imports torch, and whoever mistyped a name should not wait for that.
+    # A drawn world comes first: compiling may import torch, and whoever mistyped a name should not wait for that.
     drawn = start_drawn(ruleset, name, size, batch, seed)
-    from powderdsl.simulation.simulator import compile
+    from powderdsl.simulation.compiling import compile_any
 
-    sim = compile(ruleset, **how)
+    sim = compile_any(ruleset, **how)
     with user_values():
         if drawn is not None:
             world = sim.world(drawn.ids, seed=seed or 0)

@@ -101,6 +101,10 @@ class AnySimulator(Generic[W]):
         self._params = Parameters(ruleset, kind)
         self._tables: dict[str, Array] = {}
 
+    def of(self, ruleset: Ruleset) -> Self:
+        """A simulator of other rules on the same backend and device."""
+        raise NotImplementedError
+
     @property
     def elements(self) -> tuple[str, ...]:
         """The elements' names in id order."""

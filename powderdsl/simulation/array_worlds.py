@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from powderdsl.compiler import lower, parts
+from powderdsl.compiler import lower
 from powderdsl.ir.ops import Program
-from powderdsl.ir.segments import Segment
+from powderdsl.ir.segments import Segment, segments
 from powderdsl.model.state import property_dtype, slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld
 from powderdsl.simulation.reference_program import ReferenceProgram
 from powderdsl.simulation.state_checks import unknown_slot
-from powderdsl.system.memo import Memo
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.array_kind import Array, PlainArrays
 from powderdsl.targets.job import Job, Runnable
 from powderdsl.targets.mixed import MixedProgram
+from powderdsl.targets.wasm.host import this_host
 from powderdsl.targets.wasm.program import WasmProgram
 
 
@@ -43,27 +43,38 @@ class ArraySimulator(AnySimulator[ArrayWorld]):
 
     Args:
         backend: ``wasm`` or ``reference``.
-        memo: where passes are kept that other rulesets may have, too.
     """
 
     world_type = ArrayWorld
     device = "cpu"
     notes: tuple[str, ...] = ()
 
-    def __init__(self, ruleset: Ruleset, backend: str = "wasm", memo: Memo | None = None):
+    def __init__(self, ruleset: Ruleset, backend: str = "wasm"):
         super().__init__(ruleset, PlainArrays())
         self.backend = self.running = backend
         self._program = (
-            ReferenceProgram(ruleset, self.kind) if backend == "reference" else WholeOrParts(ruleset, memo)
+            ReferenceProgram(ruleset, self.kind) if backend == "reference" else WholeOrParts(ruleset)
         )
+
+    def of(self, ruleset: Ruleset) -> ArraySimulator:
+        return ArraySimulator(ruleset, self.backend)
+
+
+def wasm_problem() -> str:
+    """Why no WebAssembly runs in this process; empty if it does."""
+    try:
+        this_host()
+    except (ImportError, OSError, RuntimeError) as error:  # wasmtime can be installed where it does not run
+        return " ".join(str(error).split())[:200] or type(error).__name__
+    return ""
 
 
 class WholeOrParts:
     """WebAssembly for whole steps and for chosen passes; the oracle for given draws and for what fits no bit planes."""
 
-    def __init__(self, ruleset: Ruleset, memo: Memo | None):
-        self._ruleset, self._kind, self._memo = ruleset, PlainArrays(), memo
-        self._lowered = lower(ruleset, memo)  # what cannot be lowered is reported before the first step
+    def __init__(self, ruleset: Ruleset):
+        self._ruleset, self._kind = ruleset, PlainArrays()
+        self._lowered = lower(ruleset)  # what cannot be lowered is reported before the first step
         self._oracle = ReferenceProgram(ruleset, self._kind)
         self._made: dict[frozenset[str] | None, Runnable] = {}
 
@@ -81,13 +92,13 @@ class WholeOrParts:
         program = self._lowered
         if chosen is not None:
             program = replace(program, passes=tuple(one for one in program.passes if one.name in chosen))
-        found = parts(program, self._memo)
-        made = [self._part(one, first=number == 0) for number, one in enumerate(found)]
-        return made[0] if len(made) == 1 else MixedProgram(made)
+        found = segments(program)
+        parts = [self._part(one, first=number == 0) for number, one in enumerate(found)]
+        return parts[0] if len(parts) == 1 else MixedProgram(parts)
 
     def _part(self, segment: Segment, *, first: bool) -> Runnable:
         if segment.planes is not None:
-            return WasmProgram(segment.program, segment.planes, self._kind, self._memo)
+            return WasmProgram(segment.program, segment.planes, self._kind)
         return OracleOfPasses(self._ruleset, segment.program, first=first)
 
 

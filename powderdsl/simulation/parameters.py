@@ -49,7 +49,7 @@ class Parameters:
                 raise ValueError(f"{name} takes one value or {batch}, found shape {list(array.shape)}")
             if not bool(((array >= lo) & (array <= hi)).all()):
                 raise ValueError(f"{name} takes {lo:g}..{hi:g}")
-            if kind.name in ("int", "flag") and not bool((array == xp.round(array)).all()):
+            if kind.name in ("int", "flag") and not bool((array == xp.floor(array)).all()):
                 raise ValueError(f"{name} takes integers")
             values[name] = self._kind.copied(xp.broadcast_to(array, (batch,)))
         return values

@@ -10,13 +10,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from powderdsl.diagnostics import Span
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Assign, Expr, Field, Move, Pass, Rule, Ruleset, Swap, integer
-from powderdsl.simulation.simulator import Simulator, World, compile
+from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld
+from powderdsl.targets.array_kind import Array
 
 SLOT = "last writer"
 """The field of the numbers. Names in rule files have no blanks, so none is the same."""
@@ -67,8 +65,8 @@ class Provenance:
     of a cell in the last step, 0 where none did. A rule that writes the element that was there counts too.
     """
 
-    world: World
-    numbers: Tensor
+    world: AnyWorld
+    numbers: Array
     rules: tuple[NumberedRule, ...]
 
     def rule_at(self, row: int, column: int, world: int = 0) -> NumberedRule | None:
@@ -80,27 +78,28 @@ class Provenance:
 class Recorder:
     """Steps worlds of a simulator and records which rules wrote their elements. Compiles the rules once more."""
 
-    def __init__(self, sim: Simulator):
+    def __init__(self, sim: AnySimulator[Any]):
         self.sim = sim
         self.rules = numbered_rules(sim.ruleset)
-        self._marked = compile(marked(sim.ruleset), backend=sim.backend, device=str(sim.device))
+        self._marked = sim.of(marked(sim.ruleset))
 
-    def step(self, world: World, steps: int = 1, **options: Any) -> Provenance:
+    def step(self, world: AnyWorld, steps: int = 1, **options: Any) -> Provenance:
         """Like `Simulator.step`, which takes the same options, gives the same worlds and raises the same errors.
 
         After 0 steps no rule has written.
         """
         self.sim.check(world)
-        dtype = next(getattr(torch, slot.dtype) for slot in self._marked.slots if slot.name == SLOT)
-        nothing = torch.zeros(world.shape, dtype=dtype, device=self.sim.device)
+        xp = self.sim.kind.xp
+        dtype = next(getattr(xp, slot.dtype) for slot in self._marked.slots if slot.name == SLOT)
+        nothing = xp.asarray(xp.zeros_like(world.ids), dtype=dtype)
         start = replace(world, sim=self._marked, state={**world.state, SLOT: nothing})
         end = self._marked.step(start, steps, **options)
         state = dict(end.state)
-        numbers = state.pop(SLOT).to(torch.int16)
+        numbers = xp.asarray(state.pop(SLOT), dtype=xp.int16)
         return Provenance(replace(end, sim=self.sim, state=state), numbers, self.rules)
 
 
-def writers(world: World, steps: int = 1, **options: Any) -> Provenance:
+def writers(world: AnyWorld, steps: int = 1, **options: Any) -> Provenance:
     """The worlds some steps later, and which rules wrote their elements in the last of these steps.
 
     This compiles the rules for one call; a `Recorder` compiles them once. `options` are those of `Simulator.step`.

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import BACKENDS, current_backend, load, starting_backend
+from powderdsl.compiler import checked_request, starting_backend
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.any_arrays import MAX_CELLS, AnySimulator, AnyWorld, clock_of, whole_count
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.programs import find_device, make_program
-from powderdsl.system.writing import failure
 from powderdsl.targets.job import Job
 from powderdsl.targets.profiling import profile_of
 from powderdsl.targets.tensor_kind import Tensors
@@ -77,6 +76,10 @@ class Simulator(AnySimulator[World]):
         super().__init__(ruleset, Tensors(self.device))
         self.observer = Observer(ruleset, self.device)
         self._program = make_program(ruleset, backend, self.device, threads)
+        self._threads = threads
+
+    def of(self, ruleset: Ruleset) -> Simulator:
+        return Simulator(ruleset, self.backend, self.device, self._threads)
 
     @property
     def running(self) -> str:
@@ -119,10 +122,5 @@ def compile(
     Raises:
         CompileError: PD701 if the backend or the device is not available.
     """
-    model = load(ruleset) if isinstance(ruleset, str) else ruleset
-    if not isinstance(model, Ruleset):
-        raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
-    backend = current_backend(backend)
-    if backend not in BACKENDS:
-        raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
+    model, backend = checked_request(ruleset, backend)
     return Simulator(model, backend, device, threads)

@@ -84,10 +84,9 @@ def checked_floats(kind: ArrayKind, array: Array, slot: Slot) -> Array:
     xp = kind.xp
     if not bool(xp.isfinite(array).all()):
         raise ValueError(f"{slot.name} has values that are not finite")
-    inside = xp.clip(xp.asarray(array, dtype=xp.float32), slot.kind.lo, slot.kind.hi)
-    floats = kind.contiguous(inside)
+    floats = kind.empty(xp.float32, tuple(array.shape))
     for rows in _rows(floats.shape):
-        part = floats[..., rows, :]
+        part = xp.clip(xp.asarray(array[..., rows, :], dtype=xp.float32), slot.kind.lo, slot.kind.hi)
         floats[..., rows, :] = xp.where(xp.abs(part) < SNAP, 0, part)
     return floats
 
@@ -114,7 +113,7 @@ def _integers(
     arrays: ArrayKind, array: Array, ids: Array, slot: Slot, usual: Array | None, ruleset: Ruleset
 ) -> Array:
     xp, kind = arrays.xp, slot.kind
-    if arrays.sort(array) == "float" and not bool((array == xp.round(array)).all()):
+    if arrays.sort(array) == "float" and not bool((array == xp.floor(array)).all()):
         raise TypeError(f"{slot.name} takes integers, found {array.dtype}")
     values = xp.asarray(array, dtype=xp.int64)
     if kind.name == "element":

@@ -1,20 +1,23 @@
-"""Arrays of .npz files from strangers: the contents that an archive claims are checked before any of it is unpacked."""
+"""Arrays in .npz files, as NumPy writes and reads them.
+
+Files may come from strangers: the contents that an archive claims are checked before any of it is unpacked.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import struct
 import zipfile
+from ast import literal_eval
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.system.reading import open_regular
 
 MAX_ENTRIES = 256
@@ -23,6 +26,11 @@ MAX_DIRECTORY = 1 << 20
 """Maximum bytes of its list of contents."""
 MAX_HEADER = 10_000
 """Maximum bytes of an array's header."""
+CHUNK = 1 << 24
+"""Bytes of an array that are written together."""
+_MAGIC, _ALIGNMENT, _SHAPE_ROOM = b"\x93NUMPY", 64, 21
+"""How arrays begin; the multiple of bytes at which their values begin; characters that may hold the first side."""
+_WORDS = {"b": "bool", "i": "int", "u": "uint", "f": "float", "U": "str"}
 _END, _END64 = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q")
 _LOCATOR = 20
 
@@ -33,10 +41,16 @@ class BadArchive(Exception):
 
 @dataclass(frozen=True)
 class Header:
-    """What an array claims to be, and where its bytes begin in the unpacked member."""
+    """What an array claims to be, and where its bytes begin in the unpacked member.
+
+    `letter` is ``b``, ``i``, ``u`` or ``f``, or ``U`` for text; `itemsize` the bytes of a number or text. Those of
+    numbers stand the other way round if `swapped`.
+    """
 
     shape: tuple[int, ...]
-    dtype: np.dtype[Any]
+    letter: str
+    itemsize: int
+    swapped: bool
     fortran: bool
     start: int
     entry: zipfile.ZipInfo
@@ -44,7 +58,13 @@ class Header:
     @property
     def size(self) -> int:
         """Bytes."""
-        return prod(self.shape) * self.dtype.itemsize
+        return prod(self.shape) * self.itemsize
+
+    @property
+    def dtype(self) -> str:
+        """NumPy's name of it, such as ``uint8``; ``str`` for text."""
+        word = _WORDS[self.letter]
+        return word if self.letter in "bU" else f"{word}{8 * self.itemsize}"
 
 
 @dataclass(frozen=True)
@@ -60,14 +80,60 @@ class Archive:
         return sum(header.size for header in self.headers.values())
 
     def read(self, name: str) -> NDArray[Any]:
-        """Read an array of the size that its header claims; it is read-only. Raises BadArchive."""
+        """Read an array of numbers, of the size that its header claims; it is read-only. Raises BadArchive."""
+        header, data = self.headers[name], self._bytes(name)
+        if header.letter == "U":
+            raise BadArchive(f"`{name}` is not an array of numbers")
+        if header.swapped:
+            parts, size = bytearray(len(data)), header.itemsize
+            for place in range(size):
+                parts[place::size] = data[size - 1 - place :: size]
+            data = memoryview(bytes(parts))
+        flat = np.frombuffer(data, header.dtype)
+        if header.fortran:
+            return np.transpose(flat.reshape(header.shape[::-1]))
+        return flat.reshape(header.shape)
+
+    def text(self, name: str) -> str:
+        """Read a text. Raises BadArchive."""
+        header, data = self.headers[name], self._bytes(name)
+        if header.letter != "U" or header.shape != ():
+            raise BadArchive(f"`{name}` is not a text")
+        with _as_bad_archive():
+            return str(data, "utf-32-be" if header.swapped else "utf-32-le").rstrip("\0")
+
+    def _bytes(self, name: str) -> memoryview:
         header = self.headers[name]
         with _as_bad_archive(), self._zip.open(header.entry) as member:
             data = member.read()
         if len(data) != header.start + header.size:
             raise BadArchive(f"`{name}` does not have the bytes that it says")
-        flat = np.frombuffer(data, header.dtype, offset=header.start)
-        return flat.reshape(header.shape, order="F" if header.fortran else "C")
+        return memoryview(data)[header.start :]
+
+
+def write_archive(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | str]) -> None:
+    """Write an .npz, compressed: the bytes that `numpy.savez_compressed` writes."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, value in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if isinstance(value, str):
+                    _write_header(member, f"<U{len(value)}", ())
+                    member.write(value.encode("utf-32-le"))
+                    continue
+                shape = tuple(value.shape)
+                _write_header(member, value.dtype.str, shape)
+                step = max(1, CHUNK // max(1, prod(shape[1:]) * value.dtype.itemsize))
+                for start in range(0, shape[0], step):
+                    member.write(value[start : start + step].tobytes())
+
+
+def _write_header(member: IO[bytes], descr: str, shape: tuple[int, ...]) -> None:
+    """The header of an array in C order, of version 1.0, with room for a longer first side."""
+    text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}"
+    text += " " * (_SHAPE_ROOM - len(str(shape[0]))) if shape else ""
+    before = len(_MAGIC) + 4
+    text += " " * (_ALIGNMENT - (before + len(text) + 1) % _ALIGNMENT) + "\n"
+    member.write(_MAGIC + b"\1\0" + struct.pack("<H", len(text)) + text.encode("latin-1"))
 
 
 @contextmanager
@@ -129,16 +195,31 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Head
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise BadArchive(f"`{name}` is packed in another way than .npz files are")
     with archive.open(entry) as member:
-        version = np.lib.format.read_magic(member)
+        magic, version = member.read(len(_MAGIC)), tuple(member.read(2))
+        if magic != _MAGIC:
+            raise BadArchive(f"`{name}` is not an array")
         if version not in ((1, 0), (2, 0)):
             raise BadArchive(f"`{name}` has the npy version {version}")
-        read = (
-            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        )
-        shape, fortran, dtype = read(member, max_header_size=MAX_HEADER)
-        header = Header(shape, dtype, fortran, member.tell(), entry)
-    if dtype.kind not in "biufU" or dtype.subdtype is not None or any(side < 0 for side in shape):
-        raise BadArchive(f"`{name}` is not an array of numbers")
+        length = struct.Struct("<H" if version == (1, 0) else "<I")
+        (count,) = length.unpack(member.read(length.size))
+        if count > MAX_HEADER:
+            raise BadArchive(f"`{name}` has a header of {count:,} bytes")
+        values = literal_eval(member.read(count).decode("latin-1").strip())
+        start = member.tell()
+    header = _checked_header(name, values, start, entry)
     if entry.file_size != header.start + header.size:
         raise BadArchive(f"`{name}` has {entry.file_size - header.start:,} bytes, not {header.size:,}")
     return name, header
+
+
+def _checked_header(name: str, values: Any, start: int, entry: zipfile.ZipInfo) -> Header:
+    if not isinstance(values, dict) or values.keys() != {"descr", "fortran_order", "shape"}:
+        raise BadArchive(f"`{name}` does not say what it is")
+    descr, fortran, shape = values["descr"], values["fortran_order"], values["shape"]
+    found = re.fullmatch(r"([<>|=]?)(?:b(1)|[iu]([1248])|f([248])|U([0-9]{1,9}))", str(descr))
+    sides = isinstance(shape, tuple) and all(type(side) is int and side >= 0 for side in shape)
+    if not isinstance(descr, str) or found is None or not sides or not isinstance(fortran, bool):
+        raise BadArchive(f"`{name}` is not an array of numbers")
+    letter = descr.lstrip("<>|=")[0]
+    size = int(next(part for part in found.groups()[1:] if part)) * (4 if letter == "U" else 1)
+    return Header(shape, letter, size, found[1] == ">" and size > 1, fortran, start, entry)

@@ -57,7 +57,7 @@ def limits(xp: Any, values: Any, threshold: Threshold) -> Any:
     """For chances, float64 [B]: how many of the possible draws lie below each, or not above it if strict: int64 [B]."""
     count = 1 << threshold.bits
     scaled = values * count - 0.5
-    limit = xp.ceil(scaled) if threshold.strict else xp.floor(scaled) + 1
+    limit = -xp.floor(-scaled) if threshold.strict else xp.floor(scaled) + 1
     return xp.asarray(xp.clip(limit, 0, count), dtype=xp.int64)
 
 

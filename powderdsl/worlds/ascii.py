@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.model.types import Element
 from powderdsl.syntax.sources import read_source
@@ -108,9 +106,8 @@ def write_ascii(
     vacant = sorted(set(np.unique(world).tolist()) - characters.keys())
     if vacant:
         raise ValueError(f"no element has the ids {vacant[:8]}")
-    table = np.array([characters.get(number, " ") for number in range(max(characters, default=0) + 1)])
-    separator = " " if spaced else ""
-    return "".join(separator.join(row) + "\n" for row in table[world].tolist())
+    separator, glyph = " " if spaced else "", characters.__getitem__
+    return "".join(separator.join(map(glyph, row)) + "\n" for row in world.tolist())
 
 
 def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[str, int]:

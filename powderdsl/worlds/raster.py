@@ -11,9 +11,7 @@ from dataclasses import dataclass, field
 from math import isqrt
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Span
 
 MAX_CELLS = 1 << 24
@@ -24,6 +22,9 @@ MAX_COORDINATE = 1 << 24
 
 FAR = 1 << 40
 """Beyond every row."""
+
+MOST = 1 << 62
+"""No number below is larger."""
 
 Size = tuple[int, int]
 """(rows, columns)."""
@@ -82,7 +83,7 @@ def paint(size: Size, fill: int, paints: Iterable[Paint], ids: Mapping[str, int]
     world = np.full(size, fill, dtype=np.uint8)
     for statement in paints:
         window, covered = _in_window(statement.shape, size)
-        world[window][covered] = ids[statement.element]
+        world[window] = np.where(covered, np.uint8(ids[statement.element]), world[window])
     return world
 
 
@@ -151,7 +152,7 @@ def _line(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
     bound = length + root(xp, width * width * (down * down + longer * longer) - 1) // 4
     # Turning the line round changes nothing, so the slope may be taken to the right.
     across = (column - left) * down * xp.where(right < 0, -1, 1)
-    divisor = xp.clip(abs(longer), 1, None)
+    divisor = xp.clip(abs(longer), 1, MOST)
     upright, hit = longer == 0, abs(across) <= bound
     first = xp.where(upright, xp.where(hit, -FAR, FAR), top - (bound - across) // divisor)
     last = xp.where(upright, xp.where(hit, FAR, -FAR), top + (across + bound) // divisor)
@@ -166,7 +167,7 @@ def _disk(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
     """The cells nearer to the center than the radius: a disk of radius 1 is one cell."""
     row, center, radius = n
     left = radius * radius - 1 - (column - center) ** 2
-    reach = root(xp, xp.clip(left, 0, None))
+    reach = root(xp, xp.clip(left, 0, MOST))
     return xp.where(left < 0, FAR, row - reach), row + reach + 1
 
 
@@ -204,7 +205,7 @@ def _ramp(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
     top, left, bottom, end = n
     wide = abs(end - left)
     climb = (column - left) * xp.where(end > left, 1, -1) * (bottom - top)
-    first = xp.where(wide == 0, xp.minimum(top, bottom), top - (-climb) // xp.clip(wide, 1, None))
+    first = xp.where(wide == 0, xp.minimum(top, bottom), top - (-climb) // xp.clip(wide, 1, MOST))
     beside = (column < xp.minimum(left, end)) | (column > xp.maximum(left, end))
     return xp.where(beside, FAR, first), xp.maximum(top, bottom) + 1
 

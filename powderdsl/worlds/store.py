@@ -8,13 +8,12 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import ELEMENT
-from powderdsl.simulation.simulator import Simulator, World
-from powderdsl.system.archives import Archive, BadArchive, open_archive
+from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld, W
+from powderdsl.system.archives import Archive, BadArchive, open_archive, write_archive
 from powderdsl.system.reading import parse_json
 from powderdsl.system.writing import failure, replacing
 from powderdsl.worlds.raster import MAX_CELLS
@@ -28,14 +27,14 @@ MORE = 1 << 24
 """Bytes that arrays may take beyond those of twice the worlds: fields of packs that are not loaded."""
 
 
-def save(world: World, path: str | Path) -> None:
+def save(world: AnyWorld, path: str | Path) -> None:
     """Write worlds with everything that later steps depend on. The file appears whole or not at all.
 
     Raises:
         CompileError: PD613 if the place cannot be written, PD602 if the disk is full, PD607 if there are more than
             MAX_CELLS cells. TypeError: `world` is not a world.
     """
-    if not isinstance(world, World):
+    if not isinstance(world, AnyWorld):
         raise TypeError(f"save takes a World, found {type(world).__name__}")
     target = Path(path)
     check_saved(target, world.shape)
@@ -46,26 +45,27 @@ def save(world: World, path: str | Path) -> None:
         "palette": {str(element.id): element.qualified for element in ruleset.elements},
         "fields": {name: word for name, word in qualified_slots(ruleset).items() if name in world.state},
     }
-    arrays = {f"{SLOT}{name}": value.cpu().numpy() for name, value in world.state.items()}
-    clock = {name: getattr(world, name).cpu().numpy() for name in CLOCK}
+    to_numpy = world.sim.kind.to_numpy
+    arrays = {f"{SLOT}{name}": to_numpy(value) for name, value in world.state.items()}
+    clock = {name: to_numpy(getattr(world, name)) for name in CLOCK}
     with replacing(target, follow=True) as temporary:
         try:
             with temporary.open("wb") as file:
-                np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays, **clock)  # type: ignore[arg-type]
+                write_archive(file, {"about": json.dumps(about), **arrays, **clock})
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
             raise _bad(target, f"cannot be written: {error.strerror}") from None
 
 
-def load_world(path: str | Path, sim: Simulator) -> World:
+def load_world(path: str | Path, sim: AnySimulator[W]) -> W:
     """Worlds from a file, for a simulator whose ruleset may number its elements differently.
 
     Raises:
         CompileError: PD602 if the file is not a saved world; PD603 if the ruleset lacks one of its elements or fields;
             PD607 if it has more than MAX_CELLS cells. TypeError: `sim` is not a simulator.
     """
-    if not isinstance(sim, Simulator):
+    if not isinstance(sim, AnySimulator):
         raise TypeError(f"load_world takes a Simulator, from powderdsl.compile; found {type(sim).__name__}")
     source = Path(path)
     try:
@@ -79,12 +79,10 @@ def load_world(path: str | Path, sim: Simulator) -> World:
         raise _bad(source, f"is not a saved world: {error}") from None
 
 
-def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
-    import torch
-
+def _loaded(archive: Archive, sim: AnySimulator[W], source: Path) -> W:
     palette, qualified, saved_in = _about(archive, source)
     shape = _shape(archive, sim, source)
-    clock = {name: torch.from_numpy(_clock(archive, name, source)).to(sim.device) for name in CLOCK}
+    clock = {name: sim.kind.from_numpy(_clock(archive, name, source)) for name in CLOCK}
     ids = archive.read(IDS)
     fields: dict[str, Any] = {}
     for key in archive.headers:
@@ -106,7 +104,7 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
         fields[slot.name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
     try:
         world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
-        return World(sim, world.state, **clock)
+        return sim.world_type(sim, world.state, **clock)
     except (ValueError, TypeError) as error:
         raise _bad(source, str(error)) from None
 
@@ -114,10 +112,10 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
 def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str], str]:
     """The palette, the qualified name of each field (none in older files), and the name of the ruleset."""
     header = archive.headers.get("about")
-    if header is None or header.shape != () or header.dtype.kind != "U" or header.size > MAX_ABOUT:
+    if header is None or header.shape != () or header.letter != "U" or header.size > MAX_ABOUT:
         raise _bad(path, "is not a saved world: it does not say what it is")
     try:
-        about = parse_json(str(archive.read("about")).encode())
+        about = parse_json(archive.text("about").encode())
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             raise _bad(path, f"was saved in another format than {FORMAT}")
         palette = {int(number): str(name) for number, name in about["palette"].items()}
@@ -128,10 +126,10 @@ def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str]
     return palette, fields, str(about.get("ruleset"))[:100]
 
 
-def _shape(archive: Archive, sim: Simulator, path: Path) -> tuple[int, ...]:
+def _shape(archive: Archive, sim: AnySimulator[Any], path: Path) -> tuple[int, ...]:
     """[worlds, rows, columns], if the arrays are not larger than those of such worlds can be."""
     header = archive.headers.get(IDS)
-    if header is None or header.dtype != np.uint8 or len(header.shape) != 3 or 0 in header.shape:
+    if header is None or header.dtype != "uint8" or len(header.shape) != 3 or 0 in header.shape:
         raise _bad(path, "is not a saved world: it has no elements [worlds, rows, columns]")
     cells = prod(header.shape)
     check_saved(path, header.shape)
@@ -152,7 +150,7 @@ def check_saved(path: Path, shape: tuple[int, ...]) -> None:
 def _clock(archive: Archive, name: str, path: Path) -> Any:
     header = archive.headers.get(name)
     batch = archive.headers[IDS].shape[:1]
-    if header is None or header.dtype.kind not in "iu" or header.shape != batch:
+    if header is None or header.letter not in "iu" or header.shape != batch:
         raise _bad(path, f"is not a saved world: its arrays do not fit together (`{name}`)")
     values = archive.read(name).astype(np.int64)
     if (values < 0).any():
@@ -160,7 +158,7 @@ def _clock(archive: Archive, name: str, path: Path) -> Any:
     return values
 
 
-def _translated(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
+def _translated(palette: dict[int, str], ids: Any, sim: AnySimulator[Any], path: Path) -> Any:
     """The file's ids as ours, uint8; reports elements that we do not have."""
     if ids.dtype != np.uint8:
         raise _bad(path, f"is not a saved world: elements are bytes, found {ids.dtype}")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from powderdsl.analysis.reactions import moved_ids, unchanging_ids
+from powderdsl.arrays import NDArray, np
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS, Shape, Size, mask
@@ -37,7 +35,8 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
         return worlds
     frame = _frame_element(ruleset, ground) if min(size) >= 3 else None
     edge = mask(Shape("frame"), size)
-    for index, world in enumerate(worlds):
+    for index in range(batch):
+        world = np.full(size, ground, dtype=np.uint8)
         random = np.random.default_rng([seed, index])
         for _ in range(24):
             cells = mask(random_shape(random, size, max(min(size) // 8, 1)), size)
@@ -47,6 +46,7 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
             world[cells] = element
         if frame is not None:
             world[edge] = frame
+        worlds[index] = world
     return worlds
 
 

@@ -139,9 +139,9 @@ def test_threads_are_set():
 
     before = torch.get_num_threads()
     try:
-        powderdsl("run", "core", *FAST, "--threads", "2")
+        powderdsl("run", "core", *FAST, "--backend", "torch", "--threads", "2")
         assert torch.get_num_threads() == 2
-        powderdsl("run", "core", *FAST)
+        powderdsl("run", "core", *FAST, "--backend", "torch")
         assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)

@@ -17,7 +17,7 @@ import torch
 import powderdsl
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs.checkpoints import latest_checkpoint, save_checkpoint
-from powderdsl.system.archives import BadArchive, open_archive
+from powderdsl.system.archives import BadArchive, open_archive, write_archive
 from powderdsl.worlds.raster import MAX_CELLS
 
 
@@ -75,6 +75,39 @@ def test_a_long_list_of_contents_is_not_read(tmp_path):
             archive.writestr(f"{number}.npy", b"")
     with pytest.raises(BadArchive, match="more than 256"), open_archive(tmp_path / "a.npz"):
         pass
+
+
+def test_archives_are_those_of_numpy(tmp_path):
+    random = np.random.default_rng(1)
+    arrays = {
+        "ids": random.integers(0, 9, (3, 5, 7)).astype(np.uint8),
+        "speed": random.normal(size=(2, 2, 400, 300)).astype(np.float32),
+        "few": np.arange(4, dtype=np.int64),
+        "flags": random.random((12, 1)) < 0.5,
+    }
+    np.savez_compressed(tmp_path / "numpy.npz", about=np.array("ä 🌍 {}"), **arrays)
+    with (tmp_path / "ours.npz").open("wb") as file:
+        write_archive(file, {"about": "ä 🌍 {}", **arrays})
+    assert (tmp_path / "ours.npz").read_bytes() == (tmp_path / "numpy.npz").read_bytes()
+    with open_archive(tmp_path / "ours.npz") as archive:
+        assert archive.text("about") == "ä 🌍 {}"
+        for name, value in arrays.items():
+            found = archive.read(name)
+            assert (found.dtype, found.shape, found.tobytes()) == (value.dtype, value.shape, value.tobytes())
+
+
+def test_arrays_in_other_orders_are_read(tmp_path):
+    value = np.arange(24, dtype=">i4").reshape(2, 3, 4)
+    np.savez(tmp_path / "a.npz", a=value, b=np.asfortranarray(value), c=np.array("x", ">U3"))
+    with open_archive(tmp_path / "a.npz") as archive:
+        assert archive.headers["a"].dtype == "int32"
+        assert (archive.read("a") == value).all()
+        assert (archive.read("b") == value).all()
+        assert archive.text("c") == "x"
+        with pytest.raises(BadArchive):
+            archive.text("a")
+        with pytest.raises(BadArchive):
+            archive.read("c")
 
 
 # Checkpoints

@@ -4,10 +4,28 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import powderdsl
+from powderdsl.cli.start_worlds import start
 from powderdsl.compiler import BACKENDS
+from powderdsl.worlds.ascii import write_ascii
+from powderdsl.worlds.strewn import strew
+
+SCENE = """\
+scene: spring
+size: [12, 37]
+fill: empty
+draw:
+  - frame wall
+  - disk sand at (5, 9) radius 3
+  - line water from (2, 2) to (9, 33) width 2
+  - box cloner rows 2 columns 20:24
+  - clone := water in box rows 2 columns 20:24
+  - velocity := (-1, 4) in disk at (5, 9) radius 2
+"""
 
 BLOCKED = """
 import sys
@@ -41,6 +59,37 @@ PRINTED = [name for name in BACKENDS if name not in ("auto", "reference")]
     ids=" ".join,
 )
 def test_command(arguments: tuple[str, ...]) -> None:
-    ended = subprocess.run([sys.executable, "-c", BLOCKED, *arguments], capture_output=True, text=True)
+    ended = run(*arguments)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", BLOCKED, *arguments], capture_output=True, text=True)
+
+
+def test_worlds_run_and_are_saved_as_with_torch(tmp_path: Path) -> None:
+    """A scene that sets fields, then the saved world; shapes at random, drawn in the terminal."""
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(SCENE)
+    ended = run("run", "powderworld", "--world", str(scene), "--steps", "7", "--out", f"{tmp_path}/first.npz")
+    assert ended.returncode == 0, ended.stderr
+    more = ("--world", f"{tmp_path}/first.npz", "--steps", "5", "--out", f"{tmp_path}/second.npz", "-v")
+    ended = run("run", "powderworld", *more, "--backend", "wasm")
+    assert "wasm on cpu" in ended.stderr
+    sim = powderdsl.compile("powderworld", backend="torch")
+    world = start(sim.ruleset, str(scene), None, None, None, backend="torch")
+    for name, steps in (("first", 7), ("second", 5)):
+        world = sim.step(world, steps)
+        powderdsl.save(world, tmp_path / "expected.npz")
+        assert (tmp_path / f"{name}.npz").read_bytes() == (tmp_path / "expected.npz").read_bytes()
+    drawn = run("run", "powderworld", "--steps", "3", "--size", "9x20", "--seed", "4").stdout
+    ids = sim.step(sim.world(strew(sim.ruleset, (9, 20), 1, 4), seed=4), 3).ids[0]
+    assert drawn.split() == write_ascii(ids, sim.ruleset.elements).split()
+
+
+def test_backends_that_need_torch_say_so() -> None:
+    ended = run("run", "life", "--steps", "1", "--backend", "native")
+    assert ended.returncode == 2
+    assert "PD701" in ended.stderr
+    assert "torch is not installed" in ended.stderr

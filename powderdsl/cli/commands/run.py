@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from powderdsl.cli.output import counted, progress
 
 if TYPE_CHECKING:
     from powderdsl.cli.terminal import LiveView
-    from powderdsl.simulation.simulator import World
+    from powderdsl.simulation.any_arrays import AnyWorld
 
 ANIMATIONS = (".gif", ".mp4")
 SUFFIXES = (".png", *ANIMATIONS, ".npz")
@@ -120,42 +121,44 @@ def command(
         click.echo(_populations(first, last), err=True)
 
 
-def _set_threads(threads: int | None, world: World) -> int:
-    """Set and return how many threads torch uses: `threads`, or one for small batches."""
+def _set_threads(threads: int | None, world: AnyWorld) -> int:
+    """Set and return how many threads torch uses, if it runs: `threads`, or one for small batches."""
+    from powderdsl.simulation.array_worlds import ArrayWorld
+
+    if isinstance(world, ArrayWorld):
+        return 1
     import torch
 
     if threads is not None:
         torch.set_num_threads(threads)
-    elif world.ids.numel() <= SMALL_BATCH:
+    elif prod(world.shape) <= SMALL_BATCH:
         torch.set_num_threads(1)
     return torch.get_num_threads()
 
 
-def _populations(start: World, end: World) -> str:
+def _populations(start: AnyWorld, end: AnyWorld) -> str:
     """How many cells each element has, before and after."""
-    import torch
-
-    before, after = (torch.bincount(w.ids.flatten().long(), minlength=256).tolist() for w in (start, end))
+    cells = [world.sim.kind.to_numpy(world.ids).tobytes() for world in (start, end)]
     elements = start.sim.ruleset.elements
     width = max(len(element.name) for element in elements)
-    rows = [(e.name, before[e.id], after[e.id]) for e in elements if before[e.id] or after[e.id]]
-    return "\n".join(f"  {name:<{width}}  {old:>9,} -> {new:>9,}" for name, old, new in rows)
+    rows = [(element.name, *(ids.count(element.id) for ids in cells)) for element in elements]
+    return "\n".join(f"  {name:<{width}}  {old:>9,} -> {new:>9,}" for name, old, new in rows if old or new)
 
 
-def play(start: World, plan: Playback) -> World:
+def play(start: AnyWorld, plan: Playback) -> AnyWorld:
     """Run to the end; the last world. Nothing half-written stays behind when it is interrupted."""
     from powderdsl.cli.pictures import first_world, pictures
     from powderdsl.cli.terminal import LiveView
 
     ruleset, world = start.sim.ruleset, start
 
-    def stream() -> Iterator[World]:
+    def stream() -> Iterator[AnyWorld]:
         nonlocal world
         for step, world in _worlds(start, plan):
             show(step, world)
             yield world
 
-    def picture(world: World) -> Any:
+    def picture(world: AnyWorld) -> Any:
         return pictures(world, most=MOST_PICTURES, factor=plan.scale)
 
     with ExitStack() as stack:
@@ -164,7 +167,7 @@ def play(start: World, plan: Playback) -> World:
         else:
             bar = stack.enter_context(progress(ruleset.name, plan.steps))
 
-            def show(step: int, world: World) -> None:
+            def show(step: int, world: AnyWorld) -> None:
                 bar(step)
 
         if plan.out is not None and plan.suffix in ANIMATIONS:
@@ -191,7 +194,7 @@ def play(start: World, plan: Playback) -> World:
     return world
 
 
-def _worlds(world: World, plan: Playback) -> Iterator[tuple[int, World]]:
+def _worlds(world: AnyWorld, plan: Playback) -> Iterator[tuple[int, AnyWorld]]:
     """The world each time it is shown, after the number of steps that it has made."""
     # Where nobody looks in between, short calls still let progress be shown and Ctrl-C be heard.
     looking = plan.watch or plan.suffix in ANIMATIONS
@@ -205,13 +208,13 @@ def _worlds(world: World, plan: Playback) -> Iterator[tuple[int, World]]:
         yield done, world
 
 
-def _watcher(view: LiveView, plan: Playback) -> Callable[[int, World], None]:
+def _watcher(view: LiveView, plan: Playback) -> Callable[[int, AnyWorld], None]:
     """A function that shows a world, no faster than the frame rate on a terminal."""
     from powderdsl.cli.pictures import first_world
 
     due = time.perf_counter()
 
-    def show(step: int, world: World) -> None:
+    def show(step: int, world: AnyWorld) -> None:
         nonlocal due
         caption = f"{world.sim.ruleset.name}  step {step} of {plan.steps}"
         view.show(**first_world(world), caption=caption)

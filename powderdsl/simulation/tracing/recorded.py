@@ -24,8 +24,8 @@ from powderdsl.model.types import (
     Swap,
     Transform,
 )
+from powderdsl.simulation.any_arrays import AnyWorld
 from powderdsl.simulation.provenance import NumberedRule, numbered_rules
-from powderdsl.simulation.simulator import World
 
 Cell = tuple[int, int]
 """(row, column)."""
@@ -84,13 +84,14 @@ class RecordedStep:
     substeps: list[RecordedSubstep] = field(default_factory=list)
 
 
-def record_step(world: World, number: int = 0) -> RecordedStep:
+def record_step(world: AnyWorld, number: int = 0) -> RecordedStep:
     """The next step of one world of a batch, with default parameters, recorded."""
     one = world.select([number])
     ruleset = world.sim.ruleset
     table = {slot.name: slot for slot in slots(ruleset)}
-    state = {name: value.cpu().numpy() for name, value in one.state.items()}
-    clock = reference.Clock(*(part.cpu().numpy() for part in (one.seed, one.index, one.step)))
+    to_numpy = world.sim.kind.to_numpy
+    state = {name: to_numpy(value) for name, value in one.state.items()}
+    clock = reference.Clock(*(to_numpy(part) for part in (one.seed, one.index, one.step)))
     step = RecordedStep(reference.widened(ruleset, state))
     rules = iter(numbered_rules(ruleset))
     lets: dict[str, tuple[Let, reference.Context]] = {}

@@ -15,8 +15,8 @@ from powderdsl.model.expressions.operands import look
 from powderdsl.model.state import Slot, scratch_slots, slot_name
 from powderdsl.model.text import element_name, show_expr, show_offset, show_value
 from powderdsl.model.types import ELEMENT, FLAG, Expr, Kind, Offset, Rule, Ruleset
+from powderdsl.simulation.any_arrays import AnyWorld
 from powderdsl.simulation.provenance import NumberedRule
-from powderdsl.simulation.simulator import World
 from powderdsl.simulation.tracing.recorded import (
     Cell,
     RecordedStep,
@@ -134,7 +134,7 @@ class Trace:
 
 
 def trace(
-    world: World,
+    world: AnyWorld,
     row: int,
     column: int,
     step: int = 1,
@@ -186,7 +186,7 @@ def trace(
     )
 
 
-def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
+def _slots(world: AnyWorld, names: Iterable[str] | None) -> list[Slot]:
     """The slots of some names, or all of the state. Raises KeyError."""
     known = {slot.name: slot for slot in world.sim.slots}
     if names is None:

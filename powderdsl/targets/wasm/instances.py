@@ -8,7 +8,6 @@ from threading import RLock
 from typing import Any
 
 from powderdsl.ir.ops import Program
-from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job
@@ -24,17 +23,9 @@ class Loaded:
     """A module for grids of one width, ready to be instantiated, and its numbers."""
 
     def __init__(
-        self,
-        host: Host,
-        kind: ArrayKind,
-        program: Program,
-        planes: Program,
-        width: int,
-        *,
-        apart: bool,
-        memo: Memo | None = None,
+        self, host: Host, kind: ArrayKind, program: Program, planes: Program, width: int, *, apart: bool
     ):
-        made = wasm_module(planes, width, apart=apart, memo=memo)
+        made = wasm_module(planes, width, apart=apart)
         self.host, self.kind, self.module = host, kind, host.compile(made.code)
         self.layout, self.pieces = made.layout, pieces(program)
         self.passes = tuple(one.name for one in planes.passes)

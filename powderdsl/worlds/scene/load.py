@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.fields.words import WordProblem, read_word
 from powderdsl.model.state import Slot, slot_name, slots
