@@ -10,6 +10,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.analysis.outgrown import with_outgrown
-from powderdsl.diagnostics import Label, Reporter, Severity, Source, Span, suggest
+from powderdsl.diagnostics import CompileError, Label, Reporter, Severity, Source, Span, suggest
 from powderdsl.model.check import check
 from powderdsl.model.composition.compose import compose
 from powderdsl.model.composition.layout import own_slots
@@ -25,16 +26,19 @@ from powderdsl.model.composition.optional_names import words_of_tree
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.packs import read_file
-from powderdsl.model.types import Kind, Param, Ruleset, Value
+from powderdsl.model.parameter_values import set_params
+from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.system.memo import Memo
 from powderdsl.system.memory import collection_paused
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
-    from powderdsl.ir.ops import Program
+    from powderdsl.ir.ops import PassGraph, Program
+    from powderdsl.ir.segments import Segment
 
 BACKENDS = {
     "auto": "`wasm` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
@@ -137,7 +141,10 @@ def shipped_tests() -> list[str]:
 
 
 def load(
-    *names: str | Path, params: Mapping[str, Any] | None = None, palette: Palette | None = None
+    *names: str | Path,
+    params: Mapping[str, Any] | None = None,
+    palette: Palette | None = None,
+    memo: Memo | None = None,
 ) -> Ruleset:
     """Read rule files into a checked model.
 
@@ -147,20 +154,24 @@ def load(
         params: other values for parameters, by qualified name: ``{"pack.param": 0.05}``.
         palette: ids that were recorded, such as a model's: the qualified name of the element of each id, or None.
             Elements that it does not have get its free ids, then those after its end.
+        memo: where files that have not changed since are not parsed again.
 
     Raises:
         CompileError: with everything that is wrong in the files.
     """
-    ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette)
+    ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette, memo=memo)
     return ruleset
 
 
 def load_with_diagnostics(
-    *names: str | Path, params: Mapping[str, Any] | None = None, palette: Palette | None = None
+    *names: str | Path,
+    params: Mapping[str, Any] | None = None,
+    palette: Palette | None = None,
+    memo: Memo | None = None,
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
     """Like `load`; the second value has the warnings and notes."""
     reporter = Reporter()
-    packs, ruleset = read(names, reporter)
+    packs, ruleset = read(names, reporter, memo)
     reporter.raise_if_errors()
     model = check(packs, ruleset, reporter, palette, _shipped_words)
     if params:
@@ -191,9 +202,11 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
     )
 
 
-def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl], RulesetDecl | None]:
+def read(
+    names: Sequence[str | Path], reporter: Reporter, memo: Memo | None = None
+) -> tuple[list[PackDecl], RulesetDecl | None]:
     """Declarations of everything named, each pack once, in the order of first mention."""
-    reader = _Reader(reporter)
+    reader = _Reader(reporter, memo)
     packs, rulesets = reader.packs, reader.rulesets
     left_out: dict[str, None] = {}
     for name in names:
@@ -213,7 +226,7 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
     *beside, last = rulesets
     loaded = {pack.name.text for pack in kept}
     gone = [name for one in last.lineage for name in one.members if name not in loaded]
-    spare = packs | _left_out_by(last, reporter)
+    spare = packs | _left_out_by(last, reporter, memo)
     reserved = tuple(spare[name] for name in dict.fromkeys(gone) if name in spare)
     return kept, replace(last, beside=tuple(beside), left_out=reserved)
 
@@ -282,24 +295,38 @@ def _is_there(text: str) -> bool:
         return False
 
 
-def _declaration(path: Path | None, reporter: Reporter) -> PackDecl | RulesetDecl | None:
-    source = read_source(path, reporter) if path else None
-    return read_file(source, reporter) if source else None
+def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Diagnostic, ...]]:
+    """The declaration of a file, and what is to be said about it."""
+    reporter = Reporter()
+    with suppress(CompileError):  # more errors than are reported
+        return read_file(source, reporter), reporter.diagnostics
+    return None, reporter.diagnostics
 
 
 class _Reader:
     """Declarations that have been read: each pack and ruleset once, in the order of first mention."""
 
-    def __init__(self, reporter: Reporter):
-        self.reporter = reporter
+    def __init__(self, reporter: Reporter, memo: Memo | None):
+        self.reporter, self.memo = reporter, memo
         self.packs: dict[str, PackDecl] = {}
         self.rulesets: list[RulesetDecl] = []
+
+    def declaration(self, path: Path | None) -> PackDecl | RulesetDecl | None:
+        """The declaration in a file."""
+        source = read_source(path, self.reporter) if path else None
+        if source is None:
+            return None
+        memo = Memo(1) if self.memo is None else self.memo
+        decl, found = memo.of(("declaration", source), lambda: _read_apart(source))
+        for one in found:
+            self.reporter.add(one)
+        return decl
 
     def read(self, word: str, lister: RulesetDecl | None = None) -> None:
         """Read what a word names; `lister` is the ruleset that lists it."""
         if word in self.packs:
             return
-        decl = _declaration(_find(word, self.reporter, lister), self.reporter)
+        decl = self.declaration(_find(word, self.reporter, lister))
         if isinstance(decl, PackDecl):
             name = decl.name
             other = self.packs.setdefault(name.text, decl)
@@ -316,7 +343,7 @@ class _Reader:
 
     def read_ruleset(self, written: RulesetDecl) -> None:
         """A ruleset with what it inherits, and its packs: each is looked for beside the file that lists it."""
-        found = _with_base(written, (written,), self.reporter)
+        found = _with_base(written, (written,), self)
         if found is None or any(one.source.name == found.source.name for one in self.rulesets):
             return
         self.rulesets.append(found)
@@ -326,9 +353,9 @@ class _Reader:
             self.read(name, lister)
 
 
-def _left_out_by(ruleset: RulesetDecl, reporter: Reporter) -> dict[str, PackDecl]:
+def _left_out_by(ruleset: RulesetDecl, reporter: Reporter, memo: Memo | None) -> dict[str, PackDecl]:
     """The packs that rulesets leave out of those that they extend: the ids of their elements stay reserved."""
-    reader = _Reader(reporter)
+    reader = _Reader(reporter, memo)
     for one in ruleset.lineage:
         for scalar in one.without:
             lister = one.base.lister(scalar.text) if one.base else None
@@ -337,12 +364,13 @@ def _left_out_by(ruleset: RulesetDecl, reporter: Reporter) -> dict[str, PackDecl
     return reader.packs
 
 
-def _with_base(decl: RulesetDecl, path: tuple[RulesetDecl, ...], reporter: Reporter) -> RulesetDecl | None:
+def _with_base(decl: RulesetDecl, path: tuple[RulesetDecl, ...], reader: _Reader) -> RulesetDecl | None:
     """The ruleset with the one that it extends; `path` leads from the first one to this one."""
+    reporter = reader.reporter
     if decl.extends is None:
         return decl
     span, name = decl.extends.span, decl.extends.text
-    base = _declaration(_find_beside(name, reporter, decl, span), reporter)
+    base = reader.declaration(_find_beside(name, reporter, decl, span))
     if base is None:
         return None
     if isinstance(base, PackDecl):
@@ -367,7 +395,7 @@ def _with_base(decl: RulesetDecl, path: tuple[RulesetDecl, ...], reporter: Repor
             helps=["list packs instead of extending"],
         )  # fmt: skip
         return None
-    whole = _with_base(base, (*path, base), reporter)
+    whole = _with_base(base, (*path, base), reader)
     if whole is None:
         return None
     for scalar in decl.without:
@@ -427,61 +455,33 @@ def _report_unknown(word: str, span: Span | None, reporter: Reporter, notes: Seq
     reporter.error("PD304", f"no pack or ruleset `{word}`", span, label, notes=notes, helps=helps)
 
 
-def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) -> Ruleset:
-    """The ruleset with other parameter values, checked against their kinds."""
-    if not isinstance(values, Mapping):
-        raise TypeError(f"params takes a mapping from names to values, found {type(values).__name__}")
-    known = {param.name: param for param in ruleset.params}
-    found: dict[str, Value] = {}
-    for name, value in values.items():
-        if name not in known:
-            names = ", ".join(sorted(known)) or "none"
-            helps = suggest(name, known, "parameters") or (f"parameters: {names}",)
-            reporter.error("PD309", f"unknown parameter `{name}`", None, helps=helps)
-            continue
-        try:
-            found[name] = param_value(known[name], value)
-        except ValueError as error:
-            notes = [f"it is {_kind_in_words(known[name].kind)}"]
-            reporter.error("PD402", f"parameter `{name}`: {error}", None, notes=notes)
-    return ruleset.with_params(found)
-
-
-def _kind_in_words(kind: Kind) -> str:
-    if kind.name == "chance":
-        return "a chance: write a percentage from 0% to 100%, or a number from 0 to 1"
-    if kind.name == "flag":
-        return "a flag: write yes or no"
-    return f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
-
-
-def param_value(param: Param, value: Any) -> Value:
-    """A value for a parameter from text (``"5%"``, ``"yes"``) or a number. Raises ValueError."""
-    text = value.strip() if isinstance(value, str) else None
-    flags = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
-    try:
-        if text is not None and text.endswith("%"):
-            number = float(text[:-1]) / 100
-        else:
-            number = float(value if text is None else flags.get(text, text))
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{repr(value) if text is None else f'`{text}`'} is not a number") from None
-    kind = param.kind.name
-    lo, hi = (0.0, 1.0) if kind in ("chance", "flag") else (param.kind.lo, param.kind.hi)
-    if not lo <= number <= hi:
-        bounds = "0%..100%" if kind == "chance" else f"{lo:g}..{hi:g}"
-        raise ValueError(f"{text or format(number, 'g')} lies outside {bounds}")
-    if kind not in ("int", "flag"):
-        return number
-    if number != int(number):
-        raise ValueError(f"{number:g} is not an integer")
-    return int(number)
-
-
 @collection_paused()
-def lower(ruleset: Ruleset) -> Program:
-    """The checked model as optimized IR."""
+def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
+    """The checked model as optimized IR. With a memo, only passes that have changed go through the stages."""
     from powderdsl.ir.lower.rules import lower_ruleset
     from powderdsl.ir.stages import run_passes
+    from powderdsl.ir.structure import structure
 
-    return run_passes(lower_ruleset(ruleset))
+    program = lower_ruleset(ruleset)
+    if memo is None:
+        return run_passes(program)
+
+    def optimized(pass_: PassGraph) -> PassGraph:
+        key = "optimized", program.slots, structure(pass_)
+        (made,) = memo.of(key, lambda: run_passes(replace(program, passes=(pass_,))).passes)
+        return made
+
+    return replace(program, passes=tuple(map(optimized, program.passes)))
+
+
+def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:
+    """Optimized IR in segments, on bit planes where they can carry it."""
+    from powderdsl.ir.segments import Carried, carry, segments
+    from powderdsl.ir.structure import structure
+
+    def carried(whole: Program, pass_: PassGraph) -> Carried:
+        if memo is None:
+            return carry(whole, pass_)
+        return memo.of(("planes", whole.slots, structure(pass_)), lambda: carry(whole, pass_))
+
+    return segments(program, carried)

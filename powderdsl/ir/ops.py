@@ -255,14 +255,16 @@ def ordered(roots: Iterable[Node], known: Container[int] = ()) -> list[Node]:
     """All nodes that some nodes need, arguments before their users, in a stable order; those `known` by id left out."""
     seen: dict[int, Node] = {}
     for root in roots:
-        stack = [(root, False)]
+        stack = [root] if id(root) not in known else []
         while stack:
-            node, ready = stack.pop()
-            if ready:
-                seen.setdefault(id(node), node)
-            elif id(node) not in seen and id(node) not in known:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
+            node = stack[-1]
+            for arg in node.args:
+                if id(arg) not in seen and id(arg) not in known:
+                    stack.append(arg)
+                    break
+            else:
+                seen[id(node)] = node
+                stack.pop()
     return list(seen.values())
 
 

@@ -459,6 +459,6 @@ class Ruleset:
                 yield pass_, moment
 
     def with_params(self, values: dict[str, Value]) -> Ruleset:
-        """The same ruleset with other defaults; the values are checked by `compiler.set_params`."""
+        """The same ruleset with other defaults; the values are checked by `parameter_values.set_params`."""
         params = tuple(replace(p, default=values.get(p.name, p.default)) for p in self.params)
         return replace(self, params=params)

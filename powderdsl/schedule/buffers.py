@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -20,7 +20,6 @@ from powderdsl.schedule.types import (
     Statement,
     Var,
     load,
-    ordered,
     values_of,
 )
 

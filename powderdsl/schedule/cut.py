@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Literal
 
-from powderdsl.ir.ops import FLAG, REAL, Node, Offset, walk
+from powderdsl.ir.ops import FLAG, REAL, Node, Offset, ordered, walk
 from powderdsl.schedule.costs import (
     ARITHMETIC,
     LOGIC,
@@ -39,7 +39,6 @@ from powderdsl.schedule.types import (
     flat,
     load,
     loaded,
-    ordered,
     values_of,
 )
 

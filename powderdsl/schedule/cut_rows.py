@@ -78,9 +78,8 @@ def chain_of(node: Node, have: Have) -> list[Node]:
         node = node.args[2]
     if len(chain) < FEWEST or node.op in UNIFORM:  # a value that is the same in all cells has no field
         return []
-    for (
-        choice
-    ) in chain:  # a choice may build on the one below it, which the row still holds, not on those before
+    # A choice may build on the one below it, which the row still holds, not on those before.
+    for choice in chain:
         seen = {id(choice.args[2])}
         stack = [choice.args[1]]
         while stack:
@@ -88,8 +87,9 @@ def chain_of(node: Node, have: Have) -> list[Node]:
             if id(part) in seen or have(part):
                 continue
             seen.add(id(part))
-            reads = any(inner is choice.args[2] for inner in walk(part))
-            if part.op in ("select", "draw") or (part.op == "shift" and reads):
+            if part.op in ("select", "draw"):
+                return []
+            if part.op == "shift" and any(inner is choice.args[2] for inner in walk(part)):
                 return []
             stack.extend(part.args)
     return chain

@@ -4,16 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, Graph, Node
+from powderdsl.ir.ops import FLAG, Graph, Node, ordered
 from powderdsl.schedule.rewrite import map_values
-from powderdsl.schedule.types import (
-    Compute,
-    Schedule,
-    combined,
-    map_computes,
-    ordered,
-    with_args,
-)
+from powderdsl.schedule.types import Compute, Schedule, combined, map_computes, with_args
 
 FEW_BITS = 2
 """Draws of at most this many bits are made unconditionally."""

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from powderdsl.ir.ops import FLAG, Node
+from powderdsl.ir.ops import FLAG, Node, ordered
 from powderdsl.schedule.costs import LOGIC
 from powderdsl.schedule.draws import DRAWS
 from powderdsl.schedule.floats import is_comparison
@@ -26,7 +26,6 @@ from powderdsl.schedule.types import (
     load,
     loaded,
     map_computes,
-    ordered,
     values_of,
     with_args,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, Graph, Node
+from powderdsl.ir.ops import FLAG, Graph, Node, ordered
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -15,7 +15,6 @@ from powderdsl.schedule.types import (
     conjuncts,
     in_order,
     map_computes,
-    ordered,
 )
 
 MAX_CONDITIONS = 4

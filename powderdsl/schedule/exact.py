@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from powderdsl.ir.ops import REAL, SNAP, Node
+from powderdsl.ir.ops import REAL, SNAP, Node, ordered
 from powderdsl.schedule.rewrite import map_values
-from powderdsl.schedule.types import Compute, Guard, Schedule, Statement, ordered
+from powderdsl.schedule.types import Compute, Guard, Schedule, Statement
 
 DIGITS = 23
 """Binary places of a float32 after the first."""

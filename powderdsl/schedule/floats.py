@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
 from powderdsl.schedule.rewrite import Rule, map_values, with_values
 from powderdsl.schedule.types import (
     Compute,
@@ -17,7 +17,6 @@ from powderdsl.schedule.types import (
     conjuncts,
     flat,
     load,
-    ordered,
     rewritten,
     values_of,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
 from powderdsl.schedule.types import (
     Compute,
     Out,
@@ -15,7 +15,6 @@ from powderdsl.schedule.types import (
     flat,
     loaded,
     map_blocks,
-    ordered,
     over_variables,
     values_of,
 )

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node
+from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered
 from powderdsl.ir.single import single
 from powderdsl.schedule.types import (
     ANSWER,
@@ -19,7 +19,6 @@ from powderdsl.schedule.types import (
     combined,
     load,
     map_computes,
-    ordered,
     rewritten,
 )
 

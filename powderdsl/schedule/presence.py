@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import or_
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
 from powderdsl.schedule.narrow import unchanged
 from powderdsl.schedule.types import (
     ANSWER,
@@ -18,7 +18,6 @@ from powderdsl.schedule.types import (
     Statement,
     combined,
     flat,
-    ordered,
     values_of,
 )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
-from powderdsl.ir.ops import Node
+from powderdsl.ir.ops import Node, ordered
 from powderdsl.ir.text import attr_text
 from powderdsl.schedule.types import (
     Compute,
@@ -21,7 +21,6 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     Sync,
-    ordered,
     values_of,
 )
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, walk
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered, walk
 
 ANSWER = Type("answer")
 """One truth value for all cells, such as whether a flag is set anywhere."""
@@ -166,32 +166,16 @@ def loaded(nodes: Iterable[Node]) -> Iterator[str]:
                 yield str(inner.attr)
 
 
-def ordered(roots: Iterable[Node]) -> list[Node]:
-    """All nodes of some values, arguments before their users, in a stable order."""
-    seen: dict[int, Node] = {}
-    for root in roots:
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if ready:
-                seen.setdefault(id(node), node)
-            elif id(node) not in seen:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-    return list(seen.values())
-
-
 def with_args(node: Node, args: tuple[Node, ...], graph: Graph) -> Node:
     """The same operation on other arguments."""
-    same = len(args) == len(node.args) and all(a is b for a, b in zip(args, node.args, strict=True))
-    return node if same else graph.node(node.op, node.type, args, node.attr, node.places)
+    return node if args == node.args else graph.node(node.op, node.type, args, node.attr, node.places)
 
 
 def rewritten(roots: Iterable[Node], graph: Graph, rule: Callable[[Node], Node | None]) -> dict[int, Node]:
     """Values rebuilt bottom-up, by the id of the old node. `rule` maps nodes that have their new arguments already."""
     done: dict[int, Node] = {}
     for node in ordered(roots):
-        new = with_args(node, tuple(done[id(arg)] for arg in node.args), graph)
+        new = with_args(node, tuple([done[id(arg)] for arg in node.args]), graph)
         done[id(node)] = rule(new) or new
     return done
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, Graph, Node
+from powderdsl.ir.ops import FLAG, Graph, Node, ordered
 from powderdsl.schedule.release import made_in, reads
 from powderdsl.schedule.types import (
     Compute,
@@ -16,7 +16,6 @@ from powderdsl.schedule.types import (
     combined,
     loaded,
     map_blocks,
-    ordered,
     rewritten,
 )
 

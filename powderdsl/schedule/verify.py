@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from powderdsl.ir.ops import FLAG, OPS, Node, Type
+from powderdsl.ir.ops import FLAG, OPS, Node, Type, ordered
 from powderdsl.ir.verify import InvalidIR
 from powderdsl.schedule.join import field_reads
 from powderdsl.schedule.types import (
@@ -20,7 +20,6 @@ from powderdsl.schedule.types import (
     defined_by,
     in_order,
     loaded,
-    ordered,
     values_of,
 )
 from powderdsl.schedule.updates import read_elsewhere

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from powderdsl.compiler import lower
+from powderdsl.compiler import lower, parts
 from powderdsl.ir.ops import Program
-from powderdsl.ir.segments import Segment, segments
+from powderdsl.ir.segments import Segment
 from powderdsl.model.state import property_dtype, slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld
 from powderdsl.simulation.reference_program import ReferenceProgram
 from powderdsl.simulation.state_checks import unknown_slot
+from powderdsl.system.memo import Memo
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.array_kind import Array, PlainArrays
 from powderdsl.targets.job import Job, Runnable
@@ -43,17 +44,18 @@ class ArraySimulator(AnySimulator[ArrayWorld]):
 
     Args:
         backend: ``wasm`` or ``reference``.
+        memo: where passes are kept that other rulesets may have, too.
     """
 
     world_type = ArrayWorld
     device = "cpu"
     notes: tuple[str, ...] = ()
 
-    def __init__(self, ruleset: Ruleset, backend: str = "wasm"):
+    def __init__(self, ruleset: Ruleset, backend: str = "wasm", memo: Memo | None = None):
         super().__init__(ruleset, PlainArrays())
         self.backend = self.running = backend
         self._program = (
-            ReferenceProgram(ruleset, self.kind) if backend == "reference" else WholeOrParts(ruleset)
+            ReferenceProgram(ruleset, self.kind) if backend == "reference" else WholeOrParts(ruleset, memo)
         )
 
     def of(self, ruleset: Ruleset) -> ArraySimulator:
@@ -72,9 +74,9 @@ def wasm_problem() -> str:
 class WholeOrParts:
     """WebAssembly for whole steps and for chosen passes; the oracle for given draws and for what fits no bit planes."""
 
-    def __init__(self, ruleset: Ruleset):
-        self._ruleset, self._kind = ruleset, PlainArrays()
-        self._lowered = lower(ruleset)  # what cannot be lowered is reported before the first step
+    def __init__(self, ruleset: Ruleset, memo: Memo | None):
+        self._ruleset, self._kind, self._memo = ruleset, PlainArrays(), memo
+        self._lowered = lower(ruleset, memo)  # what cannot be lowered is reported before the first step
         self._oracle = ReferenceProgram(ruleset, self._kind)
         self._made: dict[frozenset[str] | None, Runnable] = {}
 
@@ -92,13 +94,13 @@ class WholeOrParts:
         program = self._lowered
         if chosen is not None:
             program = replace(program, passes=tuple(one for one in program.passes if one.name in chosen))
-        found = segments(program)
-        parts = [self._part(one, first=number == 0) for number, one in enumerate(found)]
-        return parts[0] if len(parts) == 1 else MixedProgram(parts)
+        found = parts(program, self._memo)
+        made = [self._part(one, first=number == 0) for number, one in enumerate(found)]
+        return made[0] if len(made) == 1 else MixedProgram(made)
 
     def _part(self, segment: Segment, *, first: bool) -> Runnable:
         if segment.planes is not None:
-            return WasmProgram(segment.program, segment.planes, self._kind)
+            return WasmProgram(segment.program, segment.planes, self._kind, self._memo)
         return OracleOfPasses(self._ruleset, segment.program, first=first)
 
 

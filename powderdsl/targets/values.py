@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Generic, TypeVar
 
-from powderdsl.ir.ops import Node
-from powderdsl.schedule.types import Compute, ordered
+from powderdsl.ir.ops import Node, ordered
+from powderdsl.schedule.types import Compute
 
 Named = TypeVar("Named")
 """What stands for a value in the text of a target: its name, or its code."""

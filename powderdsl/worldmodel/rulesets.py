@@ -12,11 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import read, set_params, starting_backend
+from powderdsl.compiler import read, starting_backend
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import ElementDecl, PackDecl
+from powderdsl.model.parameter_values import set_params
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.system.random import MASK, base_keys, mix

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Threshold
+from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Threshold, ordered
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -26,7 +26,6 @@ from powderdsl.schedule.types import (
     Sweeps,
     Var,
     defined_by,
-    ordered,
 )
 
 SNAP = np.float32(2.0**-20)

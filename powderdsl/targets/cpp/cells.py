@@ -6,9 +6,9 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from powderdsl.ir.ops import REAL, Node
+from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.schedule.join import field_reads, keeps
-from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, ordered, values_of
+from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, values_of
 from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.values import chains_of

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping
 
-from powderdsl.ir.ops import REAL, Node
+from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.ir.single import all_ones, divided, single
-from powderdsl.schedule.types import Out, ordered
+from powderdsl.schedule.types import Out
 from powderdsl.targets.layout import Layout, literal, param_key
 from powderdsl.targets.values import CellValues
 

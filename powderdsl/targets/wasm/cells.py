@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
-from powderdsl.ir.ops import REAL, SNAP, Node
-from powderdsl.schedule.types import Compute, loaded, ordered
+from powderdsl.ir.ops import REAL, SNAP, Node, ordered
+from powderdsl.schedule.types import Compute, loaded
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.values import CellValues, chains_of
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, floats, load, op, vector

@@ -8,6 +8,7 @@ from threading import RLock
 from typing import Any
 
 from powderdsl.ir.ops import Program
+from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job
@@ -23,9 +24,17 @@ class Loaded:
     """A module for grids of one width, ready to be instantiated, and its numbers."""
 
     def __init__(
-        self, host: Host, kind: ArrayKind, program: Program, planes: Program, width: int, *, apart: bool
+        self,
+        host: Host,
+        kind: ArrayKind,
+        program: Program,
+        planes: Program,
+        width: int,
+        *,
+        apart: bool,
+        memo: Memo | None = None,
     ):
-        made = wasm_module(planes, width, apart=apart)
+        made = wasm_module(planes, width, apart=apart, memo=memo)
         self.host, self.kind, self.module = host, kind, host.compile(made.code)
         self.layout, self.pieces = made.layout, pieces(program)
         self.passes = tuple(one.name for one in planes.passes)

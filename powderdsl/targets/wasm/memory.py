@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from powderdsl.ir.ops import REAL
-from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, ordered, values_of
+from powderdsl.ir.ops import REAL, ordered
+from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, values_of
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.values import chains_of
 

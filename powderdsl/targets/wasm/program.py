@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from powderdsl.ir.ops import Program
+from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.job import Job, shape_of
 from powderdsl.targets.wasm.host import this_host
@@ -18,10 +19,11 @@ class WasmProgram:
         program: the numeric program, whose slots are the state's.
         planes: the same program from `ir.bits.lower_bits`.
         kind: the arrays of its jobs.
+        memo: where the schedules of passes are kept.
     """
 
-    def __init__(self, program: Program, planes: Program, kind: ArrayKind):
-        self._program, self._planes, self._kind = program, planes, kind
+    def __init__(self, program: Program, planes: Program, kind: ArrayKind, memo: Memo | None = None):
+        self._program, self._planes, self._kind, self._memo = program, planes, kind, memo
         self._host = this_host()
         self._modules: dict[tuple[int, bool], Loaded] = {}
 
@@ -29,8 +31,9 @@ class WasmProgram:
         """The module for a width; `apart`: one whose passes can be called one by one."""
         key = (width, apart)
         if key not in self._modules:
-            made = Loaded(self._host, self._kind, self._program, self._planes, width, apart=apart)
-            self._modules[key] = made
+            self._modules[key] = Loaded(
+                self._host, self._kind, self._program, self._planes, width, apart=apart, memo=self._memo
+            )
         return self._modules[key]
 
     def run(self, job: Job) -> Mapping[str, Array]:

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import or_
 
-from powderdsl.ir.ops import Program
+from powderdsl.ir.ops import PassGraph, Program
+from powderdsl.ir.structure import structure
 from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPU, plan
+from powderdsl.schedule.types import Schedule
+from powderdsl.system.memo import Memo
 from powderdsl.system.memory import collection_paused
 from powderdsl.targets.layout import Layout, layout_of
 from powderdsl.targets.wasm.binary import Module
@@ -36,15 +39,18 @@ class WasmModule:
 
 
 @collection_paused()
-def wasm_module(program: Program, width: int, *, apart: bool = False, face: Face | None = None) -> WasmModule:
+def wasm_module(
+    program: Program, width: int, *, apart: bool = False, face: Face | None = None, memo: Memo | None = None
+) -> WasmModule:
     """The module of a program on planes, for grids of this width.
 
     Args:
         apart: passes are exported too, by their numbers.
         face: the module is a world by itself (`standalone`), and exports only what that has.
+        memo: where schedules of passes that have not changed are found.
     """
     layout = layout_of(program)
-    schedules = [plan(pass_, CPU) for pass_ in program.passes]
+    schedules = [_schedule(pass_, memo) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout)
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
@@ -54,3 +60,9 @@ def wasm_module(program: Program, width: int, *, apart: bool = False, face: Face
     if face is not None:
         Standalone(library, face, added).add()
     return WasmModule(module, layout, width)
+
+
+def _schedule(pass_: PassGraph, memo: Memo | None) -> Schedule:
+    if memo is None:
+        return plan(pass_, CPU)
+    return memo.of(("schedule", structure(pass_, places=False)), lambda: plan(pass_, CPU))

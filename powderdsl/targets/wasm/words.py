@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from powderdsl.ir.ops import Node
+from powderdsl.ir.ops import Node, ordered
 from powderdsl.schedule.draws import is_coin
-from powderdsl.schedule.types import Compute, loaded, ordered
+from powderdsl.schedule.types import Compute, loaded
 from powderdsl.schedule.updates import asked
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op

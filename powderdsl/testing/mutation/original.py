@@ -9,13 +9,14 @@ from functools import cached_property
 
 import numpy as np
 
-from powderdsl.compiler import lower, read, set_params, starting_backend
+from powderdsl.compiler import lower, read, starting_backend
 from powderdsl.diagnostics import Diagnostic, Reporter, Severity, Source
 from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.packs import read_file
+from powderdsl.model.parameter_values import set_params
 from powderdsl.model.types import Example, Ruleset
 from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.testing.generators.cases import Start

@@ -1,0 +1,138 @@
+"""Compiling again with a memo: the same results, and only what has changed is made anew."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from powderdsl import compiler
+from powderdsl.compiler import load_with_diagnostics, lower, parts, shipped
+from powderdsl.diagnostics import CompileError
+from powderdsl.ir.ops import PassGraph
+from powderdsl.ir.structure import structure
+from powderdsl.system.memo import Memo
+from powderdsl.targets.wasm import source
+from powderdsl.targets.wasm.source import wasm_module
+
+
+def test_the_least_recently_used_is_forgotten() -> None:
+    memo, made = Memo(2), []
+
+    def use(key: str) -> str:
+        return memo.of(key, lambda: made.append(key) or key.upper())
+
+    assert [use(key) for key in "abacab"] == list("ABACAB")
+    assert made == list("abcb")
+    assert len(memo) == 2
+    with pytest.raises(ValueError, match="at least one"):
+        Memo(0)
+
+
+def test_exceptions_are_not_kept() -> None:
+    memo = Memo()
+
+    def fail() -> None:
+        raise KeyError
+
+    for _ in range(2):
+        with pytest.raises(KeyError):
+            memo.of("key", fail)
+    assert memo.of("key", lambda: 1) == 1
+
+
+def code(path: Path, memo: Memo | None) -> bytes:
+    model, _ = load_with_diagnostics(path, memo=memo)
+    return b"".join(
+        wasm_module(part.planes, 64, memo=memo).code
+        for part in parts(lower(model, memo), memo)
+        if part.planes is not None
+    )
+
+
+@pytest.fixture
+def rules(tmp_path: Path) -> Path:
+    """A ruleset of shipped packs, in a folder where they can be edited."""
+    for path in shipped("rules").glob("*.yaml"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "small.yaml").write_text("ruleset: small\npacks: [core, sand, water, wind]\n")
+    return tmp_path
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How many files are parsed, and how many passes are optimized and planned."""
+    counts: Counter[str] = Counter()
+
+    def count(module: object, name: str) -> None:
+        real: Callable = getattr(module, name)
+
+        def replaced(*args: object) -> object:
+            counts[name] += 1
+            return real(*args)
+
+        monkeypatch.setattr(module, name, replaced)
+
+    count(compiler, "read_file")
+    count(source, "plan")
+    return counts
+
+
+EDITS: tuple[tuple[str, Callable[[str], str]], ...] = (
+    ("water.yaml", lambda text: "# a line above everything\n" + text),
+    ("wind.yaml", lambda text: text.replace("0.95 *", "0.9 *", 1)),
+    ("water.yaml", lambda text: text.replace("count(ice) >= 3", "count(ice) >= 4", 1)),
+)
+
+
+def test_edited_rules_compile_to_the_same_code(rules: Path) -> None:
+    memo, path = Memo(), rules / "small.yaml"
+    assert code(path, memo) == code(path, None)
+    for name, edit in EDITS:
+        file = rules / name
+        before = file.read_text(encoding="utf-8")
+        file.write_text(edit(before), encoding="utf-8")
+        assert file.read_text(encoding="utf-8") != before
+        assert code(path, memo) == code(path, None), name
+
+
+def test_only_what_has_changed_is_made_again(rules: Path, counted: Counter[str]) -> None:
+    memo, path = Memo(), rules / "small.yaml"
+    first = code(path, memo)
+    files, passes = counted["read_file"], counted["plan"]
+    assert files == 5
+    assert passes >= 5
+    assert code(path, memo) == first
+    assert (counted["read_file"], counted["plan"]) == (files, passes)
+    water = rules / "water.yaml"
+    text = water.read_text(encoding="utf-8")
+    water.write_text("# a line above everything\n" + text, encoding="utf-8")
+    assert code(path, memo) == first
+    assert (counted["read_file"], counted["plan"]) == (files + 1, passes), "lines that move change no code"
+    water.write_text(text.replace("count(ice) >= 3", "count(ice) >= 4", 1), encoding="utf-8")
+    assert code(path, memo) != first
+    assert counted["plan"] == passes + 1
+
+
+def test_mistakes_are_reported_each_time(rules: Path) -> None:
+    memo, path = Memo(), rules / "small.yaml"
+    file = rules / "sand.yaml"
+    file.write_text(file.read_text(encoding="utf-8").replace("elements:", "elemments:"), encoding="utf-8")
+    messages = []
+    for kept in (None, memo, memo):
+        with pytest.raises(CompileError) as found:
+            load_with_diagnostics(path, memo=kept)
+        messages.append(str(found.value))
+    assert len(set(messages)) == 1
+    assert "elemments" in messages[0]
+
+
+def test_structure_tells_passes_apart() -> None:
+    def passes(name: str) -> tuple[PassGraph, ...]:
+        return lower(load_with_diagnostics(name)[0]).passes
+
+    once, again = passes("powderworld"), passes("powderworld")
+    assert [structure(one) for one in once] == [structure(one) for one in again]
+    assert len({structure(one, places=False) for one in (*once, *again)}) == len(once)
