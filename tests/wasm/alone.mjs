@@ -1,5 +1,5 @@
 // Runs modules that stand alone, and hashes what they hold. In Node.js: node alone.mjs JOBS.json, a list of
-// {module, cells, fields, seed, steps} with bytes in base64. In a page: `runJobs(jobs)`.
+// {module, cells, fields, clock, params, steps} with bytes in base64. In a page: `runJobs(jobs)`.
 
 export function fnv(bytes) {
   let hash = 0x811c9dc5;
@@ -10,7 +10,7 @@ export function fnv(bytes) {
 const bytesOf = (text) => Uint8Array.from(atob(text), (char) => char.charCodeAt(0));
 const SIZES = { uint8: 1, int8: 1, int16: 2, int32: 4, float32: 4 };
 
-export function runJob({ module, cells, fields, seed, steps }) {
+export function runJob({ module, cells, fields, clock, params, steps }) {
   const compiled = new WebAssembly.Module(bytesOf(module));
   const [section] = WebAssembly.Module.customSections(compiled, "powderdsl");
   const about = JSON.parse(new TextDecoder().decode(section));
@@ -18,7 +18,9 @@ export function runJob({ module, cells, fields, seed, steps }) {
   const count = about.rows * about.columns;
   const bytes = (at, size) => new Uint8Array(world.memory.buffer, at, size);
   bytes(world.cells(), count).set(bytesOf(cells));
-  world.begin(seed);
+  world.begin(0);
+  bytes(world.clock(), 24).set(bytesOf(clock));
+  params.forEach((value, number) => world.parameter(number, value));
   about.fields.forEach((field, number) => {
     if (!(field.name in fields)) return;
     const given = bytesOf(fields[field.name]);

@@ -8,7 +8,7 @@ import shutil
 import struct
 import subprocess
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from powderdsl.model.state import slots
+from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.targets.wasm.host import this_host
+from powderdsl.testing.generators.cases import Start
 
-Arrays = Mapping[str, np.ndarray]
 JOBS = Path(__file__).with_name("alone.mjs")
 
 PAGE = """<!doctype html><meta charset="utf-8"><pre id="out">none</pre>
@@ -87,15 +87,23 @@ def fnv(data: bytes) -> int:
     return found
 
 
-def job(ruleset: Ruleset, ids: np.ndarray, fields: Arrays, seed: int, steps: int) -> dict[str, Any]:
-    """A world, ids [H, W], for hosts in JavaScript."""
+def job(ruleset: Ruleset, start: Start, steps: int) -> dict[str, Any]:
+    """One world for hosts in JavaScript."""
+    (ids,), clock = start.ids, np.stack([start.seed, start.index, start.step]).astype(np.int64)
     return {
         "module": text(standalone_module(ruleset, ids.shape)),
-        "cells": text(ids.astype(np.uint8).tobytes()),
-        "fields": {name: text(np.ascontiguousarray(value).tobytes()) for name, value in fields.items()},
-        "seed": seed,
+        "cells": text(ids.tobytes()),
+        "fields": {
+            slot.name: text(_stored(slot, start)) for slot in slots(ruleset)[1:] if slot.name in start.fields
+        },
+        "clock": text(clock.tobytes()),
+        "params": [float(start.params[one.name][0]) for one in ruleset.params if start.params],
         "steps": steps,
     }
+
+
+def _stored(slot: Slot, start: Start) -> bytes:
+    return np.ascontiguousarray(start.fields[slot.name][0].astype(slot.dtype)).tobytes()
 
 
 def text(data: bytes) -> str:

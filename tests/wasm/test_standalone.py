@@ -13,15 +13,19 @@ import wasmtime
 import powderdsl
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError
+from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.simulation.standalone import standalone_module
-from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.cli.commands import powderdsl as command
+from tests.compilers import skip_without_compiler
 from tests.semantics.test_long_runs import RULESETS
 from tests.semantics.test_mixed import spread
+from tests.tiers import tiered
 from tests.wasm.standalone_world import (
     StandaloneWorld,
     chromium,
@@ -199,19 +203,58 @@ def hosts() -> list[Any]:
     ]
 
 
-@pytest.mark.parametrize("host", hosts())
-def test_hosts_give_the_same_worlds(host: Any, tmp_path: Path) -> None:
-    """Every shipped ruleset, 200 steps: ids, fields and velocity as native code and the reference have them."""
+def same_in(
+    host: Any, cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, backends: list[str]
+) -> None:
+    """Worlds in JavaScript are those of the backends: ids, fields and velocity, by hash."""
     jobs, expected = [], []
+    for ruleset, start in cases:
+        jobs.append(job(ruleset, start, steps))
+        found = []
+        for backend in backends:
+            skip_without_compiler(backend)
+            sim = compile_ruleset(ruleset, backend=backend)
+            later = sim.step(start.world(sim), steps, params=dict(start.params) or None)
+            found.append({slot: fnv(value[0].numpy().tobytes()) for slot, value in later.state.items()})
+        assert found == found[:1] * len(found)
+        expected.append(found[0])
+    assert [one["hashes"] for one in host(jobs, folder)] == expected
+
+
+@pytest.mark.parametrize("host", hosts())
+def test_shipped_rulesets(host: Any, tmp_path: Path) -> None:
+    """200 steps of each, as native code has them; the campaign asks the reference, too."""
+    same_in(host, shipped_cases(), 200, tmp_path, ["native"])
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("host", hosts())
+def test_shipped_rulesets_everywhere(host: Any, tmp_path: Path) -> None:
+    same_in(host, shipped_cases(), 200, tmp_path, ["reference", "torch", "native", "wasm"])
+
+
+def shipped_cases() -> list[tuple[Ruleset, Start]]:
+    cases = []
     for number, name in enumerate(RULESETS):
         ruleset = load(name)
-        _, world, state = states(ruleset, SIZES[number % 2], number)
-        fields = {slot: values for slot, values in state.items() if slot != "element"}
-        jobs.append(job(ruleset, state["element"], fields, 7, 200))
-        sim = compile_ruleset(ruleset, backend="auto")
-        later = sim.step(World(sim, world.state, world.seed, world.index, world.step), 200)
-        expected.append({slot: fnv(value[0].numpy().tobytes()) for slot, value in later.state.items()})
-    assert [one["hashes"] for one in host(jobs, tmp_path)] == expected
+        cases.append((ruleset, random_start(ruleset, Choices.seeded(number), (1, *SIZES[number % 2]))))
+    return cases
+
+
+@pytest.mark.parametrize("host", hosts())
+@pytest.mark.parametrize("seeds", tiered([range(3), range(3, 60)], [range(3)]))
+def test_random_rulesets(host: Any, seeds: range, tmp_path: Path) -> None:
+    cases = []
+    for seed in seeds:
+        try:
+            ruleset = load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
+            size = tuple(fitting(ruleset, side) for side in (8, 70))
+            standalone_module(ruleset, (size[0], size[1]))
+            cases.append((ruleset, random_start(ruleset, Choices.seeded(seed), (1, *size))))
+        except CompileError:  # refused, or too large for planes
+            continue
+    assert len(cases) >= 0.6 * len(seeds)
+    same_in(host, cases, 5, tmp_path, ["torch"])
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium")
