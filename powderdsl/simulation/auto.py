@@ -51,6 +51,10 @@ class Build:
             self.problem = f"{type(error).__name__}: {error}"
         self._took = time.perf_counter() - self._began
 
+    def wait(self) -> None:
+        """Return when the build has ended."""
+        self._thread.join()
+
     @property
     def seconds(self) -> float:
         """How long the build took, or has taken so far."""
@@ -137,13 +141,24 @@ class AutoProgram:
                 return native.run(part)
             count = self._slice(cells, job.steps - done)
             began = time.perf_counter()
-            state = self._first().run(part._replace(steps=count))
+            try:
+                state = self._first().run(part._replace(steps=count))
+            except MemoryError:
+                return self._large(part)
             done += count
             later = clock._replace(since=clock.since + done)
             part = part._replace(state=state, clock=later, steps=job.steps - done)
             self._account(cells, count, job.steps - done, time.perf_counter() - began)
             if done == job.steps:
                 return state
+
+    def _large(self, job: Job) -> Mapping[str, Tensor]:
+        """Worlds that do not fit into WebAssembly's memory: native code is waited for, without a compiler torch runs."""
+        self._begin()
+        if self._build is not None:
+            self._build.wait()
+        self._steps["native"] += job.steps
+        return (self._arrived() or self._asked()).run(job)
 
     def _slice(self, cells: int, left: int) -> int:
         """The number of steps to run on the first backend before the next check: one until their speed is known."""

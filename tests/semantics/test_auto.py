@@ -149,6 +149,26 @@ def test_many_short_calls_are_worth_it_together(monkeypatch: pytest.MonkeyPatch)
     assert waited(lambda: program.running == "native")
 
 
+class Full(Counter):
+    def run(self, job: Job) -> Mapping[str, Any]:
+        raise MemoryError
+
+
+def test_worlds_too_large_for_webassembly_wait_for_native_code() -> None:
+    log: list[tuple[str, int, int]] = []
+    first, torch_ = ("wasm", lambda: Full("wasm")), lambda: Counter("torch", 0, log)
+    program = AutoProgram(first, torch_, lambda: None, lambda: Counter("native", 0, log))
+    program.run(job(3))
+    program.run(job(4, 3))
+    assert log == [("native", 0, 3), ("native", 3, 4)]
+
+    def fails() -> Counter:
+        raise NoCompiler("no C++ compiler")
+
+    AutoProgram(first, torch_, lambda: None, fails).run(job(5, 7))
+    assert log[2:] == [("torch", 7, 5)]
+
+
 def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
     log: list[tuple[str, int, int]] = []
     program = AutoProgram(

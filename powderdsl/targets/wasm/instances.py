@@ -16,6 +16,9 @@ from powderdsl.targets.profiling import PassClock
 from powderdsl.targets.wasm.host import Host
 from powderdsl.targets.wasm.source import wasm_module
 
+ROOM = 1 << 30
+"""Bytes of memory from which an instance takes no new batches. What it has can be stepped and read: there is as much again."""
+
 Like = Mapping[str, tuple[Any, tuple[int, ...]]]
 """The dtype and shape of each array of a state."""
 
@@ -41,15 +44,22 @@ class Loaded:
         self._instances: dict[tuple[int, bool], Instance] = {}
 
     def instance(self, worlds: int, rows: int) -> Instance:
-        """The instance for a shape. Whether lanes are strips depends on the rows and on whether there is one world."""
+        """The instance for new batches of a shape: another one when the memory of the last is full.
+
+        Whether lanes are strips depends on the rows and on whether there is one world.
+        """
         key = (rows, worlds == 1)
-        if key not in self._instances:
-            self._instances[key] = Instance(self)
-        return self._instances[key]
+        found = self._instances.get(key)
+        if found is None or found.running.memory_size() > ROOM:
+            found = self._instances[key] = Instance(self)
+        return found
 
 
 class Instance:
-    """An instance of a module, for worlds of one number of rows. As a context, it lets one thread call functions."""
+    """An instance of a module, for worlds of one number of rows. As a context, it lets one thread call functions.
+
+    Its memory goes when no batch in it is used any more.
+    """
 
     def __init__(self, loaded: Loaded):
         self.loaded, self.kind = loaded, loaded.kind

@@ -42,7 +42,11 @@ class WasmProgram:
         assert job.passes is None
         state = job.state
         worlds, rows, width = shape_of(state)
-        instance = self.loaded(width, apart=job.timing is not None).instance(worlds, rows)
+        loaded = self.loaded(width, apart=job.timing is not None)
+        if isinstance(state, WasmState) and state.instance.loaded is loaded and job.reuse:
+            instance = state.instance
+        else:
+            instance = loaded.instance(worlds, rows)
         if isinstance(state, WasmState) and state.instance is not instance:
             state = dict(state)
         with instance as call:

@@ -21,8 +21,8 @@ from powderdsl.targets.wasm.memory import Memory, extent_of
 from powderdsl.targets.wasm.passes import pass_function
 from powderdsl.targets.wasm.standalone import Face, Standalone
 
-PAGES = 1 << 14
-"""The most pages of 64 KiB that a module's memory has: 1 GiB."""
+PAGES = 1 << 15
+"""The most pages of 64 KiB that a module's memory has: 2 GiB, so that no sum of two sizes passes 32 bits."""
 
 
 @dataclass(frozen=True)
