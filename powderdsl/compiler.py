@@ -163,6 +163,7 @@ def load(
     return ruleset
 
 
+@collection_paused()
 def load_with_diagnostics(
     *names: str | Path,
     params: Mapping[str, Any] | None = None,

@@ -80,7 +80,7 @@ def chain_of(node: Node, have: Have) -> list[Node]:
         return []
     # A choice may build on the one below it, which the row still holds, not on those before.
     for choice in chain:
-        seen = {id(choice.args[2])}
+        seen, others = {id(choice.args[2])}, set[int]()
         stack = [choice.args[1]]
         while stack:
             part = stack.pop()
@@ -89,10 +89,23 @@ def chain_of(node: Node, have: Have) -> list[Node]:
             seen.add(id(part))
             if part.op in ("select", "draw"):
                 return []
-            if part.op == "shift" and any(inner is choice.args[2] for inner in walk(part)):
+            if part.op == "shift" and _reads(part, choice.args[2], others):
                 return []
             stack.extend(part.args)
     return chain
+
+
+def _reads(node: Node, read: Node, others: set[int]) -> bool:
+    """Whether a value reads another one. `others`: the ids of nodes that do not; those found are added."""
+    stack = [node]
+    while stack:
+        top = stack.pop()
+        if top is read:
+            return True
+        if id(top) not in others:
+            others.add(id(top))
+            stack.extend(top.args)
+    return False
 
 
 def _is_kept(node: Node, found: set[str]) -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered, walk
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered
 
 ANSWER = Type("answer")
 """One truth value for all cells, such as whether a flag is set anywhere."""
@@ -161,9 +161,15 @@ def load(graph: Graph, var: Var) -> Node:
 def loaded(nodes: Iterable[Node]) -> Iterator[str]:
     """The names of the variables that values read, with repetitions."""
     for node in nodes:
-        for inner in walk(node):
-            if inner.op == "load":
-                yield str(inner.attr)
+        seen: set[int] = set()
+        stack = [node]
+        while stack:  # as `walk`
+            top = stack.pop()
+            if id(top) not in seen:
+                seen.add(id(top))
+                if top.op == "load":
+                    yield str(top.attr)
+                stack.extend(top.args)
 
 
 def with_args(node: Node, args: tuple[Node, ...], graph: Graph) -> Node:

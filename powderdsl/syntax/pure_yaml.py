@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import yaml
 from yaml import tokens
@@ -89,6 +89,7 @@ class _Scanner(Scanner):
         self.text = text.removeprefix("\ufeff") + "\0" * 16
         self.index = self.line = 0
         self.encoding = None
+        self.is_ready = False
         super().__init__()
 
     @property
@@ -127,6 +128,29 @@ class _Scanner(Scanner):
 
     def _fail(self, context: str, start: _Mark, problem: str) -> NoReturn:
         raise ScannerError(context, start, problem, self.get_mark())
+
+    def _ready(self) -> list[tokens.Token]:
+        """The tokens that were read and not taken. The first, if there is one, will not change."""
+        if not self.is_ready:
+            while self.need_more_tokens():
+                self.fetch_more_tokens()
+            self.is_ready = True
+        return self.tokens
+
+    def check_token(self, *choices: Any) -> bool:
+        found = self._ready()
+        return bool(found) and (not choices or isinstance(found[0], choices))
+
+    def peek_token(self) -> tokens.Token:
+        return self._ready()[0]
+
+    def get_token(self) -> tokens.Token:
+        token = self._ready().pop(0)
+        self.is_ready = False
+        self.tokens_taken += 1
+        if isinstance(token, tokens.TagToken):
+            self._ready()  # what is wrong after a tag comes before what is wrong with it
+        return token
 
     def fetch_stream_end(self) -> None:
         # To libyaml the end of the text is the end of a line, also inside brackets.
@@ -448,12 +472,6 @@ class _Parser(_Scanner, Parser):
     def __init__(self, text: str):
         _Scanner.__init__(self, text)
         Parser.__init__(self)
-
-    def get_token(self) -> tokens.Token:
-        token = super().get_token()
-        if isinstance(token, tokens.TagToken):
-            self.peek_token()  # what is wrong after a tag comes before what is wrong with it
-        return token
 
     def parse_flow_sequence_entry_mapping_key(self) -> yaml.Event:
         self.get_token()
