@@ -1,21 +1,26 @@
-"""What the test does in Pyodide and in CPython alike: commands, and the module of powderworld, as files in this folder."""
+"""What the test does in Pyodide and in CPython alike: commands, a module, and worlds of powderworld, as files in this folder."""
 
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from hashlib import sha256
 from io import StringIO
 from pathlib import Path
 
+from powderdsl.arrays import np
 from powderdsl.cli.dispatch import main
-from powderdsl.compiler import load, lower, shipped
-from powderdsl.ir.segments import segments
+from powderdsl.compiler import load, lower, parts, shipped
+from powderdsl.simulation.array_worlds import ArraySimulator
+from powderdsl.system.memo import Memo
 from powderdsl.targets.wasm.source import wasm_module
 
 COMMANDS = (
     "check powderworld --quick",
     "check broken.yaml --quick",
+    "check life",
     "compile powderworld --emit model",
     "explain PD301",
 )
+STEPS = 200
 
 for number, words in enumerate(COMMANDS):
     sys.argv = ["powderdsl", *words.split()]
@@ -29,6 +34,15 @@ for number, words in enumerate(COMMANDS):
     Path(f"output{number}").write_text(output.getvalue().replace(str(shipped("rules")), "rules"))
     Path(f"status{number}").write_text(str(status or 0))
 
-(segment,) = segments(lower(load("powderworld")))
-assert segment.planes is not None
-Path("module.wasm").write_bytes(wasm_module(segment.planes, 64).code)
+memo = Memo()
+model = load("powderworld", memo=memo)
+(part,) = parts(lower(model, memo), memo)
+assert part.planes is not None
+Path("module.wasm").write_bytes(wasm_module(part.planes, 64, memo=memo).code)
+
+sim = ArraySimulator(model, memo=memo)
+ids = np.frombuffer(Path("ids").read_bytes(), np.uint8).reshape(2, 64, 64)
+velocity = np.frombuffer(Path("velocity").read_bytes(), np.float32).reshape(2, 2, 64, 64)
+world = sim.step(sim.replace(sim.world(ids, seed=3), velocity=velocity), STEPS)
+hashes = [f"{name} {sha256(value.tobytes()).hexdigest()}\n" for name, value in sorted(world.state.items())]
+Path("hashes").write_text("".join(hashes))
