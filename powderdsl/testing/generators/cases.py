@@ -16,7 +16,7 @@ from powderdsl.model.types import Kind, Property, Ruleset
 from powderdsl.testing.generators.choices import Choices
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import Simulator, World
+    from powderdsl.simulation.any_arrays import AnySimulator, W
 
 Array = np.ndarray[Any, Any]
 
@@ -115,10 +115,10 @@ class Start:
         fields = {name: kept(values) if name in names else values for name, values in self.fields.items()}
         return replace(self, ids=kept(self.ids), fields=fields)
 
-    def world(self, simulator: Simulator) -> World:
+    def world(self, simulator: AnySimulator[W]) -> W:
         """The same worlds for any simulator of the ruleset."""
         world = simulator.world(self.ids, self.seed, index=self.index)
-        world = replace(world, step=world.step.new_tensor(self.step))
+        world = replace(world, step=simulator.kind.from_numpy(self.step.copy()))
         return simulator.replace(world, **self.fields) if self.fields else world
 
     def __str__(self) -> str:

@@ -10,16 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import ceil, log
+from math import ceil, log, prod
 from typing import TYPE_CHECKING
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.model import reference
 from powderdsl.model.types import Often
-from powderdsl.simulation.draw import to_numpy
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import World
+    from powderdsl.simulation.any_arrays import AnyWorld, W
 
 ERROR_RATE = 1e-6
 """How likely a correct chance fails a test, at most; and how likely one passes that is off by `OFF`."""
@@ -71,7 +70,7 @@ def _trials_between(first: float, second: float) -> int:
     return ceil(log(2 / ERROR_RATE) / divergence((a + b) / 2, low))
 
 
-def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int) -> str:
+def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: int) -> str:
     """A sentence about the first claim that counts contradict, or nothing.
 
     Args:
@@ -82,10 +81,11 @@ def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int)
     for claim, cells in chosen:
         if not cells.any():
             return f"no cell of the start world is as `{_words(claim)}` says"
-    most = max(1, MOST // (start.ids.numel() * max(steps, 1)))
+    cells_of_one = prod(start.shape)
+    most = max(1, MOST // (cells_of_one * max(steps, 1)))
     copies = min(most, max(ceil(trials_for(float(c.chance)) / int(cells.sum())) for c, cells in chosen))
     hits = [0] * len(chosen)
-    chunk = max(1, CHUNK // start.ids.numel())
+    chunk = max(1, CHUNK // cells_of_one)
     for first in range(0, copies, chunk):
         world = _copies(start, first, min(chunk, copies - first), seed)
         world = world.sim.step(world, steps=steps)
@@ -106,22 +106,23 @@ def _words(claim: Often) -> str:
     return " ".join(claim.span.text.split())
 
 
-def _cells(claim: Often, start: World) -> NDArray[np.bool_]:
+def _cells(claim: Often, start: AnyWorld) -> NDArray[np.bool_]:
     """The cells [H, W] of the start world that the claim is about."""
     holds: NDArray[np.bool_] = reference.evaluate(claim.before, world_context(start))[0]
     return holds
 
 
-def _copies(start: World, first: int, count: int, seed: int) -> World:
+def _copies(start: W, first: int, count: int, seed: int) -> W:
     """The world many times over, each with another index and so with luck of its own."""
     many = start.select([0] * count)
-    index = many.index.new_tensor(range(first, first + count))
-    return replace(many, index=index, seed=many.seed.new_full((count,), seed))
+    put = start.sim.kind.put
+    index, seeds = put([*range(first, first + count)], "int64"), put([seed] * count, "int64")
+    return replace(many, index=index, seed=seeds)
 
 
-def world_context(world: World) -> reference.Context:
+def world_context(world: AnyWorld) -> reference.Context:
     """The values that a condition reads: a world's state as the oracle holds it, parameters, the clock."""
-    ruleset = world.sim.ruleset
+    ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
     state = reference.widened(ruleset, {name: to_numpy(values) for name, values in world.state.items()})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
     return reference.Context(ruleset, state, reference.parameters(ruleset, len(world), {}), {}, clock)

@@ -9,40 +9,43 @@ from powderdsl.arrays import NDArray, np
 from powderdsl.model.fields.words import direction_word
 from powderdsl.model.text import show_number, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset
-from powderdsl.simulation.draw import to_numpy
 from powderdsl.testing.generators.cases import holding
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import World
+    from powderdsl.simulation.any_arrays import AnyWorld, W
 
 
-def with_fields(world: World, examples: Sequence[Example]) -> World:
+def with_fields(world: W, examples: Sequence[Example]) -> W:
     """Fresh worlds with the fields that their tests draw; `examples` has the test of each world."""
     names = dict.fromkeys(grid.name for example in examples for grid in example.fields)
     slots = {slot.name: slot for slot in world.sim.slots}
     changed = {}
+    to_numpy = world.sim.kind.to_numpy
     for name in names:
         values = to_numpy(world.state[name]).copy()
         may_hold = holding(world.sim.ruleset, slots[name], to_numpy(world.ids))
         for index, example in enumerate(examples):
             for grid in example.fields:
                 if grid.name == name:
-                    _draw(grid, values[index], may_hold[index])
+                    _draw(grid, values, index, may_hold[index])
         changed[name] = values
-    return world.sim.replace(world, **changed) if changed else world
+    found: W = world.sim.replace(world, **changed) if changed else world
+    return found
 
 
-def _draw(grid: FieldGrid, values: NDArray[Any], may_hold: NDArray[np.bool_]) -> None:
-    """Put the drawn values into those of one world, [H, W] or [2, H, W]."""
+def _draw(grid: FieldGrid, values: NDArray[Any], world: int, may_hold: NDArray[np.bool_]) -> None:
+    """Put the drawn values into those of one of some worlds, [B, H, W] or [B, 2, H, W]."""
     for row, cells in enumerate(grid.cells):
         for column, cell in enumerate(cells):
             if cell and (may_hold[row, column] or not grid.everywhere):
-                values[..., row, column] = [low for low, _ in cell] if values.ndim == 3 else cell[0][0]
+                drawn = [low for low, _ in cell] if values.ndim == 4 else cell[0][0]
+                values[(world, ..., row, column)] = drawn
 
 
-def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
+def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
     """The first of some worlds that is not as the grid says: its number, and `row 1, column 2 is 3, not 4`."""
     slot = next(slot for slot in world.sim.slots if slot.name == grid.name)
+    to_numpy = world.sim.kind.to_numpy
     found, fresh = (to_numpy(one.state[grid.name]) for one in (world, world.sim.world(world.ids)))
     low, high = fresh.copy(), fresh.copy()
     counts = holding(world.sim.ruleset, slot, to_numpy(world.ids))
@@ -73,10 +76,10 @@ def _ends(cell: Cell, vector: bool) -> NDArray[Any]:
     return ends if vector else ends[:, 0]
 
 
-def field_rows(name: str, world: World, index: int) -> tuple[str, ...]:
+def field_rows(name: str, world: AnyWorld, index: int) -> tuple[str, ...]:
     """A field of one world as tests draw it: rows of words, in columns. Floats with all their digits."""
     kind = next(slot.kind for slot in world.sim.slots if slot.name == name)
-    values = to_numpy(world.state[name])[index]
+    values = world.sim.kind.to_numpy(world.state[name])[index]
     height, width = values.shape[-2:]
     words = [
         [_word(world.sim.ruleset, kind, values[..., row, column]) for column in range(width)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.compiler import starting_backend
@@ -13,13 +13,12 @@ from powderdsl.model import reference
 from powderdsl.model.restrict import restricted, without
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Ruleset
-from powderdsl.simulation.draw import to_numpy
-from powderdsl.simulation.simulator import compile
+from powderdsl.simulation.compiling import compile_any
 from powderdsl.testing.pack_tests.chances import chance_problem, world_context
 from powderdsl.testing.pack_tests.fields import field_problem, field_rows, with_fields
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import Simulator, World
+    from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld, W
 
 SEEDS = (0, 1, 2, 3, 4)
 """Seeds of a test that names none: several, since a rule that depends on chance should not pass by luck."""
@@ -68,8 +67,8 @@ def run_examples(
     backend: str | None = None,
     device: str = "cpu",
     *,
-    sim: Simulator | None = None,
-    seen: Callable[[World], None] | None = None,
+    sim: AnySimulator[Any] | None = None,
+    seen: Callable[[Any], None] | None = None,
 ) -> list[ExampleResult]:
     """Run every test of a ruleset's packs, in the order of the files.
 
@@ -83,7 +82,7 @@ def run_examples(
         sim: what runs them, instead of a new simulator of this ruleset.
         seen: called with the worlds of each batch at its end.
     """
-    sim = sim or compile(ruleset, backend or starting_backend(device), device)
+    sim = sim or compile_any(ruleset, backend or starting_backend(device), device)
     sizes: dict[tuple[int, int], list[int]] = {}
     for number, example in enumerate(ruleset.tests):
         sizes.setdefault((len(example.given), len(example.given[0])), []).append(number)
@@ -95,7 +94,7 @@ def run_examples(
     return _judged([results[number] for number in range(len(ruleset.tests))], ruleset, sim)
 
 
-def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> list[ExampleResult]:
+def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: AnySimulator[Any]) -> list[ExampleResult]:
     """The results; a test that fails only with packs outside its scope names these packs."""
     scopes: dict[tuple[str, ...], list[ExampleResult]] = {}
     for result in results:
@@ -114,7 +113,7 @@ def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> l
     return [replace(one, added=added.get(one.example.span, ())) for one in results]
 
 
-def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: Simulator) -> tuple[Span, ...]:
+def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: AnySimulator[Any]) -> tuple[Span, ...]:
     """The places of the tests that pass with other rules."""
     tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
     if ruleset is None or not tests:
@@ -123,7 +122,7 @@ def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: Simulator) 
     return tuple(dict.fromkeys(result.example.span for result in results if result.passed))
 
 
-def start_of(example: Example, sim: Simulator, seed: int) -> World:
+def start_of(example: Example, sim: AnySimulator[W], seed: int) -> W:
     """The start world of a test, one of a seed."""
     ids = {char: _id(sim.ruleset, name) for char, name in example.legend}
     grid = np.array([[[ids[char] for char in row] for row in example.given]], dtype=np.uint8)
@@ -139,7 +138,7 @@ class _Running:
     seeds: tuple[int, ...]
 
     @classmethod
-    def of(cls, example: Example, sim: Simulator) -> _Running:
+    def of(cls, example: Example, sim: AnySimulator[Any]) -> _Running:
         ids = {char: _id(sim.ruleset, name) for char, name in dict(example.legend).items()}
         return cls(example, ids, SEEDS if example.seed is None else (example.seed,))
 
@@ -148,17 +147,17 @@ class _Running:
         steps = self.example.steps
         return set(range(1, steps + 1)) if self.example.always else {steps} if steps else set()
 
-    def look(self, world: World, step: int) -> ExampleResult | None:
+    def look(self, world: AnyWorld, step: int) -> ExampleResult | None:
         """The failure after a step, if any; `world` holds this test's worlds alone."""
         for index, problem, field in self._problems(world, step):
-            after = _rows(to_numpy(world.ids)[index], self.ids, self.example)
+            after = _rows(world.sim.kind.to_numpy(world.ids)[index], self.ids, self.example)
             drawn = field_rows(field, world, index) if field else ()
             return ExampleResult(
                 self.example, self.seeds, problem, self.seeds[index], step, after, field, drawn
             )
         return None
 
-    def _problems(self, world: World, step: int) -> Iterator[tuple[int, str, str]]:
+    def _problems(self, world: AnyWorld, step: int) -> Iterator[tuple[int, str, str]]:
         """The world that is wrong, how, and the field that is not as expected, if one is."""
         example = self.example
         for condition in example.always if step else ():
@@ -170,7 +169,7 @@ class _Running:
         if step < example.steps:
             return
         wanted = self._wanted()
-        differs = (to_numpy(world.ids) != wanted) & (wanted >= 0)
+        differs = (world.sim.kind.to_numpy(world.ids) != wanted) & (wanted >= 0)
         if differs.any():
             index, row, column = (int(part[0]) for part in np.nonzero(differs))
             found, asked = int(world.ids[index, row, column]), int(wanted[row, column])
@@ -189,7 +188,7 @@ class _Running:
         )
 
 
-def _run(batch: list[_Running], sim: Simulator, seen: Callable[[World], None] | None) -> list[ExampleResult]:
+def _run(batch: list[_Running], sim: AnySimulator[Any], seen: Callable[[Any], None] | None) -> list[ExampleResult]:
     """Tests of one size, all at once: each has a slice of the batch."""
     grids = [
         np.array([[one.ids[char] for char in row] for row in one.example.given], dtype=np.uint8)

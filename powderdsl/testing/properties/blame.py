@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Span
@@ -14,6 +13,7 @@ from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Pass, Ruleset
 from powderdsl.testing.generators.cases import Array, Start
+from powderdsl.testing.pack_tests.runner import ExampleResult, start_of
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired, look
 from powderdsl.testing.properties.outcomes import Counterexample, Property
 from powderdsl.testing.properties.running import (
@@ -26,8 +26,6 @@ from powderdsl.testing.properties.running import (
 )
 from powderdsl.testing.properties.samples import State
 
-if TYPE_CHECKING:
-    from powderdsl.testing.pack_tests.runner import ExampleResult
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them matter."""
@@ -145,10 +143,6 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
     """How added packs change a test: by their rules that happen, or else by what they change in other packs."""
     if not result.added:
         return None
-    from powderdsl.testing.pack_tests.runner import (
-        start_of,  # brings torch, which `powderdsl check` does without
-    )
-
     ruleset, example, sim = runner.ruleset, result.example, runner.sim
     world = sim.step(start_of(example, sim, result.seed), steps=max(result.step, 1))
     owners = pack_of_line(ruleset)

@@ -13,12 +13,12 @@ from powderdsl.model import reference
 from powderdsl.model.expressions.operands import TRUE
 from powderdsl.model.state import slots
 from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
-from powderdsl.simulation.draw import to_numpy
+from powderdsl.simulation.compiling import compile_any
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.samples import State, full_state
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import Simulator, World
+    from powderdsl.simulation.any_arrays import AnySimulator, W
 
 MARK = "happened "
 """How the flags are called that lines of rules set. No rule file can have a name with a blank."""
@@ -33,11 +33,7 @@ class Runner:
         self.lines = rule_spans(ruleset)
         self.happened: set[Span] = set()
         self.worlds_run = 0
-        from powderdsl.simulation.simulator import (
-            compile,  # brings torch, which `powderdsl check` does without
-        )
-
-        self.sim = compile(marked(ruleset), backend=self.backend)
+        self.sim = compile_any(marked(ruleset), self.backend)
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         """The state at the start and after each step, in storage dtypes. `random`: draws for all streams."""
@@ -54,25 +50,26 @@ class Runner:
 
 
 def run_sample(
-    sim: Simulator,
+    sim: AnySimulator[W],
     sample: Start,
     steps: int,
     random: Mapping[str, Array] | None = None,
     ruleset: Ruleset | None = None,
-) -> tuple[list[State], World]:
+) -> tuple[list[State], W]:
     """The state at the start and after each step, in storage dtypes, and the world after the last one.
 
     `ruleset`: whose slots are kept, if the simulator has more.
     """
     start = full_state(ruleset or sim.ruleset, sample)
     world = sim.world(sample.ids, sample.seed, index=sample.index)
-    given = {name: world.state[name].new_tensor(values) for name, values in start.items()}
-    clock = world.step.new_tensor(sample.step)
+    dtypes = {slot.name: slot.dtype for slot in sim.slots}
+    given = {name: sim.kind.from_numpy(values.astype(dtypes[name])) for name, values in start.items()}
+    clock = sim.kind.from_numpy(sample.step.copy())
     world = replace(world, state={**world.state, **given}, step=clock)
     found = [start]
     for _ in range(steps):
         world = sim.step(world, random=random, params=dict(sample.params) or None)
-        found.append({name: to_numpy(world.state[name]) for name in start})
+        found.append({name: sim.kind.to_numpy(world.state[name]) for name in start})
     return found, world
 
 
