@@ -182,7 +182,6 @@ THIRD_PARTIES: dict[str, Home] = {
             "targets.profiling",
             "simulation.draw",
             "simulation.media",
-            "testing.pack_tests",
             "experiments.bench",
             "cli",
         ),

@@ -118,7 +118,7 @@ def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: AnySimulato
     tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
     if ruleset is None or not tests:
         return ()
-    results = run_examples(replace(ruleset, tests=tests), sim.backend, str(sim.device))
+    results = run_examples(replace(ruleset, tests=tests), sim=sim.of(ruleset))
     return tuple(dict.fromkeys(result.example.span for result in results if result.passed))
 
 
@@ -188,7 +188,9 @@ class _Running:
         )
 
 
-def _run(batch: list[_Running], sim: AnySimulator[Any], seen: Callable[[Any], None] | None) -> list[ExampleResult]:
+def _run(
+    batch: list[_Running], sim: AnySimulator[Any], seen: Callable[[Any], None] | None
+) -> list[ExampleResult]:
     """Tests of one size, all at once: each has a slice of the batch."""
     grids = [
         np.array([[one.ids[char] for char in row] for row in one.example.given], dtype=np.uint8)

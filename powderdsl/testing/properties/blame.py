@@ -26,7 +26,6 @@ from powderdsl.testing.properties.running import (
 )
 from powderdsl.testing.properties.samples import State
 
-
 MOST = 8
 """Added packs that are left out in turn, to see which of them matter."""
 
