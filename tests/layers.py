@@ -161,7 +161,6 @@ _TORCH = (
     "simulation.programs",
     "simulation.observe",
     "simulation.simulator",
-    "testing.generators",
     "testing.mutation",
     "tasks.tensors",
     "tasks.episodes",
