@@ -5,15 +5,14 @@ from __future__ import annotations
 import shutil
 import sys
 import zipfile
-from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 
 import powderdsl
 from tests.wasm.jobs import hashes
+from tests.web.packages import PACKAGES, needed_in_pyodide, write_packages
 from tests.wheels import build_wheel, succeed
 
 HERE = Path(__file__).parent
@@ -36,32 +35,11 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_wheel(tmp_path_factory.mktemp("wheel"))
 
 
-def needed_in_pyodide(requirements: list[str] | None) -> Iterator[str]:
-    """The names of packages that a package needs there."""
-    for requirement in map(Requirement, requirements or ()):
-        marker = requirement.marker
-        if marker is None or marker.evaluate({"sys_platform": "emscripten", "extra": ""}):
-            yield requirement.name.lower()
-
-
 def test_metadata_asks_only_for_pure_packages(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         written = metadata.PathDistribution(zipfile.Path(wheel, name.rpartition("/")[0] + "/"))
-        assert set(needed_in_pyodide(written.requires)) == {"click", "lark", "pyyaml", "rich"}
-
-
-def write_packages(path: Path, names: set[str]) -> None:
-    """An archive of installed packages and those that they need, without their compiled parts."""
-    found: set[str] = set()
-    with zipfile.ZipFile(path, "w") as archive:
-        while names - found:
-            name = min(names - found)
-            found.add(name)
-            for file in metadata.files(name) or ():
-                if not (".." in file.parts or "__pycache__" in file.parts or file.suffix == ".so"):
-                    archive.write(file.locate(), str(file))
-            names |= set(needed_in_pyodide(metadata.requires(name)))
+        assert set(needed_in_pyodide(written.requires)) == PACKAGES
 
 
 def test_the_same_code_and_worlds(wheel: Path, tmp_path: Path, torch) -> None:  # type: ignore[no-untyped-def]
@@ -69,7 +47,7 @@ def test_the_same_code_and_worlds(wheel: Path, tmp_path: Path, torch) -> None:  
     if node is None or not (HERE / "node_modules" / "pyodide").is_dir():
         pytest.skip("Pyodide is tested in Node.js: `make web` fetches it with npm")
     packages = tmp_path / "packages.zip"
-    write_packages(packages, {"click", "lark", "pyyaml", "rich"})
+    write_packages(packages, PACKAGES)
     generator = torch.Generator().manual_seed(1)
     ids = torch.randint(0, 14, (2, 64, 64), generator=generator)
     speed = 8 * torch.randn((2, 2, 64, 64), generator=generator)

@@ -1,0 +1,66 @@
+"""How long it takes in Pyodide from an edited rule file to the first step of a world. `measure.py` runs it."""
+
+import json
+import time
+from pathlib import Path
+
+begin = time.perf_counter()
+from powderdsl.arrays import np  # noqa: E402
+from powderdsl.compiler import load_with_diagnostics, shipped  # noqa: E402
+from powderdsl.simulation.array_worlds import ArraySimulator  # noqa: E402
+from powderdsl.syntax.parse import parser  # noqa: E402
+from powderdsl.system.memo import Memo  # noqa: E402
+
+REPEATS = 5
+EDITS = {
+    "ice": ("water.yaml", "count(ice) >= 3", "count(ice) >= {}"),
+    "fire": ("fire.yaml", "count(fuel) == 0", "count(fuel) < {}"),
+    "wind": ("wind.yaml", "0.95 *", "0.8{} *"),
+}
+"""Files, text in them, and what becomes of it, with another number each time."""
+FOLDER = Path("rules")
+
+
+def laps(memo: Memo) -> dict[str, float]:
+    """Seconds from the files to a world that has stepped, by phases."""
+    start = time.perf_counter()
+    model, _ = load_with_diagnostics(FOLDER / "powderworld.yaml", memo=memo)
+    loaded = time.perf_counter()
+    sim = ArraySimulator(model, memo=memo)
+    lowered = time.perf_counter()
+    world = sim.step(sim.world(np.zeros((1, 64, 64), np.uint8), seed=1))
+    assert world.ids.shape == (1, 64, 64)
+    end = time.perf_counter()
+    return {
+        "parse and check": loaded - start,
+        "lower": lowered - loaded,
+        "plan, emit, instantiate, step": end - lowered,
+        "all": end - start,
+    }
+
+
+def best(runs: list[dict[str, float]]) -> dict[str, float]:
+    return min(runs, key=lambda one: one["all"])
+
+
+load_with_diagnostics("life")
+parser()
+found = {"imports, grammar": {"all": time.perf_counter() - begin}}
+FOLDER.mkdir(exist_ok=True)
+for path in shipped("rules").glob("*.yaml"):
+    (FOLDER / path.name).write_bytes(path.read_bytes())
+found["from scratch, the first time"] = laps(Memo())
+found["from scratch"] = best([laps(Memo()) for _ in range(REPEATS)])
+memo = Memo()
+laps(memo)
+for name, (file, before, after) in EDITS.items():
+    runs, text = [], (FOLDER / file).read_text()
+    for number in range(1, REPEATS + 1):
+        changed = text.replace(before, after.format(number + 3), 1)
+        assert changed != text
+        (FOLDER / file).write_text(changed)
+        runs.append(laps(memo))
+    (FOLDER / file).write_text(text)
+    found[f"one pass changed: {name}"] = best(runs)
+found["nothing changed"] = best([laps(memo) for _ in range(REPEATS)])
+Path("seconds.json").write_text(json.dumps(found))
