@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from powderdsl.compiler import lower
-from powderdsl.ir.segments import carry, segments
+from powderdsl.compiler import lower, parts
+from powderdsl.ir.segments import carry
 from powderdsl.model.state import SNAP, Slot, size_problem, slots, storage
 from powderdsl.model.state import fits as sides_fit
 from powderdsl.model.types import Param, Ruleset
+from powderdsl.system.memo import Memo
 from powderdsl.system.writing import failure
 from powderdsl.targets.codec import Piece, pieces
 from powderdsl.targets.wasm.source import wasm_module
@@ -22,8 +23,11 @@ MAX_CELLS = 1 << 22
 _BYTES = {"uint8": 1, "int8": 1, "int16": 2, "int32": 4, "float32": 4}
 
 
-def standalone_module(ruleset: Ruleset, size: tuple[int, int]) -> bytes:
+def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None = None) -> bytes:
     """A module that is a world of `size` (rows, columns), as `targets.wasm.standalone` describes it.
+
+    Args:
+        memo: where passes are kept that other rulesets may have, too.
 
     Raises:
         CompileError: PD607 if the world is too large or its sides do not fit the rules, PD702 if the rules have a pass
@@ -34,12 +38,12 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int]) -> bytes:
     if size[0] * size[1] > MAX_CELLS:
         helps = (f"a module holds at most {MAX_CELLS:,} cells",)
         raise failure("PD607", f"a world of {size[0]}×{size[1]} cells", helps=helps)
-    program = lower(ruleset)
-    parts = segments(program)
-    if len(parts) > 1 or parts[0].planes is None:
+    program = lower(ruleset, memo)
+    found = parts(program, memo)
+    if len(found) > 1 or found[0].planes is None:
         raise _cannot_run(ruleset)
-    held = pieces(program)
-    return wasm_module(parts[0].planes, size[1], face=_face(ruleset, size, held)).code
+    face = _face(ruleset, size, pieces(program))
+    return wasm_module(found[0].planes, size[1], face=face, memo=memo).code
 
 
 def _cannot_run(ruleset: Ruleset) -> Exception:

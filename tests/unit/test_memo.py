@@ -13,6 +13,7 @@ from powderdsl.compiler import load_with_diagnostics, lower, parts, shipped
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import PassGraph
 from powderdsl.ir.structure import structure
+from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.memo import Memo
 from powderdsl.targets.wasm import source
 from powderdsl.targets.wasm.source import wasm_module
@@ -136,3 +137,11 @@ def test_structure_tells_passes_apart() -> None:
     once, again = passes("powderworld"), passes("powderworld")
     assert [structure(one) for one in once] == [structure(one) for one in again]
     assert len({structure(one, places=False) for one in (*once, *again)}) == len(once)
+
+
+def test_modules_that_stand_alone_use_memos(rules: Path, counted: Counter[str]) -> None:
+    memo = Memo()
+    model, _ = load_with_diagnostics(rules / "small.yaml", memo=memo)
+    found = [standalone_module(model, (32, 64), one) for one in (None, memo, memo)]
+    assert len(set(found)) == 1
+    assert counted["plan"] == 2 * len(lower(model).passes)

@@ -18,7 +18,7 @@ def main() -> None:
     """Print a table for docs/performance.md. Each row is the best of five; only the first one happens once."""
     node = shutil.which("node")
     assert node is not None, "Node.js is missing"
-    load = os.getloadavg()[0]
+    busy = os.getloadavg()[0]
     with TemporaryDirectory() as name:
         folder = Path(name)
         wheel = build_wheel(folder)
@@ -27,7 +27,7 @@ def main() -> None:
         succeed(*command, cwd=folder)
         found: dict[str, dict[str, float]] = json.loads((folder / "seconds.json").read_text())
     phases = list(found["from scratch"])
-    print(f"load of the machine before: {load:.1f}\n")
+    print(f"load of the machine before: {busy:.1f}\n")
     print("| seconds | " + " | ".join(phases) + " |")
     print("|---|" + "---:|" * len(phases))
     for row, seconds in found.items():
