@@ -5,7 +5,7 @@ The reference (`model.reference`) has its own, which these are compared with.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -22,7 +22,7 @@ def name_number(name: str) -> int:
     return found
 
 
-def mix(x: Tensor) -> Tensor:
+def mix(x: Any) -> Any:
     """A 32-bit finalizer. int64 below 2³² in and out."""
     x = x ^ (x >> 16)
     x = (x * 0x7FEB352D) & MASK
@@ -31,11 +31,12 @@ def mix(x: Tensor) -> Tensor:
     return x ^ (x >> 16)
 
 
-def base_keys(seed: Tensor, index: Tensor) -> Tensor:
-    """The part of the keys that stays the same for a whole run: int64 [2, B]."""
-    import torch
+def base_keys(seed: Any, index: Any, xp: Any = None) -> Any:
+    """The part of the keys that stays the same for a whole run: int64 [2, B]. `xp`: the arrays' library, if not torch."""
+    if xp is None:
+        import torch as xp
 
-    keys = torch.tensor([[START_0], [START_1]], dtype=torch.int64, device=seed.device).expand(2, len(seed))
+    keys = xp.stack([seed * 0 + START_0, seed * 0 + START_1])
     for part in (seed & MASK, (seed >> 32) & MASK, index & MASK):
         keys = mix((keys + part) & MASK)
     return keys

@@ -5,8 +5,10 @@ What both call by the same name is called by it, as `kind.xp.where`; the rest ar
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import prod
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from powderdsl.arrays import np
 
@@ -16,11 +18,23 @@ Bytes = Any
 
 
 class ArrayKind(Protocol):
-    """Arrays of one library on one device."""
+    """Arrays of one library on one device. Values that are equal mean the same ones."""
+
+    def __hash__(self) -> int: ...
 
     @property
     def xp(self) -> Any:
         """The library's functions."""
+        ...
+
+    @property
+    def flags(self) -> Any:
+        """The dtype of flags, which libraries call by different names."""
+        ...
+
+    @property
+    def on_cpu(self) -> bool:
+        """Whether arrays are in this process's memory."""
         ...
 
     def given(self, value: Any, name: str) -> Array:
@@ -35,6 +49,14 @@ class ArrayKind(Protocol):
         """A new array with any values."""
         ...
 
+    def zeros(self, dtype: str, shape: tuple[int, ...]) -> Array:
+        """A new array of zeros."""
+        ...
+
+    def arange(self, count: int) -> Array:
+        """The first integers from 0, int64."""
+        ...
+
     def copied(self, array: Array) -> Array:
         """The same values in memory of their own, in C order."""
         ...
@@ -47,8 +69,20 @@ class ArrayKind(Protocol):
         """Ids in a dtype that can index a table."""
         ...
 
+    def entries(self, table: Array, index: Array) -> Array:
+        """The entries of a table [n], by an index of bytes [m]."""
+        ...
+
     def sort(self, array: Array) -> str:
         """``bool``, ``int``, ``float`` or ``complex``."""
+        ...
+
+    def unbound(self, array: Array, axis: int) -> Sequence[Array]:
+        """The parts of an array along an axis, which they lack."""
+        ...
+
+    def as_bytes(self, array: Array) -> Array:
+        """The bytes of all values in C order, uint8 [n]; it may share their memory."""
         ...
 
     def to_numpy(self, array: Array) -> Array:
@@ -73,10 +107,13 @@ class ArrayKind(Protocol):
 _SORTS = {"b": "bool", "i": "int", "u": "int", "f": "float", "c": "complex"}
 
 
+@dataclass(frozen=True)
 class PlainArrays:
     """Arrays of `powderdsl.arrays`: NumPy's, or our own where NumPy is missing."""
 
-    xp: Any = np
+    xp: ClassVar[Any] = np
+    flags: ClassVar[Any] = np.bool_
+    on_cpu: ClassVar[bool] = True
 
     def given(self, value: Any, name: str) -> Array:
         try:
@@ -94,6 +131,12 @@ class PlainArrays:
     def empty(self, dtype: Any, shape: tuple[int, ...]) -> Array:
         return np.empty(shape, dtype)
 
+    def zeros(self, dtype: str, shape: tuple[int, ...]) -> Array:
+        return np.zeros(shape, dtype)
+
+    def arange(self, count: int) -> Array:
+        return np.arange(count, dtype=np.int64)
+
     def copied(self, array: Array) -> Array:
         return array.copy()
 
@@ -103,8 +146,17 @@ class PlainArrays:
     def as_index(self, ids: Array) -> Array:
         return ids
 
+    def entries(self, table: Array, index: Array) -> Array:
+        return table[index]
+
     def sort(self, array: Array) -> str:
         return _SORTS[array.dtype.kind]
+
+    def unbound(self, array: Array, axis: int) -> Sequence[Array]:
+        return list(np.moveaxis(array, axis, 0))
+
+    def as_bytes(self, array: Array) -> Array:
+        return np.frombuffer(array.tobytes(), np.uint8)
 
     def to_numpy(self, array: Array) -> Array:
         return array

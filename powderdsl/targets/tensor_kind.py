@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -11,13 +13,17 @@ from torch import Tensor
 from powderdsl.arrays import np
 
 
+@dataclass(frozen=True)
 class Tensors:
     """An `array_kind.ArrayKind`."""
 
-    xp: Any = torch
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    xp: ClassVar[Any] = torch
+    flags: ClassVar[Any] = torch.bool
 
-    def __init__(self, device: torch.device | str = "cpu"):
-        self.device = torch.device(device)
+    @property
+    def on_cpu(self) -> bool:
+        return self.device.type == "cpu"
 
     def given(self, value: Any, name: str) -> Tensor:
         flags = getattr(value, "flags", None)
@@ -36,6 +42,12 @@ class Tensors:
     def empty(self, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=self.device)
 
+    def zeros(self, dtype: str, shape: tuple[int, ...]) -> Tensor:
+        return torch.zeros(shape, dtype=getattr(torch, dtype), device=self.device)
+
+    def arange(self, count: int) -> Tensor:
+        return torch.arange(count, device=self.device)
+
     def copied(self, array: Tensor) -> Tensor:
         return array.clone(memory_format=torch.contiguous_format)
 
@@ -45,11 +57,20 @@ class Tensors:
     def as_index(self, ids: Tensor) -> Tensor:
         return ids.int()
 
+    def entries(self, table: Tensor, index: Tensor) -> Tensor:
+        return table.index_select(0, index.int())
+
     def sort(self, array: Tensor) -> str:
         dtype = array.dtype
         if dtype.is_complex:
             return "complex"
         return "float" if dtype.is_floating_point else "bool" if dtype == torch.bool else "int"
+
+    def unbound(self, array: Tensor, axis: int) -> Sequence[Tensor]:
+        return array.unbind(axis)
+
+    def as_bytes(self, array: Tensor) -> Tensor:
+        return array.reshape(-1).view(torch.uint8)
 
     def to_numpy(self, array: Tensor) -> Any:
         return array.detach().cpu().numpy()

@@ -17,8 +17,8 @@ from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import Hands
-from powderdsl.tasks.tensors.generator import Made, WorldMaker, joined
 from powderdsl.tasks.tensors.measures import Facts, Meter, measures_of, scalar_value, scalars_of
+from powderdsl.tasks.tensors.starts import StartWorlds
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 
@@ -67,15 +67,10 @@ class TaskProgram:
     def __init__(self, task: Task, split: str, simulator: Simulator):
         self.task, self.split, self.simulator = task, split, simulator
         device = simulator.device
-        self._makers = [WorldMaker(one, task.size, device) for one in task.split(split).variants]
+        self._starts = StartWorlds(task, split, simulator.kind)
         self.measures = measures_of(task.goal)
         self._places = {measure: number for number, measure in enumerate(self.measures)}
-        cells = [maker.fixed_cells for maker in self._makers]
-        self._fixed = {
-            name: value
-            for name, value in cells[0].items()
-            if all(name in one and torch.equal(value, one[name]) for one in cells)
-        }
+        self._fixed = self._starts.fixed
         """Regions that are the same in all worlds of the split, bool [1, H, W]."""
         self._meter = Meter(simulator.ruleset, self.measures, task.size, self._fixed, device)
         goal = task.goal
@@ -98,7 +93,7 @@ class TaskProgram:
     def start(self, seeds: Tensor) -> Episodes:
         """New episodes of the worlds `seeds`, int64 [B], 0 or more each."""
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
-        made = self._made(seeds)
+        made = self._starts.make(seeds)
         nothing = torch.zeros_like(seeds)
         clock = (seeds, nothing.clone(), nothing.clone())
         world = World(self.simulator, self._hands.fresh_state(made.ids), *clock)
@@ -106,19 +101,6 @@ class TaskProgram:
         return Episodes(
             world, seeds, nothing.clone(), nothing.bool(), made.regions, made.targets, measured, measured
         )
-
-    def _made(self, seeds: Tensor) -> Made:
-        """The start worlds of seeds; where a split has several variants, each world comes from its own."""
-        if len(self._makers) == 1:
-            return self._makers[0].make(seeds)
-        variant = torch.remainder(seeds, len(self._makers))
-        numbers = variant.unique().tolist() or [0]
-        parts = [self._makers[number].make(seeds[variant == number]) for number in numbers]
-        # Back from the order of variants to that of the seeds.
-        order = variant.argsort(stable=True).argsort()
-        made = joined(parts, self._fixed)
-        regions = {name: one if name in self._fixed else one[order] for name, one in made.regions.items()}
-        return Made(made.ids[order], regions, {name: one[order] for name, one in made.targets.items()})
 
     def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
         """The episodes where `mask`, bool [B], is set, rebuilt as worlds `seeds`, int64 [B]; the others unchanged.

@@ -61,7 +61,7 @@ def load_task(
     Raises:
         CompileError: with everything that is wrong.
     """
-    from powderdsl.tasks.file import read_task  # brings numpy
+    from powderdsl.tasks.file import read_task
 
     reporter = reporter or Reporter()
     for name, value in (knobs or {}).items():

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.model.schema import Reader
 from powderdsl.model.types import Element, Ruleset
@@ -55,7 +54,7 @@ def _legend(entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], reader:
 
 def _drawn(
     art: yaml_tree.Scalar, legend: dict[str, str], reader: Reader, ruleset: Ruleset
-) -> np.ndarray | None:
+) -> NDArray[np.uint8] | None:
     """ASCII art, in which `?` leaves cells as they are."""
     hole = replace(ruleset.elements[0], name="?", pack="?", id=LEAVE, glyph="?")
     elements: list[Element] = [one for one in ruleset.elements if one.id != LEAVE]
@@ -73,7 +72,7 @@ def _drawn(
     return None
 
 
-def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> np.ndarray | None:
+def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[np.uint8] | None:
     """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
     file, _, name = word.text.rpartition("#") if "#" in word.text else (word.text, "", "")
     suffix = Path(file).suffix.lower()

@@ -26,9 +26,10 @@ def task_of(text: str):
 
 
 def maker(torch, task, split: str = "train", variant: int = 0):
+    from powderdsl.targets.tensor_kind import Tensors
     from powderdsl.tasks.tensors.generator import WorldMaker
 
-    return WorldMaker(task.split(split).variants[variant], task.size, torch.device("cpu"))
+    return WorldMaker(task.split(split).variants[variant], task.size, Tensors())
 
 
 def worlds(torch, text: str, count: int) -> np.ndarray:

@@ -27,7 +27,7 @@ draw:
   - velocity := (-1, 4) in disk at (5, 9) radius 2
 """
 
-BLOCKED = """
+BLOCK = """
 import sys
 
 
@@ -38,6 +38,9 @@ class Blocked:
 
 
 sys.meta_path.insert(0, Blocked())
+"""
+
+BLOCKED = f"""{BLOCK}
 from powderdsl.cli.dispatch import main
 
 main()

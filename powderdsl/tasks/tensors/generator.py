@@ -1,4 +1,4 @@
-"""Generators on tensors: seeds in, worlds out, no loop over worlds.
+"""Generators: seeds in, worlds out, no loop over worlds. On tensors, or on arrays without torch.
 
 Every number that a world draws is a hash of its seed, the statement, the repetition and which number of the statement
 it is. So a world is the same alone and in any batch, on any device.
@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-
-import torch
-from torch import Tensor
+from math import prod
+from operator import or_
 
 from powderdsl.system.random import MASK, base_keys, mix, name_number
+from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.tasks.task import Drawing, Generator, Group, Region
 from powderdsl.tasks.tensors.shapes import pack, shape_words, unpack
 from powderdsl.worlds.raster import Shape, Size, mask
@@ -43,18 +43,19 @@ _LIMITED = ("scatter", "stamp")
 class Made:
     """Generated worlds: ids uint8 [B, H, W]; regions bool [B, H, W] or [1, H, W]; targets uint8 [B, H, W]."""
 
-    ids: Tensor
-    regions: Mapping[str, Tensor]
-    targets: Mapping[str, Tensor]
+    ids: Array
+    regions: Mapping[str, Array]
+    targets: Mapping[str, Array]
 
 
-def joined(parts: Sequence[Made], fixed: Mapping[str, Tensor]) -> Made:
+def joined(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Array]) -> Made:
     """The worlds of all parts in a row. Regions of `fixed` are the same in all worlds."""
-    regions = dict(fixed)
+    xp, regions = kind.xp, dict(fixed)
     for name in (name for name in parts[0].regions if name not in fixed):
-        regions[name] = torch.cat([one.regions[name].expand(len(one.ids), -1, -1) for one in parts])
-    targets = {name: torch.cat([one.targets[name] for one in parts]) for name in parts[0].targets}
-    return Made(torch.cat([one.ids for one in parts]), regions, targets)
+        cells = [xp.broadcast_to(one.regions[name], one.ids.shape) for one in parts]
+        regions[name] = xp.concatenate(cells)
+    targets = {name: xp.concatenate([one.targets[name] for one in parts]) for name in parts[0].targets}
+    return Made(xp.concatenate([one.ids for one in parts]), regions, targets)
 
 
 class DrawTable:
@@ -63,7 +64,7 @@ class DrawTable:
     A statement has a block of `repeats` times `wanted` draws. Statements of one number share their draws.
     """
 
-    def __init__(self, blocks: Iterable[tuple[int, int, int]], device: torch.device):
+    def __init__(self, blocks: Iterable[tuple[int, int, int]], kind: ArrayKind):
         """`blocks`: number, repeats and wanted of each statement."""
         self.blocks: dict[int, tuple[int, int, int]] = {}
         """By statement: the place of its first draw, repeats, wanted."""
@@ -77,52 +78,53 @@ class DrawTable:
             keys += [statement * _STATEMENT & MASK] * (repeats * wanted)
             counters += [r * _NUMBERS + n for r in range(repeats) for n in range(wanted)]
         self.size = len(keys)
-        self.keys = torch.tensor(keys, dtype=torch.int64, device=device)
-        self.spread = torch.tensor(counters, dtype=torch.int64, device=device) * _COUNTER & MASK
+        self.keys = kind.put(keys, "int64")
+        self.spread = kind.put(counters, "int64") * _COUNTER & MASK
 
 
 class Hashes:
     """The random numbers of a batch of seeds, int64 [B]: those of a table, and others of single statements."""
 
-    def __init__(self, seeds: Tensor, table: DrawTable):
-        self.keys = base_keys(seeds, torch.full_like(seeds, _INDEX))
-        self.table = table
+    def __init__(self, seeds: Array, table: DrawTable, kind: ArrayKind):
+        self.keys = base_keys(seeds, kind.xp.full_like(seeds, _INDEX), kind.xp)
+        self.table, self.kind = table, kind
         self.drawn = self._hash(table.keys, table.spread) if table.size else None
 
-    def draw(self, statement: int, counters: Tensor) -> Tensor:
+    def draw(self, statement: int, counters: Array) -> Array:
         """32-bit numbers of one statement: int64 [B, n] for counters int64 [n]."""
-        key = torch.tensor([statement * _STATEMENT & MASK], device=counters.device)
+        key = self.kind.put([statement * _STATEMENT & MASK], "int64")
         return self._hash(key, (counters * _COUNTER) & MASK)
 
-    def _hash(self, keys: Tensor, spread: Tensor) -> Tensor:
+    def _hash(self, keys: Array, spread: Array) -> Array:
         keys = mix((self.keys[0][:, None] + keys) & MASK)
         return mix((mix((keys + spread) & MASK) + self.keys[1][:, None]) & MASK)
 
-    def block(self, statement: int, repeats: int) -> Tensor:
+    def block(self, statement: int, repeats: int) -> Array:
         """The draws of a statement of the table in its first repetitions: int64 [B, repeats, wanted]."""
         assert self.drawn is not None
         start, most, wanted = self.table.blocks[statement]
-        return self.drawn[:, start : start + most * wanted].view(-1, most, wanted)[:, :repeats]
+        drawn = self.drawn[:, start : start + most * wanted]
+        return drawn.reshape(-1, most, wanted)[:, :repeats]
 
 
 class _Draws:
     """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter."""
 
-    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Tensor]):
-        self.hashes, self.names, self.device = hashes, names, hashes.keys.device
+    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Array]):
+        self.hashes, self.names, self.kind = hashes, names, hashes.kind
         self.statement, self.repeats = statement, repeats
-        self.drawn: tuple[Tensor, ...] | None = None
+        self.drawn: Sequence[Array] | None = None
         self.used = 0
 
-    def uniform(self, low: Tensor | int, high: Tensor | int) -> Tensor:
+    def uniform(self, low: Array | int, high: Array | int) -> Array:
         """Integers from `low` to `high`, both included; where there are none, `low`."""
         if self.drawn is None:
-            self.drawn = self.hashes.block(self.statement, self.repeats).unbind(-1)
+            self.drawn = self.kind.unbound(self.hashes.block(self.statement, self.repeats), -1)
         drawn = self.drawn[self.used]
         self.used += 1
         return low + ((drawn * (high - low + 1)) >> 32)
 
-    def value(self, amount: Amount) -> Tensor | int:
+    def value(self, amount: Amount) -> Array | int:
         if amount.op == "number":
             return amount.integer
         if amount.op == "name":
@@ -132,14 +134,14 @@ class _Draws:
             return self.uniform(parts[0], parts[1])
         if amount.op == "neg":
             return -parts[0]
-        found: Tensor | int = CALCULATE[amount.op](parts[0], parts[1])
-        return found
+        return CALCULATE[amount.op](parts[0], parts[1])
 
-    def tensor(self, amount: Amount | None) -> Tensor | None:
+    def array(self, amount: Amount | None) -> Array | None:
         """int64 that broadcasts to [B, R]."""
         if amount is None:
             return None
-        return torch.as_tensor(self.value(amount), device=self.device)
+        value = self.value(amount)
+        return self.kind.put(value, "int64") if isinstance(value, int) else value
 
 
 def _draws_in(*amounts: Amount | None) -> int:
@@ -171,46 +173,49 @@ def _shape_number(region: Region, place: int) -> int:
 
 
 class WorldMaker:
-    """A generator made executable for one size and device."""
+    """A generator made executable for one size and kind of arrays."""
 
-    def __init__(self, generator: Generator, size: Size, device: torch.device):
-        self.generator, self.size, self.device = generator, size, device
+    def __init__(self, generator: Generator, size: Size, kind: ArrayKind):
+        self.generator, self.size, self.kind = generator, size, kind
         self.words = -(-size[0] // 64)
-        self.stamps = {stamp.name: _bordered(stamp.rows, device) for stamp in generator.stamps}
+        self.stamps = {stamp.name: _bordered(stamp.rows, kind) for stamp in generator.stamps}
         painted = [i for group in _groups(generator) for one in group.drawings for i in one.ids]
-        held = [int(i) for stamp in self.stamps.values() for i in stamp.unique() if i != NOTHING]
+        held = [i for stamp in generator.stamps for row in stamp.rows for i in row if i != NOTHING]
         self.planes = max(1, max([generator.fill, *painted, *held]).bit_length())
-        self.table = DrawTable(_draw_blocks(generator), device)
-        self.fixed: dict[Drawing, Tensor] = {}
+        self.table = DrawTable(_draw_blocks(generator), kind)
+        self.fixed: dict[Drawing, Array] = {}
         """Words of shapes that are the same in every world."""
-        self._bits: dict[tuple[int, int], Tensor] = {}
-        nowhere = torch.zeros(size[1], self.words, dtype=torch.int64, device=device)
+        self._bits: dict[tuple[int, int], Array] = {}
+        nowhere = kind.zeros("int64", (size[1], self.words))
         self.fixed_regions = {
-            region.name: reduce(torch.bitwise_or, map(self.fixed_words, region.shapes), nowhere)[None]
+            region.name: reduce(or_, map(self.fixed_words, region.shapes), nowhere)[None]
             for region in generator.regions
             if not region.drawn
         }
-        self.fixed_cells = {
-            name: unpack([words], size[0]).bool() for name, words in self.fixed_regions.items()
-        }
+        self.fixed_cells = {name: self._cells([words]) for name, words in self.fixed_regions.items()}
 
-    def make(self, seeds: Tensor) -> Made:
+    def _cells(self, planes: Sequence[Array]) -> Array:
+        """The cells of one plane of words: bool [..., H, W]."""
+        return self.kind.xp.asarray(unpack(self.kind, planes, self.size[0]), dtype=self.kind.flags)
+
+    def make(self, seeds: Array) -> Made:
         """The worlds of some seeds, int64 [B]."""
         chunk = max(1, len(seeds))
-        if self.device.type == "cpu":
+        if self.kind.on_cpu:
             chunk = max(1, CHUNK_CELLS // max(self.size[0] * self.size[1], self.table.size))
         made = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
-        return made[0] if len(made) == 1 else joined(made, self.fixed_cells)
+        return made[0] if len(made) == 1 else joined(self.kind, made, self.fixed_cells)
 
-    def _chunk(self, seeds: Tensor) -> Made:
-        hashes = Hashes(seeds, self.table)
+    def _chunk(self, seeds: Array) -> Made:
+        kind, height = self.kind, self.size[0]
+        hashes = Hashes(seeds, self.table, kind)
         names = self._lets(self.generator.lets, hashes, 1, {})
         regions = dict(self.fixed_regions)
         for region in self.generator.regions:
             if region.drawn:
                 regions[region.name] = self._region(region, hashes, names)
         cells = {
-            name: self.fixed_cells[name] if name in self.fixed_cells else unpack([words], self.size[0]).bool()
+            name: self.fixed_cells[name] if name in self.fixed_cells else self._cells([words])
             for name, words in regions.items()
         }
         planes = self._canvas(len(seeds), self.generator.fill)
@@ -219,80 +224,79 @@ class WorldMaker:
         for target in self.generator.targets:
             canvas = self._canvas(len(seeds), 0, more=1)
             self._paint(canvas, target.groups, hashes, names, regions)
-            painted = unpack(canvas[-1:], self.size[0]).bool()
-            targets[target.name] = torch.where(painted, unpack(canvas[:-1], self.size[0]), NOTHING)
-        return Made(unpack(planes, self.size[0]), cells, targets)
+            ids = unpack(kind, canvas[:-1], height)
+            targets[target.name] = kind.xp.where(self._cells(canvas[-1:]), ids, NOTHING)
+        return Made(unpack(kind, planes, height), cells, targets)
 
-    def _canvas(self, batch: int, fill: int, more: int = 0) -> Tensor:
+    def _canvas(self, batch: int, fill: int, more: int = 0) -> Array:
         """Planes of an element everywhere, int64 [P, B, W, K]; with one more plane for what has been painted."""
         bits = [-(fill >> plane & 1) for plane in range(self.planes + more)]
-        plane = torch.tensor(bits, dtype=torch.int64, device=self.device)[:, None, None, None]
-        return plane.repeat(1, batch, self.size[1], self.words)
+        plane = self.kind.put(bits, "int64")[:, None, None, None]
+        shape = (len(bits), batch, self.size[1], self.words)
+        return self.kind.copied(self.kind.xp.broadcast_to(plane, shape))
 
     def _lets(
-        self, lets: tuple[tuple[str, Amount], ...], hashes: Hashes, repeats: int, names: Mapping[str, Tensor]
-    ) -> dict[str, Tensor]:
+        self, lets: tuple[tuple[str, Amount], ...], hashes: Hashes, repeats: int, names: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """`names` and more of them: int64 that broadcasts to [B, R]."""
         found = dict(names)
         for name, amount in lets:
-            value = _Draws(hashes, name_number(name), repeats, found).tensor(amount)
+            value = _Draws(hashes, name_number(name), repeats, found).array(amount)
             assert value is not None
             found[name] = value
         return found
 
-    def _region(self, region: Region, hashes: Hashes, names: Mapping[str, Tensor]) -> Tensor:
+    def _region(self, region: Region, hashes: Hashes, names: Mapping[str, Array]) -> Array:
         """Words [B, W, K] of a region."""
-        found = torch.zeros(
-            len(hashes.keys[0]), self.size[1], self.words, dtype=torch.int64, device=self.device
-        )
-        for number, shape in enumerate(region.shapes):
+        shape = (len(hashes.keys[0]), self.size[1], self.words)
+        found = self.kind.zeros("int64", shape)
+        for number, drawn in enumerate(region.shapes):
             draws = _Draws(hashes, _shape_number(region, number), 1, names)
-            words = self.drawn_words(shape, [draws.tensor(one) for one in shape.amounts])
-            found |= words.expand(len(found), 1, *found.shape[1:])[:, 0]
+            words = self.drawn_words(drawn, [draws.array(one) for one in drawn.amounts])
+            found |= self.kind.xp.broadcast_to(words, (shape[0], 1, *shape[1:]))[:, 0]
         return found
 
-    def drawn_words(self, drawing: Drawing, numbers: list[Tensor | None]) -> Tensor:
+    def drawn_words(self, drawing: Drawing, numbers: list[Array | None]) -> Array:
         """The words of a shape whose numbers broadcast to [B, R]: broadcasts to [B, R, W, K]."""
         if drawing.kind in ("frame", "fill"):
             return self.fixed_words(drawing)
-        return shape_words(drawing.kind, numbers, self.size)
+        return shape_words(self.kind, drawing.kind, numbers, self.size)
 
-    def fixed_words(self, drawing: Drawing) -> Tensor:
+    def fixed_words(self, drawing: Drawing) -> Array:
         """The words [W, K] of a shape of plain numbers."""
         if drawing not in self.fixed:
             shape = Shape(drawing.kind, integers(drawing.amounts) or ())
-            cells = torch.as_tensor(mask(shape, self.size), device=self.device)
-            self.fixed[drawing] = pack(cells)
+            self.fixed[drawing] = pack(self.kind, self.kind.from_numpy(mask(shape, self.size)))
         return self.fixed[drawing]
 
-    def fixed_bits(self, number: int, planes: int) -> Tensor:
+    def fixed_bits(self, number: int, planes: int) -> Array:
         """The bits of an id, as `_plane_bits` has them."""
         if (number, planes) not in self._bits:
-            ids = torch.tensor(number, device=self.device)
-            self._bits[number, planes] = _plane_bits(ids, planes, self.planes)
+            ids = self.kind.put([[number]], "int64")
+            self._bits[number, planes] = _plane_bits(self.kind, ids, planes, self.planes)
         return self._bits[number, planes]
 
     def _paint(
         self,
-        planes: Tensor,
+        planes: Array,
         groups: tuple[Group, ...],
         hashes: Hashes,
-        names: Mapping[str, Tensor],
-        regions: Mapping[str, Tensor],
+        names: Mapping[str, Array],
+        regions: Mapping[str, Array],
     ) -> None:
         """Paint all groups on planes, in place."""
-        batch = planes.shape[1]
+        xp, batch = self.kind.xp, planes.shape[1]
         for group in groups:
-            count = _Draws(hashes, group.number, 1, names).tensor(group.count)
+            count = _Draws(hashes, group.number, 1, names).array(group.count)
             assert count is not None
             repeats = group.most
-            if planes.device.type == "cpu" and repeats > 1:
+            if self.kind.on_cpu and repeats > 1:
                 # Repetitions that no world of the batch has are not drawn.
-                repeats = int(count.max()) if count.numel() else 0
+                repeats = int(count.max()) if prod(count.shape) else 0
             if repeats == 0:
                 continue
-            active = torch.arange(repeats, device=self.device) < count
-            once = -active.expand(batch, repeats).long()[..., None, None]
+            active = xp.broadcast_to(self.kind.arange(repeats) < count, (batch, repeats))
+            once = -xp.asarray(active, dtype=xp.int64)[..., None, None]
             local = self._lets(group.lets, hashes, repeats, names)
             painters = []
             for one in group.drawings:
@@ -306,37 +310,40 @@ class WorldMaker:
 class _Painter:
     """One statement in all its repetitions: what it needs is computed for all of them at once."""
 
-    def __init__(self, maker: WorldMaker, drawing: Drawing, draws: _Draws, once: Tensor, planes: int):
+    def __init__(self, maker: WorldMaker, drawing: Drawing, draws: _Draws, once: Array, planes: int):
         """`once`: int64 [B, R, 1, 1], all bits where a world has a repetition."""
         self.maker, self.drawing, self.draws = maker, drawing, draws
-        repeats = once.shape[1]
+        repeats, kind = once.shape[1], maker.kind
         if len(drawing.ids) > 1:
-            ids = torch.tensor(drawing.ids, device=maker.device)[draws.uniform(0, len(drawing.ids) - 1)]
-            bits = _plane_bits(ids, planes, maker.planes)
+            ids = kind.put(list(drawing.ids), "int64")[draws.uniform(0, len(drawing.ids) - 1)]
+            bits = _plane_bits(kind, ids, planes, maker.planes)
         else:  # those of stamps stand in their pictures
             bits = maker.fixed_bits(drawing.ids[0] if drawing.ids else 0, planes)
-        self.bits = bits.unbind(2) if bits.shape[2] > 1 else bits.unbind(2) * repeats
-        self.numbers: list[Tensor | None] = []
+        some = kind.unbound(bits, 2)
+        self.bits = some if len(some) > 1 else some * repeats
+        self.numbers: list[Array | None] = []
         words = once
         if drawing.kind not in _LIMITED and integers(drawing.amounts) is not None:
             words = maker.fixed_words(drawing) & once
         else:
-            numbers = [draws.tensor(one) for one in drawing.amounts]
-            self.numbers = [None if one is None else one.expand(once.shape[:2]) for one in numbers]
+            shape = tuple(once.shape[:2])
+            for one in drawing.amounts:
+                value = draws.array(one)
+                self.numbers.append(None if value is None else kind.xp.broadcast_to(value, shape))
             if drawing.kind not in _LIMITED:
                 words = maker.drawn_words(drawing, self.numbers) & once
-        self.words = words.unbind(1)
+        self.words = kind.unbound(words, 1)
 
-    def paint(self, planes: Tensor, repeat: int, regions: Mapping[str, Tensor]) -> None:
+    def paint(self, planes: Array, repeat: int, regions: Mapping[str, Array]) -> None:
         """Paint one repetition on planes, in place."""
-        drawing = self.drawing
+        drawing, kind = self.drawing, self.maker.kind
         words, bits = self.words[repeat], self.bits[repeat]
         if drawing.kind == "stamp":
             picture = self._stamp(repeat)
-            words = words & pack(picture != NOTHING)
-            layers = [pack((picture >> place & 1).bool()) for place in range(self.maker.planes)]
-            layers += [torch.full_like(words, -1)] * (len(planes) - len(layers))
-            bits = torch.stack(layers)
+            words = words & pack(kind, picture != NOTHING)
+            layers = [pack(kind, (picture >> place & 1) != 0) for place in range(self.maker.planes)]
+            layers += [kind.xp.full_like(words, -1)] * (len(planes) - len(layers))
+            bits = kind.xp.stack(layers)
         elif drawing.kind == "scatter":
             words = words & self._scattered(repeat)
         if drawing.where is not None:
@@ -345,38 +352,39 @@ class _Painter:
             words = words & self._holding(planes, drawing.over)
         planes ^= (planes ^ bits) & words
 
-    def _holding(self, planes: Tensor, ids: frozenset[int]) -> Tensor:
+    def _holding(self, planes: Array, ids: frozenset[int]) -> Array:
         """The words of cells that hold one of some elements."""
-        found = torch.zeros_like(planes[0])
+        xp = self.maker.kind.xp
+        found = xp.zeros_like(planes[0])
         for one in sorted(ids):
-            same = torch.full_like(planes[0], -1 if one >> self.maker.planes == 0 else 0)
+            same = xp.full_like(planes[0], -1 if one >> self.maker.planes == 0 else 0)
             for place in range(self.maker.planes):
                 same = same & (planes[place] if one >> place & 1 else ~planes[place])
             found = found | same
         return found
 
-    def _stamp(self, repeat: int) -> Tensor:
+    def _stamp(self, repeat: int) -> Array:
         """The stamp where it stands in each world: uint8 [B, H, W], NOTHING around it."""
-        picture = self.maker.stamps[str(self.drawing.stamp)]
+        kind, picture = self.maker.kind, self.maker.stamps[str(self.drawing.stamp)]
         index = []
         for axis, side in enumerate(self.maker.size):
             start = self.numbers[axis]
             assert start is not None
-            place = torch.arange(side, device=picture.device) - start[:, repeat, None] + 1
-            index.append(place.clamp(0, picture.shape[axis] - 1))
+            place = kind.arange(side) - start[:, repeat, None] + 1
+            index.append(kind.xp.clip(place, 0, picture.shape[axis] - 1))
         return picture[index[0][:, :, None], index[1][:, None, :]]
 
-    def _scattered(self, repeat: int) -> Tensor:
+    def _scattered(self, repeat: int) -> Array:
         """Words [B, W, K] in which each bit is set with the chance of `chance` in a hundred.
 
         A draw of CHANCE_BITS bits is compared with the threshold from the last bit to the first, 64 cells at once.
         """
-        percent = self.numbers[0]
+        kind, percent = self.maker.kind, self.numbers[0]
         assert percent is not None
         limit = (percent[:, repeat, None] << CHANCE_BITS) // 100
         width, words = self.maker.size[1], self.maker.words
-        halves = torch.arange(2 * width * words, device=limit.device)
-        below = torch.zeros_like(halves)[None]
+        halves = kind.arange(2 * width * words)
+        below = kind.xp.zeros_like(halves)[None]
         for place in range(CHANCE_BITS):
             counters = (
                 ((halves + 1) * CHANCE_BITS + place) * (_NUMBERS * 256) + repeat * _NUMBERS + _NUMBERS - 1
@@ -384,19 +392,18 @@ class _Painter:
             drawn = self.draws.hashes.draw(self.drawing.number, counters)
             bit = -(limit >> place & 1)
             below = (bit & ~drawn) | (~(bit ^ drawn) & below)
-        below = torch.where(limit >> CHANCE_BITS > 0, -1, below) & MASK
-        low, high = below.view(-1, width, words, 2).unbind(-1)
+        below = kind.xp.where(limit >> CHANCE_BITS > 0, -1, below) & MASK
+        low, high = kind.unbound(below.reshape(-1, width, words, 2), -1)
         return low | high << 32
 
 
-def _plane_bits(ids: Tensor, planes: int, own: int) -> Tensor:
-    """The bits of ids [B, R] (or fewer) in each plane, as whole words: [P, B, R, 1, 1], planes beyond `own` set."""
-    ids = ids[(None,) * (2 - ids.ndim)]
-    place = torch.arange(planes, device=ids.device)[:, None, None]
-    return torch.where(place < own, -(ids >> place & 1), -1)[..., None, None]
+def _plane_bits(kind: ArrayKind, ids: Array, planes: int, own: int) -> Array:
+    """The bits of ids [B, R] in each plane, as whole words: int64 [P, B, R, 1, 1], planes beyond `own` set."""
+    place = kind.arange(planes)[:, None, None]
+    return kind.xp.where(place < own, -(ids >> place & 1), -1)[..., None, None]
 
 
-def _bordered(rows: tuple[tuple[int, ...], ...], device: torch.device) -> Tensor:
+def _bordered(rows: tuple[tuple[int, ...], ...], kind: ArrayKind) -> Array:
     """A stamp's ids with a border of NOTHING, uint8 [h + 2, w + 2]: what lies outside is read there."""
-    picture = torch.tensor(rows, dtype=torch.uint8, device=device)
-    return torch.nn.functional.pad(picture, (1, 1, 1, 1), value=NOTHING)
+    edge = [NOTHING] * (len(rows[0]) + 2)
+    return kind.put([edge, *([NOTHING, *row, NOTHING] for row in rows), edge], "uint8")

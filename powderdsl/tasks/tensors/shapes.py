@@ -3,54 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
+from typing import Any
 
-import torch
-from torch import Tensor
-
+from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.worlds.raster import Size, covered_rows
 
 
-def shape_words(kind: str, numbers: Sequence[Tensor | None], size: Size) -> Tensor:
+def shape_words(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size) -> Array:
     """The cells of shapes, not frames, as bits: int64 [..., W, ⌈H/64⌉].
 
     `numbers` are int64 [...], in the order of `scene.statements.NUMBERS`; None is an open end.
     """
+    xp = kind.xp
     given = [None if one is None else one[..., None] for one in numbers]
-    device = next((one.device for one in given if one is not None), None)
-    rows = covered_rows(torch, kind, given, torch.arange(size[1], device=device), size)
-    first, last = (one.clamp(0, size[0]) for one in rows)
-    below = [_bits_below(last - base) & ~_bits_below(first - base) for base in range(0, size[0], 64)]
-    return torch.stack(below, -1)
+    rows = covered_rows(xp, shape, given, kind.arange(size[1]), size)
+    first, last = (xp.clip(one, 0, size[0]) for one in rows)
+    below = [_bits_below(xp, last - base) & ~_bits_below(xp, first - base) for base in range(0, size[0], 64)]
+    return xp.stack(below, -1)
 
 
-def _bits_below(n: Tensor) -> Tensor:
+def _bits_below(xp: Any, n: Array) -> Array:
     """Words whose bits below bit n are set; all of them from 64 on."""
-    return torch.where(n >= 64, -1, (1 << n.clamp(0, 63)) - 1)
+    return xp.where(n >= 64, -1, (1 << xp.clip(n, 0, 63)) - 1)
 
 
-def pack(cells: Tensor) -> Tensor:
+def pack(kind: ArrayKind, cells: Array) -> Array:
     """Cells, bool [..., H, W], as bits: int64 [..., W, ⌈H/64⌉]."""
     *batch, height, width = cells.shape
-    number = -(-height // 64)
-    padded = torch.nn.functional.pad(cells.to(torch.uint8), (0, 0, 0, 64 * number - height))
-    bits = padded.view(*batch, number, 64, width).long()
-    shift = torch.arange(64, device=cells.device)[:, None]
-    return (bits << shift).sum(-2).transpose(-1, -2).contiguous()
+    number, xp = -(-height // 64), kind.xp
+    missing = kind.zeros("uint8", (*batch, 64 * number - height, width))
+    padded = xp.concatenate([xp.asarray(cells, dtype=xp.uint8), missing], axis=-2)
+    bits = xp.asarray(padded.reshape(*batch, number, 64, width), dtype=xp.int64)
+    return kind.contiguous(xp.swapaxes((bits << kind.arange(64)[:, None]).sum(-2), -1, -2))
 
 
-def unpack(planes: Sequence[Tensor] | Tensor, height: int) -> Tensor:
+def unpack(kind: ArrayKind, planes: Sequence[Array] | Array, height: int) -> Array:
     """Numbers whose bits are planes, int64 [..., W, ⌈H/64⌉] each, lowest first: uint8 [..., H, W]."""
-    found: Tensor | None = None
-    table = _EIGHT_ROWS.to(planes[0].device)
+    table = _eight_rows(kind)
+    found: Array | None = None
     for place, words in enumerate(planes):
         # A byte of a word is eight rows. In the table it is eight bytes, so that eight numbers are put together at once.
-        eight = table.index_select(0, words.reshape(-1).view(torch.uint8).int()) << place
+        eight = kind.entries(table, kind.as_bytes(words)) << place
         found = eight if found is None else found | eight
     assert found is not None
     *batch, width, number = planes[0].shape
-    columns = found.view(torch.uint8).view(*batch, width, 64 * number)
-    return columns[..., :height].transpose(-1, -2).contiguous()
+    columns = kind.as_bytes(found).reshape(*batch, width, 64 * number)
+    return kind.contiguous(kind.xp.swapaxes(columns[..., :height], -1, -2))
 
 
-_EIGHT_ROWS = (torch.arange(256)[:, None] >> torch.arange(8) & 1).to(torch.uint8).view(torch.int64)[:, 0]
-"""The bits of each byte as eight bytes, which are one word: int64 [256]."""
+@cache
+def _eight_rows(kind: ArrayKind) -> Array:
+    """The bits of each byte as eight bytes, which are one word: int64 [256]."""
+    return kind.put([sum((byte >> row & 1) << 8 * row for row in range(8)) for byte in range(256)], "int64")
