@@ -7,7 +7,7 @@ from itertools import compress
 from math import prod
 from typing import Any, NamedTuple
 
-from powderdsl.arrays.movement import Shape, expanded, places_of, steps_of
+from powderdsl.arrays.movement import FEW, Shape, expanded, places_of, steps_of
 
 _WIDE = 8
 
@@ -34,16 +34,24 @@ class Ranges(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Places in elements, and the shape of the result."""
+    """Places in elements of each block, and the shape of the result."""
 
     places: list[int]
     shape: Shape
+    block: int
 
 
 def selected(key: tuple[Any, ...], shape: Shape) -> Ranges | Places:
     """What a key selects: integers, slices, None, Ellipsis, Picks and Masks. Raises IndexError."""
     items = _complete(key, shape)
-    if any(isinstance(one, (Picks, Mask)) for one in items):
+    arrays = sum(isinstance(one, (Picks, Mask)) for one in items)
+    if arrays:
+        others = sum(isinstance(one, int) for one in items)
+        if (
+            arrays == 1 and not others and items[0] == slice(None) and shape[0] >= FEW
+        ):  # the same in each block
+            inner = _places(items[1:], shape[1:])
+            return Places(inner.places, (shape[0], *inner.shape), prod(shape[1:]))
         return _places(items, shape)
     parts: list[range] = []
     found: list[int] = []
@@ -57,14 +65,6 @@ def selected(key: tuple[Any, ...], shape: Shape) -> Ranges | Places:
             place = _within(one, shape[len(parts)], len(parts))
             parts.append(range(place, place + 1))
     return Ranges(parts, tuple(found))
-
-
-def all_places(ranges: Ranges, shape: Shape) -> list[int]:
-    """The places that ranges select."""
-    steps = steps_of(shape)
-    return places_of(
-        [[place * step for place in part] for part, step in zip(ranges.parts, steps, strict=True)]
-    )
 
 
 def _complete(key: tuple[Any, ...], shape: Shape) -> list[Any]:
@@ -111,7 +111,7 @@ def _places(items: list[Any], shape: Shape) -> Places:
                 axis += len(one.shape)
             else:
                 picks = one if isinstance(one, Picks) else Picks((), [one])
-                values = [_within(value, shape[axis], axis) * steps[axis] for value in picks.values]
+                values = _scaled(picks.values, shape[axis], axis, steps[axis])
                 chosen.append((picks.shape, values))
                 axis += 1
     together, offsets = _added(chosen)
@@ -121,7 +121,13 @@ def _places(items: list[Any], shape: Shape) -> Places:
         first = 0
     lists = [offsets if side is None else side for side in sides]
     lengths: list[Shape] = [together if side is None else (len(side),) for side in sides]
-    return Places(places_of(lists), tuple(length for part in lengths for length in part))
+    return Places(places_of(lists), tuple(length for part in lengths for length in part), prod(shape))
+
+
+def _scaled(values: Sequence[int], side: int, axis: int, step: int) -> list[int]:
+    if values and not (min(values) >= 0 and max(values) < side):
+        values = [_within(value, side, axis) for value in values]
+    return [value * step for value in values] if step != 1 else [*values]
 
 
 def _of_mask(mask: Mask, shape: Shape, axis: int, steps: Shape) -> tuple[Shape, list[int]]:
@@ -135,6 +141,8 @@ def _of_mask(mask: Mask, shape: Shape, axis: int, steps: Shape) -> tuple[Shape, 
 
 def _added(chosen: list[tuple[Shape, list[int]]]) -> tuple[Shape, list[int]]:
     """The shape of arrays together, and the sums of their places."""
+    if len(chosen) == 1:
+        return chosen[0]
     try:
         shape = broadcast([one for one, _ in chosen])
     except ValueError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from itertools import chain, product
+from itertools import chain
 from math import prod
 from operator import itemgetter
 
@@ -27,11 +27,48 @@ def taken(raw: bytes, size: int, places: Sequence[int]) -> bytes:
 
 def put(raw: bytes, size: int, places: Sequence[int], values: bytes) -> bytes:
     """The memory with other elements at some places; of several for one place the last one stays."""
-    code = _UNSIGNED[size]
-    changed, given = array(code, bytes(raw)), array(code, bytes(values))
+    changed, given = typed(raw, size), typed(values, size)
     for place, value in zip(places, given, strict=True):
         changed[place] = value
     return changed.tobytes()
+
+
+def typed(raw: bytes, size: int) -> array[int]:
+    """A copy of the memory whose elements are numbers."""
+    return array(_UNSIGNED[size], bytes(raw))
+
+
+FEW = 6
+"""Blocks from which on it pays to move the same element of all blocks at once."""
+
+
+def shuffled(raw: bytes, size: int, block: int, places: Sequence[int]) -> bytes:
+    """In each block of some elements those at `places`, in this order."""
+    count = len(raw) // (size * block) if block else 0
+    if count < FEW:
+        return taken(
+            raw, size, [start + place for start in range(0, count * block, block) for place in places]
+        )
+    source, found = typed(raw, size), typed(bytes(count * len(places) * size), size)
+    for number, place in enumerate(places):
+        found[number :: len(places)] = source[place::block]
+    return found.tobytes()
+
+
+def put_shuffled(raw: bytes, size: int, block: int, places: Sequence[int], values: bytes) -> bytes:
+    """The memory with other elements at `places` of each block."""
+    changed, given = typed(raw, size), typed(values, size)
+    for number, place in enumerate(places):
+        changed[place::block] = given[number :: len(places)]
+    return changed.tobytes()
+
+
+def looked_up(raw: bytes, row: int, numbers: bytes) -> bytes:
+    """The rows of some bytes each that have these numbers."""
+    found = bytearray(len(numbers) * row)
+    for place in range(row):
+        found[place::row] = numbers.translate(raw[place::row][:256].ljust(256, b"\0"))
+    return bytes(found)
 
 
 def steps_of(shape: Shape) -> Shape:
@@ -43,26 +80,61 @@ def steps_of(shape: Shape) -> Shape:
     return tuple(reversed(found))
 
 
-def sliced(raw: bytes, size: int, shape: Shape, parts: Sequence[range]) -> bytes:
-    """The elements at the places `parts` along the axes."""
+def _runs(shape: Shape, parts: Sequence[range]) -> tuple[list[int], int]:
+    """Where runs of elements that lie together begin, and how long they are; 0 if there are none."""
     steps = steps_of(shape)
     axis = len(shape)
     while axis and parts[axis - 1] == range(shape[axis - 1]):  # whole axes at the end lie together
         axis -= 1
     if axis == 0:
-        return raw
+        return [0], prod(shape)
+    if parts[axis - 1].step != 1 and len(parts[axis - 1]) > 1:
+        return places_of(_offsets(parts[:axis], steps)), steps[axis - 1]
+    starts = places_of(_offsets((*parts[: axis - 1], parts[axis - 1][:1]), steps))
+    return starts, len(parts[axis - 1]) * steps[axis - 1]
+
+
+def sliced(raw: bytes, size: int, shape: Shape, parts: Sequence[range]) -> bytes:
+    """The elements at the places `parts` along the axes."""
     if any(not len(part) for part in parts):
         return b""
-    outer, part, step = parts[: axis - 1], parts[axis - 1], steps[axis - 1]
-    starts = [sum(place) for place in product(*_offsets(outer, steps))]
-    first, count = part[0] * step, len(part)
-    if part.step == 1 or count == 1:
-        length = count * step
-        if count == 1 and step == 1 and len(starts) > 1:
-            return _every(raw, size, [start + first for start in starts])
-        pieces = [raw[(start + first) * size : (start + first + length) * size] for start in starts]
-        return b"".join(pieces) if len(pieces) > 1 else pieces[0]
-    return taken(raw, size, [s + p * step + i for s in starts for p in part for i in range(step)])
+    inner = _in_blocks(shape, parts)
+    if inner is not None:
+        return shuffled(raw, size, prod(shape[1:]), inner)
+    starts, length = _runs(shape, parts)
+    if len(starts) == 1:
+        return raw[starts[0] * size : (starts[0] + length) * size]
+    if length == 1:
+        return _every(raw, size, starts)
+    return b"".join([raw[start * size : (start + length) * size] for start in starts])
+
+
+def _in_blocks(shape: Shape, parts: Sequence[range]) -> list[int] | None:
+    """The places in each world of a batch, if it pays to move them in all worlds at once."""
+    if len(shape) < 2 or shape[0] < FEW or parts[0] != range(shape[0]):
+        return None
+    starts, length = _runs(shape[1:], parts[1:])
+    if length == prod(shape[1:]) or len(starts) * length > 4 * shape[0]:
+        return None
+    return [start + place for start in starts for place in range(length)]
+
+
+def put_sliced(raw: bytes, size: int, shape: Shape, parts: Sequence[range], values: bytes) -> bytes:
+    """The memory with other elements at the places `parts` along the axes."""
+    if any(not len(part) for part in parts):
+        return raw
+    inner = _in_blocks(shape, parts)
+    if inner is not None:
+        return put_shuffled(raw, size, prod(shape[1:]), inner, values)
+    starts, length = _runs(shape, parts)
+    if length == 1:
+        return put(raw, size, starts, values)
+    changed = bytearray(raw)
+    for number, start in enumerate(starts):
+        changed[start * size : (start + length) * size] = values[
+            number * length * size : (number + 1) * length * size
+        ]
+    return bytes(changed)
 
 
 def _offsets(parts: Sequence[range], steps: Shape) -> list[list[int]]:
@@ -120,15 +192,35 @@ def permuted(raw: bytes, size: int, shape: Shape, axes: Sequence[int]) -> bytes:
     kept = len(axes)
     while kept and axes[kept - 1] == kept - 1:
         kept -= 1
-    if kept == 0:
+    if kept == 0 or not raw:
         return raw
-    block = prod(shape[kept:])
+    first = next(place for place in range(kept) if axes[place] != place)
     steps = steps_of(shape[:kept])
-    ranges = [range(0, shape[axis] * steps[axis], steps[axis]) for axis in axes[:kept]]
-    if block == 1:
-        return taken(raw, size, places_of(ranges))
-    length = block * size
-    return b"".join([raw[place * length : (place + 1) * length] for place in places_of(ranges)])
+    block = prod(shape[kept:])
+    if block > 1:
+        length = block * size
+        ranges = [range(0, shape[axis] * steps[axis], steps[axis]) for axis in axes[:kept]]
+        return b"".join([raw[place * length : (place + 1) * length] for place in places_of(ranges)])
+    count, inner = prod(shape[:first]), prod(shape[first:kept])
+    turn = axes[first]
+    if count < FEW and [*axes[first:kept]] == [*range(turn, kept), *range(first, turn)]:
+        columns, length = prod(shape[turn:kept]), inner * size
+        blocks = (raw[start : start + length] for start in range(0, len(raw), length))
+        return b"".join([_turned(one, size, columns) for one in blocks])
+    ranges = [range(0, shape[axis] * steps[axis], steps[axis]) for axis in axes[first:kept]]
+    return shuffled(raw, size, inner, places_of(ranges))
+
+
+def _turned(raw: bytes, size: int, columns: int) -> bytes:
+    """Rows and columns exchanged."""
+    source = typed(raw, size)
+    rows = len(source) // columns
+    if columns <= rows:
+        return b"".join([source[column::columns] for column in range(columns)])
+    found = typed(raw, size)
+    for row in range(rows):
+        found[row::rows] = source[row * columns : (row + 1) * columns]
+    return found.tobytes()
 
 
 def places_of(ranges: Sequence[Sequence[int]]) -> list[int]:

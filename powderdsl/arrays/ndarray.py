@@ -19,9 +19,19 @@ from powderdsl.arrays.arithmetic import (
     negated,
 )
 from powderdsl.arrays.dtypes import bool_, dtype, int64
-from powderdsl.arrays.indexing import Mask, Picks, Ranges, all_places, broadcast, selected
+from powderdsl.arrays.indexing import Mask, Picks, Ranges, broadcast, selected
 from powderdsl.arrays.memories import Memory, checked, converted, filled, number, numbers, own
-from powderdsl.arrays.movement import Shape, expanded, permuted, put, sliced, taken
+from powderdsl.arrays.movement import (
+    Shape,
+    expanded,
+    looked_up,
+    permuted,
+    put,
+    put_shuffled,
+    put_sliced,
+    shuffled,
+    sliced,
+)
 from powderdsl.arrays.reductions import axes_of, reduced
 from powderdsl.arrays.shown import shown
 
@@ -225,8 +235,13 @@ class Numbers:
 
     def __getitem__(self, key: Any) -> Any:
         parts = self._key(key)
-        found = selected(parts, self.shape)
         raw, held = self.memory.raw, self.memory.type
+        if len(parts) == 1 and isinstance(parts[0], Picks) and self.shape and not self.memory.single:
+            row = prod(self.shape[1:]) * held.itemsize
+            rows = _rows_at(raw, row, self.shape[0], parts[0].values)
+            if rows is not None:
+                return made((*parts[0].shape, *self.shape[1:]), self.dtype, Memory(rows, held))
+        found = selected(parts, self.shape)
         if isinstance(found, Ranges):
             if not self.memory.single:
                 raw = sliced(raw, held.itemsize, self.shape, found.parts)
@@ -234,7 +249,7 @@ class Numbers:
                 return result((), self.dtype, Memory(raw, held))
             return self.viewed(found.shape, Memory(raw, held))
         if not self.memory.single:
-            raw = taken(raw, held.itemsize, found.places)
+            raw = shuffled(raw, held.itemsize, found.block, found.places)
         return made(found.shape, self.dtype, Memory(raw, held))
 
     # Operations
@@ -273,7 +288,6 @@ class ndarray(Numbers):
             old = self.full if len(flags) == 1 else self.memory
             self.memory = chosen(flags, memory, old, self.dtype, self.size) if flags else self.memory
             return
-        places = all_places(found, self.shape) if isinstance(found, Ranges) else found.places
         sides = given.shape
         if isinstance(found, Ranges) and found.shape == () != sides and ... not in parts:
             raise ValueError("setting one element with an array is not there without NumPy")
@@ -288,11 +302,14 @@ class ndarray(Numbers):
         memory = _spread(memory, sides, found.shape)
         held = self.memory.type if memory.type is self.memory.type else self.dtype
         size = held.itemsize
-        raws = [
-            own(filled(one, prod(shape)), held)
-            for one, shape in ((self.memory, self.shape), (memory, found.shape))
-        ]
-        self.memory = Memory(put(raws[0], size, places, raws[1]), held)
+        before, given_raw = own(self.full, held), own(filled(memory, prod(found.shape)), held)
+        if isinstance(found, Ranges):
+            raw = put_sliced(before, size, self.shape, found.parts, given_raw)
+        elif found.block < self.size:
+            raw = put_shuffled(before, size, found.block, found.places, given_raw)
+        else:
+            raw = put(before, size, found.places, given_raw)
+        self.memory = Memory(raw, held)
 
     def check_writable(self) -> None:
         if self.fixed:
@@ -348,6 +365,24 @@ def _index(one: Any) -> Any:
     if found.dtype.kind not in "iu":
         raise IndexError("arrays used as indices must be of integer (or boolean) type")
     return Picks(found.shape, numbers(found.full))
+
+
+LONGEST = 64
+"""Bytes of a row of a table whose columns are looked up one by one."""
+
+
+def _rows_at(raw: bytes, row: int, count: int, values: Sequence[int]) -> bytes | None:
+    """The rows of a table at some places, in a fast way; None if there is none."""
+    if isinstance(values, bytes):
+        if count < 256 and values.translate(None, bytes(range(count))):
+            return None
+        if row <= LONGEST:
+            return looked_up(raw, row, values)
+    elif not values or min(values) < 0 or max(values) >= count:
+        return None
+    if row <= LONGEST:
+        return None
+    return b"".join([raw[value * row : (value + 1) * row] for value in values])
 
 
 def _listed(values: Any) -> ndarray:

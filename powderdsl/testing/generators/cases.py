@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import np
@@ -132,8 +133,14 @@ def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
     prop = ruleset.property(slot.name)
     if prop is not None:
         return property_table(ruleset, prop, slot.dtype)[ids]
-    values = np.array([slot.fresh(identity) for identity in range(256)], slot.dtype)[ids]
+    values = _fresh_values(slot)[ids]
     return np.moveaxis(values, -1, 1) if slot.planes == 2 else values
+
+
+@lru_cache(maxsize=64)
+def _fresh_values(slot: Slot) -> Array:
+    """A field's values [256] or [256, 2] in fresh cells, by element id."""
+    return np.array([slot.fresh(identity) for identity in range(256)], slot.dtype)
 
 
 def property_table(ruleset: Ruleset, prop: Property, dtype: str = "float64") -> Array:

@@ -36,7 +36,9 @@ def joined(samples: Sequence[Start], ruleset: Ruleset) -> Start:
         np.concatenate([sample.index for sample in samples]),
         np.concatenate([sample.step for sample in samples]),
         {
-            name: np.concatenate([s.fields.get(name, fresh(ruleset, table[name], s.ids)) for s in samples])
+            name: np.concatenate(
+                [s.fields[name] if name in s.fields else fresh(ruleset, table[name], s.ids) for s in samples]
+            )
             for name in sorted(names)
         },
         {
