@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,71 @@ draw:
   - box cloner rows 2 columns 20:24
   - clone := water in box rows 2 columns 20:24
   - velocity := (-1, 4) in disk at (5, 9) radius 2
+"""
+
+WISHES = """\
+pack: wishes
+elements:
+  air: {id: 0, color: "#FFFFFF", glyph: "."}
+  nut: {id: 1, color: "#806040"}
+  oak: {id: 2, color: "#30A030"}
+fields:
+  wish: {type: element, default: air, at: element}
+  facing: {type: direction, default: above, at: element}
+  awake: {type: flag, at: place}
+  age: {type: 0..999, default: 5, at: place}
+  drift: {type: vec2(-9..9), at: place}
+  heat: {type: real(0..1), at: place}
+passes:
+  grow:
+    do: nut -> wish if wish is oak and facing is left and awake and right is air with chance 20%
+  wander:
+    after: grow
+    do:
+      - nut swaps right if right is air and drift.row > 1 with chance 10%
+      - age += 100 where awake and oak
+      - heat := heat / 3 + 0.1 where oak
+      - drift += vector(0.3, heat) where awake and nut
+      - awake := no where oak
+invariants:
+  - count(oak) is constant
+  - count(nut, oak) is constant
+  - age stays in 5..900
+  - never (oak and age > 800)
+  - nothing reaches beyond 0 cells
+tests:
+  - nuts wait:
+      given: |
+        n . o .
+        . n . .
+      fields:
+        drift: |
+          2,0 . (-2.5,3) .
+          . . . .
+        heat: 0.25
+        facing: |
+          left . . .
+          . above . .
+      after: 3 steps
+      expect: |
+        n . o .
+        . n . o
+      expect_fields:
+        heat: |
+          0.25 0.25 0.15..0.2 .
+          . . . .
+  - nuts swim:
+      given: |
+        n . n .
+      fields: {drift: "3,0 3,0 3,0 3,0"}
+      after: 1 step
+      often: {nut -> air: 10%}
+  - nuts drown:
+      given: |
+        n . n .
+      fields: {drift: "3,0 3,0 3,0 3,0"}
+      after: 1 step
+      often: {nut -> air: 20%}
 """
 
 BLOCK = """
@@ -96,3 +162,35 @@ def test_backends_that_need_torch_say_so() -> None:
     assert ended.returncode == 2
     assert "PD701" in ended.stderr
     assert "torch is not installed" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("check", "powderworld", "--ledger", "--notes"),
+        ("test", "wishes.yaml", "--examples", "32", "--drawn", "2", "--no-keep"),
+        ("trace", "powderworld", "--at", "9,9", "--step", "4", "--size", "16x16", "--seed", "2"),
+        pytest.param(("check", "turned.yaml"), marks=pytest.mark.campaign),
+        pytest.param(("test", "turned.yaml", "--examples", "64", "--no-keep"), marks=pytest.mark.campaign),
+        pytest.param(
+            ("trace", "wishes.yaml", "--at", "1,1", "--step", "3", "--size", "6x6", "--all"),
+            marks=pytest.mark.campaign,
+        ),
+    ],
+    ids=" ".join,
+)
+def test_output_is_that_with_numpy(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    """Invariants that a world breaks, tests that fail by chance, fields of all kinds."""
+    (tmp_path / "wishes.yaml").write_text(WISHES, encoding="utf-8")
+    turned = "  - mirrored worlds agree\n  - rotated worlds agree\ntests:"
+    (tmp_path / "turned.yaml").write_text(WISHES.replace("tests:", turned), encoding="utf-8")
+    programs = (BLOCKED, BLOCKED.removeprefix(BLOCK))
+    ended = [
+        subprocess.run([sys.executable, "-c", one, *arguments], capture_output=True, text=True, cwd=tmp_path)
+        for one in programs
+    ]
+    assert ended[0].stderr == ended[1].stderr == ""
+    first, second = (re.sub(r" in [0-9]+ s\b", "", one.stdout) for one in ended)
+    assert first == second
+    assert ended[0].returncode == ended[1].returncode
+    assert first
