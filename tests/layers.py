@@ -100,7 +100,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "simulation.provenance",
         "simulation.any_arrays",
     ),  # explains by what the oracle does
-    "simulation.media": ("system", "simulation.draw"),
+    "simulation.media": ("arrays", "system", "simulation.draw"),
     "worlds": (*_FRONT, "analysis", "simulation.draw"),
     "worlds.store": (*_FRONT, "worlds", "simulation.any_arrays"),  # saved worlds are values of the simulator
     "testing.generators": _SCREEN,

@@ -10,12 +10,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
-
+from powderdsl.arrays import NDArray, np
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.system.interrupts import held_back
+from powderdsl.system.packages import pillow
 from powderdsl.system.writing import failure, replacing
 
 MIN_GIF_DELAY = 20
@@ -24,8 +22,10 @@ MIN_GIF_DELAY = 20
 
 def write_png(path: str | Path, image: Any) -> None:
     """Write one picture, uint8 [H, W, 3] (array or tensor). Raises ValueError for another shape or type."""
+    images, frame = pillow("writing a picture"), _frame(image)
     with replacing(Path(path), follow=True) as temporary:
-        Image.fromarray(_frame(image)).save(temporary, format="PNG", optimize=True)
+        picture = images.frombytes("RGB", (frame.shape[1], frame.shape[0]), frame.tobytes())
+        picture.save(temporary, format="PNG", optimize=True)
 
 
 def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop: bool = True) -> None:
@@ -35,7 +35,8 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop:
     Raises ValueError for no frames, for frames of different sizes, and for a bad `fps`.
     """
     delay = max(round(100 / _checked_rate(fps)) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
-    images = (_indexed(frame) for frame in _same_size(frames))
+    module = pillow("writing an animation", "numpy")
+    images = (_indexed(module, frame) for frame in _same_size(frames))
     first = next(images)
     endless = {"loop": 0} if loop else {}
     with replacing(Path(path), follow=True) as temporary:
@@ -128,13 +129,13 @@ def _checked_rate(fps: float) -> float:
     return fps
 
 
-def _indexed(frame: NDArray[np.uint8]) -> Image.Image:
+def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
     """A frame with a palette of its own, exact where it has at most 256 colors."""
     packed = frame.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     colors, index = np.unique(packed, return_inverse=True)
     if len(colors) > 256:
-        return Image.fromarray(frame).quantize(256, dither=Image.Dither.NONE)
-    image = Image.fromarray(index.reshape(packed.shape).astype(np.uint8))
+        return images.fromarray(frame).quantize(256, dither=images.Dither.NONE)
+    image = images.fromarray(index.reshape(packed.shape).astype(np.uint8))
     image.putpalette(b"".join(int(color).to_bytes(3, "big") for color in colors))
     return image
 
@@ -142,4 +143,6 @@ def _indexed(frame: NDArray[np.uint8]) -> Image.Image:
 def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """H.264 stores color at half the size, so both sides must be even: the last row or column is doubled."""
     height, width = frame.shape[:2]
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    if height % 2:
+        frame = np.concatenate([frame, frame[-1:]])
+    return np.concatenate([frame, frame[:, -1:]], axis=1) if width % 2 else frame

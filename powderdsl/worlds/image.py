@@ -12,6 +12,7 @@ from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.model.types import Element
 from powderdsl.simulation.draw import ramps
+from powderdsl.system.packages import pillow
 from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
@@ -101,15 +102,15 @@ def _pack(color: str) -> int:
 
 def _pixels(path: Path) -> NDArray[np.uint8]:
     """The picture as uint8 [H, W, 4], red, green, blue, opacity."""
-    pillow = _pillow()
+    images = pillow("reading a picture", "numpy")
     try:
         file = open_regular(path)
     except OSError as error:
         raise failure("PD101", f"cannot read {path}", notes=(error.strerror or str(error),)) from None
     with file:
         try:
-            return _decode(file, path, pillow)
-        except (pillow.DecompressionBombWarning, pillow.DecompressionBombError):
+            return _decode(file, path, images)
+        except (images.DecompressionBombWarning, images.DecompressionBombError):
             raise _too_large(path, "far too many") from None
         except _BROKEN as error:
             raise failure("PD602", f"{path} is not a readable PNG", notes=(str(error)[:200],)) from None
@@ -119,23 +120,10 @@ _BROKEN = (OSError, ValueError, SyntaxError, EOFError, IndexError, OverflowError
 """Errors that Pillow raises for broken files."""
 
 
-def _pillow() -> Any:
-    """Pillow's module of images. Raises CompileError (PD612) where pictures cannot be read."""
-    try:
-        import numpy  # noqa: F401
-        from PIL import Image
-    except ImportError as error:
-        helps = ("pip install numpy pillow, or draw the world as text: a .txt or .yaml file",)
-        raise failure(
-            "PD612", "pictures are read with NumPy and Pillow", notes=(str(error),), helps=helps
-        ) from None
-    return Image
-
-
-def _decode(file: BinaryIO, path: Path, pillow: Any) -> NDArray[np.uint8]:
+def _decode(file: BinaryIO, path: Path, images: Any) -> NDArray[np.uint8]:
     with warnings.catch_warnings():
-        warnings.simplefilter("error", pillow.DecompressionBombWarning)
-        image = pillow.open(file, formats=["PNG"])  # reads the header alone
+        warnings.simplefilter("error", images.DecompressionBombWarning)
+        image = images.open(file, formats=["PNG"])  # reads the header alone
     width, height = image.size
     if height * width > MAX_CELLS:
         raise _too_large(path, f"{height}×{width}")

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 import powderdsl
+from powderdsl.cli.pictures import pictures
 from powderdsl.cli.start_worlds import start
 from powderdsl.compiler import BACKENDS
+from powderdsl.simulation.media import write_png
 from powderdsl.worlds.ascii import write_ascii
 from powderdsl.worlds.strewn import strew
 
@@ -155,6 +157,21 @@ def test_worlds_run_and_are_saved_as_with_torch(tmp_path: Path) -> None:
     drawn = run("run", "powderworld", "--steps", "3", "--size", "9x20", "--seed", "4").stdout
     ids = sim.step(sim.world(strew(sim.ruleset, (9, 20), 1, 4), seed=4), 3).ids[0]
     assert drawn.split() == write_ascii(ids, sim.ruleset.elements).split()
+
+
+def test_pictures_are_written_and_what_lacks_a_package_says_so(tmp_path: Path) -> None:
+    first, second = tmp_path / "first.png", tmp_path / "second.png"
+    assert run("render", "garden", "--rules", "powderworld", "--out", str(first)).returncode == 0
+    ruleset = powderdsl.load("powderworld")
+    write_png(
+        second, pictures(start(ruleset, "garden", None, None, None, backend="wasm"), most=1, factor=None)
+    )
+    assert first.read_bytes() == second.read_bytes()
+    for arguments in (("--world", str(first)), ("--out", f"{tmp_path}/world.gif", "--steps", "1")):
+        ended = run("run", "powderworld", *arguments)
+        assert ended.returncode == 2
+        assert "PD612" in ended.stderr
+        assert "needs numpy" in ended.stderr
 
 
 def test_backends_that_need_torch_say_so() -> None:
