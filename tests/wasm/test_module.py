@@ -109,6 +109,8 @@ def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-
             instance.call("allocate", worlds, rows)
     with pytest.raises(MemoryError):
         instance.call("scratch", (1 << 32) - 1)
+    batch = instance.call("allocate", 2, 64)  # smaller ones still fit
+    instance.call("run", batch, 3)
 
 
 def _programs(name: str) -> tuple[Any, Any]:

@@ -11,7 +11,13 @@ from powderdsl.cli.dispatch import main
 from powderdsl.compiler import load, lower, parts, shipped
 from powderdsl.simulation.array_worlds import ArraySimulator
 from powderdsl.system.memo import Memo
+from powderdsl.targets.array_kind import PlainArrays
 from powderdsl.targets.wasm.source import wasm_module
+from powderdsl.tasks.shipped import load_task
+from powderdsl.tasks.tensors.starts import StartWorlds
+from powderdsl.worlds.scene import load_start
+from powderdsl.worlds.store import load_world, save
+from powderdsl.worlds.strewn import strew
 
 COMMANDS = (
     "check powderworld --quick",
@@ -19,6 +25,7 @@ COMMANDS = (
     "check life",
     "compile powderworld --emit model",
     "explain PD301",
+    "trace powderworld --world garden --at 10,10 --step 5",
 )
 STEPS = 200
 
@@ -46,3 +53,14 @@ velocity = np.frombuffer(Path("velocity").read_bytes(), np.float32).reshape(2, 2
 world = sim.step(sim.replace(sim.world(ids, seed=3), velocity=velocity), STEPS)
 hashes = [f"{name} {sha256(value.tobytes()).hexdigest()}\n" for name, value in sorted(world.state.items())]
 Path("hashes").write_text("".join(hashes))
+
+# Worlds that are drawn, scattered, made for tasks, saved and loaded
+save(world, "world.npz")
+again = sim.step(load_world("world.npz", sim), 5, params={"water.melt": 0.5}, passes=sim.passes[::2])
+Path("world.npz").unlink()
+drawn = load_start("garden", model, size=(40, 70)).ids
+scattered = strew(model, (33, 20), 2, 7)
+painted = sim.paint(sim.world(scattered), where=scattered > 2, element="sand", velocity=(1, 2.5))
+made = StartWorlds(load_task("sort-sand-and-stone"), "train", PlainArrays()).make(np.array([5, 9], np.int64))
+arrays = [*again.state.values(), again.step, drawn, scattered, *painted.state.values(), made.ids]
+Path("worlds").write_text("".join(f"{sha256(value.tobytes()).hexdigest()}\n" for value in arrays))

@@ -62,7 +62,7 @@ def test_the_same_code_and_worlds(wheel: Path, tmp_path: Path, torch) -> None:  
     succeed(sys.executable, script, cwd=here)
     written = {path.name: path.read_bytes() for path in here.iterdir()}
     assert {path.name: path.read_bytes() for path in there.iterdir()} == written
-    assert [written[f"status{number}"] for number in range(5)] == [b"0", b"2", b"0", b"0", b"0"]
+    assert [written[f"status{number}"] for number in range(6)] == [b"0", b"2", b"0", b"0", b"0", b"0"]
 
     native = powderdsl.compile("powderworld", backend="native")
     world = native.step(native.replace(native.world(ids, seed=3), velocity=speed), 200)
