@@ -91,5 +91,5 @@ clean:  ## remove what the targets made, except .venv
 	@rm -rf build dist demo.gif .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find powderdsl tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
-distclean: clean  ## clean, and remove .venv
-	@rm -rf $(VENV)
+distclean: clean  ## clean, and remove what `make setup` and `make web` installed
+	@rm -rf $(VENV) tests/web/node_modules

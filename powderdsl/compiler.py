@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -317,8 +317,8 @@ class _Reader:
         source = read_source(path, self.reporter) if path else None
         if source is None:
             return None
-        memo = Memo(1) if self.memo is None else self.memo
-        decl, found = memo.of(("declaration", source), lambda: _read_apart(source))
+        memo = Memo() if self.memo is None else self.memo
+        decl, found = memo.of(("declaration", source.name), source, lambda: _read_apart(source))
         for one in found:
             self.reporter.add(one)
         return decl
@@ -468,8 +468,9 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
         return run_passes(program)
 
     def optimized(pass_: PassGraph) -> PassGraph:
-        key = "optimized", program.slots, structure(pass_)
-        (made,) = memo.of(key, lambda: run_passes(replace(program, passes=(pass_,))).passes)
+        key = program.slots, structure(pass_)
+        run = partial(run_passes, replace(program, passes=(pass_,)))
+        (made,) = memo.of(("optimized", pass_.name), key, run).passes
         return made
 
     return replace(program, passes=tuple(map(optimized, program.passes)))
@@ -483,6 +484,6 @@ def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:
     def carried(whole: Program, pass_: PassGraph) -> Carried:
         if memo is None:
             return carry(whole, pass_)
-        return memo.of(("planes", whole.slots, structure(pass_)), lambda: carry(whole, pass_))
+        return memo.of(("planes", pass_.name), (whole.slots, structure(pass_)), lambda: carry(whole, pass_))
 
     return segments(program, carried)

@@ -133,7 +133,7 @@ COMMUTATIVE = frozenset({"and", "or", "xor", "eq", "add", "mul", "min", "max"})
 LEAVES = frozenset({"input", "const", "param", "coordinate", "inside", "draw"})
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Node:
     """An operation on nodes. Made by `Graph.node` only; identity is equality within a graph."""
 
@@ -151,6 +151,12 @@ class Graph:
 
     def __init__(self) -> None:
         self._nodes: dict[Hashable, Node] = {}
+
+    def copy(self) -> Graph:
+        """A graph with the same nodes, to which others can be added."""
+        made = Graph()
+        made._nodes = dict(self._nodes)
+        return made
 
     @property
     def size(self) -> int:

@@ -20,16 +20,20 @@ from powderdsl.targets.wasm.source import wasm_module
 
 
 def test_the_least_recently_used_is_forgotten() -> None:
-    memo, made = Memo(2), []
+    memo, made = Memo(versions=2, things=2), []
 
-    def use(key: str) -> str:
-        return memo.of(key, lambda: made.append(key) or key.upper())
+    def use(thing: str, version: str) -> str:
+        return memo.of(thing, version, lambda: made.append(thing + version) or (thing + version).upper())
 
-    assert [use(key) for key in "abacab"] == list("ABACAB")
-    assert made == list("abcb")
-    assert len(memo) == 2
+    assert [use("x", version) for version in "abacab"] == [f"X{version}".upper() for version in "abacab"]
+    assert made == ["xa", "xb", "xc", "xb"]
+    for thing in "yxzx":
+        use(thing, "b")
+    assert made[4:] == ["yb", "zb"]
+    use("y", "b")
+    assert made[6:] == ["yb"]
     with pytest.raises(ValueError, match="at least one"):
-        Memo(0)
+        Memo(versions=0)
 
 
 def test_exceptions_are_not_kept() -> None:
@@ -40,16 +44,17 @@ def test_exceptions_are_not_kept() -> None:
 
     for _ in range(2):
         with pytest.raises(KeyError):
-            memo.of("key", fail)
-    assert memo.of("key", lambda: 1) == 1
+            memo.of("thing", "version", fail)
+    assert memo.of("thing", "version", lambda: 1) == 1
 
 
 def code(path: Path, memo: Memo | None) -> bytes:
     model, _ = load_with_diagnostics(path, memo=memo)
     return b"".join(
-        wasm_module(part.planes, 64, memo=memo).code
+        wasm_module(part.planes, width, memo=memo).code
         for part in parts(lower(model, memo), memo)
         if part.planes is not None
+        for width in (64, 70)
     )
 
 

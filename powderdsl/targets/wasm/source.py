@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import or_
 
@@ -65,4 +65,6 @@ def wasm_module(
 def _schedule(pass_: PassGraph, memo: Memo | None) -> Schedule:
     if memo is None:
         return plan(pass_, CPU)
-    return memo.of(("schedule", structure(pass_, places=False)), lambda: plan(pass_, CPU))
+    key = structure(pass_, places=False)
+    kept = memo.of(("schedule", pass_.name), key, lambda: plan(pass_, CPU))
+    return replace(kept, graph=kept.graph.copy())  # emitting code adds nodes to it
