@@ -68,6 +68,7 @@ class Instance:
         self.gone: list[int] = []
         """Batches that nobody uses any more."""
         self._lock = RLock()
+        self._inputs_at = self.call("inputs", 0)  # from the beginning of a batch
         self._inputs: tuple[Mapping[str, Array], int, bytes] | None = None
         """The last parameters, the number of worlds, and what the module takes for them."""
 
@@ -143,7 +144,7 @@ class Instance:
             self._inputs = (job.params, worlds, self.input_bytes(job.params, worlds))
         clocks = [self.kind.contiguous(one) for one in (job.clock.seed, job.clock.world, job.clock.step)]
         data = b"".join((*map(self.kind.bytes_of, clocks), self._inputs[2]))
-        self.running.write(self.call("inputs", batch), data)
+        self.running.write(batch + self._inputs_at, data)
 
     def run(self, batch: int, job: Job, worlds: int) -> None:
         """Run a batch, and measure the time of passes if the job asks for it."""

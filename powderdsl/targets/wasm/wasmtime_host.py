@@ -33,12 +33,13 @@ class WasmtimeModule:
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
         self._store = wasmtime.Store(engine)
-        exports = dict(wasmtime.Instance(self._store, module, []).exports(self._store).items())
+        exports: dict[str, Any] = dict(wasmtime.Instance(self._store, module, []).exports(self._store).items())
         self._context = self._store._context()
         self._functions = {
             name: ctypes.byref(one._func) for name, one in exports.items() if isinstance(one, wasmtime.Func)
         }
-        self._memory: Any = exports["memory"]
+        self._memory = exports["memory"]
+        self._memory_at = ctypes.byref(self._memory._memory)
         self._raw = (ctypes.c_uint64 * (2 * MOST_ARGUMENTS))()  # of 16 bytes each
         self._values = ctypes.cast(self._raw, ctypes.POINTER(_ffi.wasmtime_val_raw_t))
         self._trap = ctypes.POINTER(_ffi.wasm_trap_t)()
@@ -66,6 +67,9 @@ class WasmtimeModule:
             ctypes.memset(self._trap_at, 0, ctypes.sizeof(self._trap))
 
     def write(self, at: int, data: Bytes) -> None:
+        if isinstance(data, bytes):
+            ctypes.memmove(self._address(at), data, len(data))
+            return
         view = memoryview(data).cast("B")
         self._bytes(at, view.nbytes)[:] = view
 
@@ -73,10 +77,13 @@ class WasmtimeModule:
         view = memoryview(out).cast("B")
         view[:] = self._bytes(at, view.nbytes)
 
+    def _address(self, at: int) -> int:
+        """An address of the module's memory in this process; memory may move when it grows."""
+        start = _ffi.wasmtime_memory_data(self._context, self._memory_at)
+        return ctypes.addressof(start.contents) + at
+
     def _bytes(self, at: int, size: int) -> memoryview:
-        """Some bytes of the module's memory, which may move when it grows."""
-        start = ctypes.addressof(self._memory.data_ptr(self._store).contents)
-        return memoryview((ctypes.c_ubyte * size).from_address(start + at)).cast("B")
+        return memoryview((ctypes.c_ubyte * size).from_address(self._address(at))).cast("B")
 
     def memory_size(self) -> int:
         return int(self._memory.data_len(self._store))
