@@ -14,6 +14,8 @@ from powderdsl.arrays.memories import Memory, checked, converted, own
 from powderdsl.arrays.movement import Shape, expanded
 from powderdsl.arrays.ndarray import Numbers, array_of, generic, made, ndarray, result
 
+_PLAIN = {bool, int, float}
+
 
 def asarray(values: Any, dtype: Any = None) -> ndarray:
     """An array of anything that is one, or of nested lists."""
@@ -30,6 +32,12 @@ def asarray(values: Any, dtype: Any = None) -> ndarray:
             raise TypeError(f"there are no arrays of {type(values).__name__} without NumPy")
         wanted = kind or result_type([], [values])
         return made((), wanted, checked([values], wanted))
+    types = {*map(type, values)} if values else set()
+    if len(types) == 1 and types <= _PLAIN:
+        wanted = kind or result_type([], [values[0]])
+        # Equal numbers are held as one; of zeros there are two.
+        one = isinstance(values, list) and values[0] and values.count(values[0]) == len(values)
+        return made((len(values),), wanted, checked([values[0]] if one else list(values), wanted))
     shape, leaves = _nested(values)
     found = [one.dtype for one in leaves if isinstance(one, Numbers)]
     weak = [one for one in leaves if not isinstance(one, Numbers)]

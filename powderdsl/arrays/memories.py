@@ -77,13 +77,16 @@ def packed(values: list[Any], kind: dtype) -> Memory:
 def checked(values: list[Any], kind: dtype) -> Memory:
     """Numbers of Python that must fit. Raises OverflowError for integers that do not, TypeError for others."""
     if kind.kind == "f":
-        return packed([rounded(value, kind) for value in values], kind)
+        if {*map(type, values)} != {float}:
+            values = [rounded(value, kind) for value in values]
+        return packed(values, kind)
     if kind is bool_:
         return Memory(bytes(map(bool, values)), kind)
-    values = [value if isinstance(value, int) else _whole(value) for value in values]
-    for value in values:
-        if not kind.low <= value <= kind.high:
-            raise OverflowError(f"Python integer {value} out of bounds for {kind}")
+    if not {*map(type, values)} <= {int, bool}:
+        values = [value if isinstance(value, int) else _whole(value) for value in values]
+    if values and not (kind.low <= min(values) and max(values) <= kind.high):
+        wrong = next(value for value in values if not kind.low <= value <= kind.high)
+        raise OverflowError(f"Python integer {wrong} out of bounds for {kind}")
     return packed(values, kind)
 
 

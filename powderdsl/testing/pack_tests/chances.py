@@ -114,8 +114,8 @@ def _cells(claim: Often, start: AnyWorld) -> NDArray[np.bool_]:
 
 def _copies(start: W, first: int, count: int, seed: int) -> W:
     """The world many times over, each with another index and so with luck of its own."""
-    many = start.select([0] * count)
     put = start.sim.kind.put
+    many = start.select(put([0] * count, "int64"))
     index, seeds = put([*range(first, first + count)], "int64"), put([seed] * count, "int64")
     return replace(many, index=index, seed=seeds)
 
