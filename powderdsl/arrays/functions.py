@@ -14,13 +14,12 @@ from powderdsl.arrays.dtypes import bool_, float32, float64, int64, promoted
 from powderdsl.arrays.indexing import broadcast
 from powderdsl.arrays.making import asarray, broadcast_to, zeros
 from powderdsl.arrays.memories import Memory, checked, converted, number, numbers, own
-from powderdsl.arrays.movement import Shape, expanded, joined, repeated, rolled
+from powderdsl.arrays.movement import expanded, joined, repeated, rolled
 from powderdsl.arrays.ndarray import Numbers, array_of, made, ndarray, result
 from powderdsl.arrays.operations import binary, operands
 from powderdsl.arrays.reductions import axes_of
 
-inf, nan, pi = float("inf"), float("nan"), 3.141592653589793
-newaxis = None
+inf = float("inf")
 
 
 class _Grid:
@@ -52,18 +51,8 @@ mgrid, s_ = _Grid(), _Index()
 # The same elements elsewhere
 
 
-def broadcast_arrays(*values: Any) -> list[ndarray]:
-    found = [asarray(one) for one in values]
-    shape = broadcast([one.shape for one in found])
-    return [broadcast_to(one, shape) for one in found]
-
-
 def reshape(values: Any, shape: Any) -> ndarray:
     return asarray(values).reshape(shape)
-
-
-def ravel(values: Any) -> ndarray:
-    return asarray(values).ravel()
 
 
 def transpose(values: Any, axes: Any = ()) -> ndarray:
@@ -276,14 +265,6 @@ class _LogicalOr:
 logical_or = _LogicalOr()
 
 
-def logical_and(x: Any, y: Any) -> Any:
-    return binary("bitwise_and", asarray(x, bool_), asarray(y, bool_))
-
-
-def logical_not(x: Any) -> Any:
-    return ~asarray(x, bool_)
-
-
 def absolute(x: Any) -> Any:
     found = _array(x)
     return found.__abs__()
@@ -403,24 +384,3 @@ def cumsum(values: Any) -> ndarray:
 
 def product_of(values: Any) -> Any:
     return asarray(values).prod()
-
-
-def sum_of(values: Any, axis: Any = None) -> Any:
-    return asarray(values).sum(axis)
-
-
-def any_of(values: Any, axis: Any = None) -> Any:
-    return asarray(values).any(axis)
-
-
-def all_of(values: Any, axis: Any = None) -> Any:
-    return asarray(values).all(axis)
-
-
-def unravel_index(index: int, shape: Shape) -> tuple[Any, ...]:
-    found: list[int] = []
-    rest = int(index)
-    for side in reversed(shape):
-        found.append(rest % side)
-        rest //= side
-    return tuple(int64(one) for one in reversed(found))

@@ -171,9 +171,6 @@ class Numbers:
     def ravel(self) -> ndarray:
         return self.reshape(-1)
 
-    def flatten(self) -> ndarray:
-        return self.reshape(-1).copy()
-
     def transpose(self, *axes: Any) -> ndarray:
         given = axes[0] if len(axes) == 1 and not isinstance(axes[0], int) else axes
         order = [one % self.ndim for one in given] or [*reversed(range(self.ndim))]
@@ -314,7 +311,7 @@ class ndarray(Numbers):
     def check_writable(self) -> None:
         if self.fixed:
             raise ValueError("assignment destination is read-only")
-        if self.owner is not None and sys.getrefcount(self.owner) > 2:
+        if self.owner is not None and _sharers(self) > _ALONE:
             raise ValueError("writing to an array that has views is not there without NumPy: copy it first")
 
 
@@ -365,6 +362,14 @@ def _index(one: Any) -> Any:
     if found.dtype.kind not in "iu":
         raise IndexError("arrays used as indices must be of integer (or boolean) type")
     return Picks(found.shape, numbers(found.full))
+
+
+def _sharers(array: Numbers) -> int:
+    return sys.getrefcount(array.owner)
+
+
+# How many references there are to the owner of one array: versions of Python count those in passing differently.
+_ALONE = _sharers(made((), bool_, Memory(b"\0", bool_), object()))
 
 
 LONGEST = 64

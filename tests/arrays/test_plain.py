@@ -254,7 +254,7 @@ UNARY: dict[str, Callable[..., Any]] = {
     "searchsorted": lambda np, a: (np.searchsorted([0, 5, 7], a), np.searchsorted([0, 5, 7], a, side="right")),
     "astype": lambda np, a: [a.astype(kind) for kind in KINDS[:9]],
     "floats": lambda np, a: (a.astype("float32"), a.astype(float)),
-    "logical": lambda np, a: (np.logical_or.reduce([a, a == 0]), np.logical_not(a), np.logical_and(a, a)),
+    "logical": lambda np, a: np.logical_or.reduce([a, a == 0]),
     "asarray": lambda np, a: (np.asarray(a), np.asarray(a, np.float64), np.atleast_1d(a), np.array([a, a])),
     "iterate": lambda np, a: (len(a), list(a), [int(one) for one in a.ravel()]),
     "bool": lambda np, a: bool(a),
