@@ -110,7 +110,7 @@ def test_ctrl_c_before_anything_was_measured(monkeypatch):
     assert "interrupted: 0 of 2 rounds" in result.stdout
 
 
-def test_without_a_compiler_arrays_are_measured(monkeypatch):
+def test_without_a_compiler_webassembly_is_measured(monkeypatch):
     def none():
         raise bench_command.NoCompiler("no C++ compiler found")
 
@@ -118,7 +118,7 @@ def test_without_a_compiler_arrays_are_measured(monkeypatch):
     result = powderdsl(*QUICK, "--batch", "1")
     assert result.exit_code == 0
     assert "no C++ compiler found" in result.stderr
-    assert "\narrays " in result.stdout
+    assert "\nwasm " in result.stdout
     assert "\nnative " not in result.stdout
 
 
