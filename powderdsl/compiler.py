@@ -80,12 +80,14 @@ def checked_request(ruleset: Ruleset | str, backend: str) -> tuple[Ruleset, str]
 def starting_backend(device: str) -> str:
     """The backend that runs rules on a torch device at once, without a compiler of C++."""
     on_cpu = str(device).partition(":")[0] == "cpu"
-    return "wasm" if on_cpu and has_wasmtime() else "torch"
+    return "wasm" if on_cpu and has_webassembly() else "torch"
 
 
 @cache
-def has_wasmtime() -> bool:
-    """Whether wasmtime runs on this machine: on some it can be installed, but not imported."""
+def has_webassembly() -> bool:
+    """Whether there is a host for modules: Pyodide's, or wasmtime, which some machines can install but not import."""
+    if sys.platform == "emscripten":
+        return True
     try:
         import wasmtime  # noqa: F401
     except (ImportError, OSError, RuntimeError):

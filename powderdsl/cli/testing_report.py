@@ -106,7 +106,7 @@ class TestingReport:
         search.try_random()
         if has_hypothesis():
             try_drawn(search, self.drawn)
-        else:
+        elif self.drawn:
             self.say("Hypothesis is not installed: only random worlds were tried")
         results = search.finish()
         for result in results:

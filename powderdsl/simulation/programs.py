@@ -9,7 +9,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import has_wasmtime, lower, starting_backend
+from powderdsl.compiler import has_webassembly, lower, starting_backend
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
 from powderdsl.model.types import Ruleset
@@ -100,7 +100,7 @@ def _wasm_program(program: Program, device: torch.device) -> Runnable:
     """On the CPU only; passes that do not fit bit planes run on torch tensors."""
     if device.type != "cpu":
         raise _refusal("wasm", "wasmtime runs on the CPU", _ELSEWHERE.format(device))
-    if not has_wasmtime():
+    if not has_webassembly():
         problem = "the package `wasmtime` is missing, or does not run on this machine"
         raise _refusal("wasm", problem, "`pip install wasmtime`, or run on the backend `torch` or `native`")
     from powderdsl.targets.torch.mixed import packed_program
