@@ -33,7 +33,9 @@ class WasmtimeModule:
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
         self._store = wasmtime.Store(engine)
-        exports: dict[str, Any] = dict(wasmtime.Instance(self._store, module, []).exports(self._store).items())
+        exports: dict[str, Any] = dict(
+            wasmtime.Instance(self._store, module, []).exports(self._store).items()
+        )
         self._context = self._store._context()
         self._functions = {
             name: ctypes.byref(one._func) for name, one in exports.items() if isinstance(one, wasmtime.Func)
