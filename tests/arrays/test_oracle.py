@@ -1,0 +1,57 @@
+"""The oracle gives the same worlds on plain arrays as on NumPy's, for random rules."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from powderdsl.diagnostics import CompileError
+from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from powderdsl.testing.properties.running import reference_states
+
+BLOCKED = f"""
+import sys
+
+sys.modules.update(numpy=None, torch=None)
+sys.path[:0] = [{str(Path(__file__).parents[2])!r}]
+from tests.arrays.test_oracle import digests
+
+print(*digests(int(sys.argv[1]), int(sys.argv[2])), sep="\\n")
+"""
+
+
+def digests(first: int, stop: int) -> Iterator[str]:
+    """For each seed a digest of all states of some random worlds under random rules."""
+    for seed in range(first, stop):
+        choices = Choices.seeded(seed)
+        try:
+            rules = load_text(random_ruleset_text(seed))
+        except CompileError:
+            continue
+        whole = hashlib.sha256()
+        for shape in (
+            (9, choices.integer(1, 5), choices.integer(1, 5)),
+            (2, choices.integer(1, 4), choices.pick((31, 33, 64, 65))),
+        ):
+            for state in reference_states(rules, random_start(rules, choices, shape), 3):
+                for name, values in sorted(state.items()):
+                    whole.update(f"{name} {values.dtype} {values.shape}".encode() + values.tobytes())
+        yield f"{seed} {whole.hexdigest()}"
+
+
+@pytest.mark.parametrize(
+    ("first", "stop"),
+    [(0, 8), *(pytest.param(seed, seed + 50, marks=pytest.mark.campaign) for seed in range(8, 308, 50))],
+)
+def test_random_rules(first: int, stop: int) -> None:
+    command = [sys.executable, "-c", BLOCKED, str(first), str(stop)]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert ended.stderr == ""
+    assert ended.stdout.splitlines() == [*digests(first, stop)]
