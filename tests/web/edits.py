@@ -18,7 +18,7 @@ from powderdsl.system.memo import Memo  # noqa: E402
 
 REPEATS = 5
 EDITS = {
-    "ice": ("water.yaml", "count(ice) >= 3", "count(ice) >= {}"),
+    "freezing": ("water.yaml", "count(ice) >= 3", "count(ice) >= {}"),
     "fire": ("fire.yaml", "count(fuel) == 0", "count(fuel) < {}"),
     "wind": ("wind.yaml", "0.95 *", "0.8{} *"),
 }
