@@ -39,8 +39,12 @@ def check_ids(kind: ArrayKind, ids: Array, name: str, ruleset: Ruleset) -> None:
     xp, known = kind.xp, _holders(kind, (element.id for element in ruleset.elements))
     flat = ids.reshape(-1)
     for start in range(0, len(flat), CHUNK):
-        values = xp.asarray(flat[start : start + CHUNK], dtype=xp.int64)
-        good = (values >= 0) & (values < 256) & known[xp.clip(values, 0, 255)]
+        values = flat[start : start + CHUNK]
+        if values.dtype == xp.uint8:
+            good = known[kind.as_index(values)]
+        else:
+            values = xp.asarray(values, dtype=xp.int64)
+            good = (values >= 0) & (values < 256) & known[xp.clip(values, 0, 255)]
         if not bool(good.all()):
             at = good.tolist().index(False)
             place = _place(start + at, tuple(ids.shape))
@@ -117,10 +121,11 @@ def _integers(
         raise TypeError(f"{slot.name} takes integers, found {array.dtype}")
     values = xp.asarray(array, dtype=xp.int64)
     if kind.name == "element":
-        check_ids(arrays, values, slot.name, ruleset)
+        check_ids(arrays, array if array.dtype == xp.uint8 else values, slot.name, ruleset)
     lo, hi = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(kind.name, (kind.lo, kind.hi))
-    if bool(((values < lo) | (values > hi)).any()):
-        raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {int(values.min())}..{int(values.max())}")
+    least, most = int(values.min()), int(values.max())
+    if least < lo or most > hi:
+        raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {least}..{most}")
     prop = ruleset.property(slot.name)
     limited = prop.stored if prop is not None else slot.of
     if limited is not None:
