@@ -222,12 +222,16 @@ def select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) 
 
 
 def isin(values: Any, test_elements: Any) -> Any:
-    found, tests = asarray(values), asarray(test_elements)
-    if found.dtype.kind == "f" or (tests.dtype.kind == "f" and tests.size):
-        raise TypeError("isin of floats is not there without NumPy")
-    wanted = set(tests.ravel().tolist())
+    found = asarray(values)
+    if isinstance(test_elements, list) and {*map(type, test_elements)} <= {int} and found.dtype.kind != "f":
+        wanted = frozenset(test_elements)
+    else:
+        tests = asarray(test_elements)
+        if found.dtype.kind == "f" or (tests.dtype.kind == "f" and tests.size):
+            raise TypeError("isin of floats is not there without NumPy")
+        wanted = frozenset(tests.ravel().tolist())
     if found.memory.type.itemsize == 1 and found.memory.type.code == "B":
-        raw = found.memory.raw.translate(_members(frozenset(wanted)))
+        raw = found.memory.raw.translate(_members(wanted))
     else:
         raw = bytes(map(wanted.__contains__, numbers(found.memory)))
     return result(found.shape, bool_, Memory(raw, bool_), False)

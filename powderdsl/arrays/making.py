@@ -10,7 +10,7 @@ from typing import Any
 
 from powderdsl.arrays.dtypes import dtype, float64, int64, promoted, result_type
 from powderdsl.arrays.indexing import broadcast
-from powderdsl.arrays.memories import Memory, checked, converted, own
+from powderdsl.arrays.memories import Memory, checked, constant, converted, own
 from powderdsl.arrays.movement import Shape, expanded
 from powderdsl.arrays.ndarray import Numbers, array_of, generic, made, ndarray, result
 
@@ -31,7 +31,7 @@ def asarray(values: Any, dtype: Any = None) -> ndarray:
         if not isinstance(values, (bool, int, float)):
             raise TypeError(f"there are no arrays of {type(values).__name__} without NumPy")
         wanted = kind or result_type([], [values])
-        return made((), wanted, checked([values], wanted))
+        return made((), wanted, constant(values, wanted))
     types = {*map(type, values)} if values else set()
     if len(types) == 1 and types <= _PLAIN:
         wanted = kind or result_type([], [values[0]])

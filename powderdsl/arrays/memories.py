@@ -90,6 +90,16 @@ def checked(values: list[Any], kind: dtype) -> Memory:
     return packed(values, kind)
 
 
+def constant(value: bool | int | float, kind: dtype) -> Memory:
+    """One number. Raises as `checked` does."""
+    return _kept(value, kind) if value else checked([value], kind)  # two zeros are equal, but not the same
+
+
+@lru_cache(maxsize=1 << 10, typed=True)
+def _kept(value: bool | int | float, kind: dtype) -> Memory:
+    return checked([value], kind)
+
+
 def _whole(value: Any) -> int:
     if isinstance(value, float):
         return int(value)

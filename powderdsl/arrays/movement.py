@@ -45,6 +45,8 @@ FEW = 6
 def shuffled(raw: bytes, size: int, block: int, places: Sequence[int]) -> bytes:
     """In each block of some elements those at `places`, in this order."""
     count = len(raw) // (size * block) if block else 0
+    if not count or not len(places):
+        return b""
     if count < FEW:
         return taken(
             raw, size, [start + place for start in range(0, count * block, block) for place in places]

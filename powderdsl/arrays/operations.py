@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from math import prod
 from typing import Any
 
@@ -11,7 +10,7 @@ from powderdsl.arrays.arithmetic import COMPARISONS, combined, compared
 from powderdsl.arrays.dtypes import bool_, dtype, float64, int64, promoted, result_type
 from powderdsl.arrays.indexing import broadcast
 from powderdsl.arrays.making import asarray
-from powderdsl.arrays.memories import Memory, checked, converted
+from powderdsl.arrays.memories import Memory, checked, constant, converted
 from powderdsl.arrays.movement import Shape, expanded
 from powderdsl.arrays.ndarray import Numbers, ndarray, result
 
@@ -41,16 +40,11 @@ def operands(values: Sequence[Any]) -> tuple[list[Memory], dtype, Shape]:
 
 def _operand(one: Any, kind: dtype, shape: Shape) -> Memory:
     if not isinstance(one, Numbers):
-        return _constant(one, kind) if one else checked([one], kind)
+        return constant(one, kind)
     memory = converted(one.memory, one.dtype, kind)
     if memory.single or one.shape == shape:
         return memory
     return Memory(expanded(memory.raw, memory.type.itemsize, one.shape, shape), memory.type)
-
-
-@lru_cache(maxsize=1 << 10, typed=True)
-def _constant(one: Any, kind: dtype) -> Memory:
-    return checked([one], kind)
 
 
 def binary(op: str, x: Any, y: Any) -> Any:

@@ -170,13 +170,13 @@ BINARY: dict[str, Callable[..., Any]] = {
 }
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400, deadline=None, derandomize=True)
 @given(st.sampled_from(sorted(BINARY)), pairs(COMMON), pairs(COMMON))
 def test_operations_on_two_arrays(name: str, first: Any, second: Any) -> None:
     compare(BINARY[name], (first[0], second[0]), (first[1], second[1]))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300, deadline=None, derandomize=True)
 @given(
     st.sampled_from(sorted(BINARY.keys() - {"clip"})),
     pairs(),
@@ -202,7 +202,7 @@ IN_PLACE: dict[str, Callable[[Any, Any], Any]] = {
 }
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.sampled_from(sorted(IN_PLACE)), pairs(((4, 5), (3,), (1,))), pairs(((4, 5), (1, 5), (), (3,))))
 def test_operations_in_place(name: str, first: Any, second: Any) -> None:
     def call(np: Any, a: Any, b: Any) -> Any:
@@ -263,7 +263,7 @@ UNARY: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=600, deadline=None, derandomize=True)
 @given(st.sampled_from(sorted(UNARY)), pairs())
 def test_operations_on_one_array(name: str, pair: Any) -> None:
     if name == "floats" or (name == "astype" and pair[0].dtype.kind != "f"):
@@ -315,13 +315,13 @@ KEYS: tuple[Callable[..., Any], ...] = (
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.sampled_from(KEYS), pairs())
 def test_indexing(key: Callable[..., Any], pair: Any) -> None:
     compare(lambda np, a: a[key(np)], (pair[0],), (pair[1],))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.sampled_from(KEYS), pairs(), pairs(((), (1,), (3,), (2, 3), (4,), (1, 3))))
 def test_writing(key: Callable[..., Any], pair: Any, value: Any) -> None:
     if value[0].dtype.kind == "f" and pair[0].dtype.kind in "iu":
@@ -349,7 +349,7 @@ def test_types_of_results() -> None:
         assert plain.dtype(numpy.dtype(kind).str).kind == numpy.dtype(kind).kind
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.floats(width=32))
 def test_floats_as_text(value: float) -> None:
     assert str(plain.float32(value)) == str(numpy.float32(value))
@@ -362,7 +362,7 @@ def test_powers_of_two_as_text() -> None:
         assert str(plain.float32(2.0**place)) == str(numpy.float32(2.0**place))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.integers(-(2**63), 2**63 - 1))
 def test_integers_are_rounded_once(value: int) -> None:
     check_equal(numpy.array([value]).astype("float32"), plain.array([value]).astype("float32"))
@@ -374,7 +374,7 @@ def test_numbers_from_text(text: str, kind: str) -> None:
     compare(lambda np: np.dtype(kind).type(text), (), ())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     st.integers(0, 2**80) | st.lists(st.integers(0, 2**40), min_size=1, max_size=6),
     st.lists(
