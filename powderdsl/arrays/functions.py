@@ -13,7 +13,7 @@ from powderdsl.arrays import arithmetic
 from powderdsl.arrays.dtypes import bool_, float32, float64, int64, promoted
 from powderdsl.arrays.indexing import broadcast
 from powderdsl.arrays.making import asarray, broadcast_to, zeros
-from powderdsl.arrays.memories import Memory, checked, converted, number, numbers, own
+from powderdsl.arrays.memories import Memory, checked, converted, number, numbers, own, packed
 from powderdsl.arrays.movement import expanded, joined, repeated, rolled
 from powderdsl.arrays.ndarray import Numbers, array_of, made, ndarray, result
 from powderdsl.arrays.operations import binary, operands
@@ -383,7 +383,8 @@ def cumsum(values: Any) -> ndarray:
     found = asarray(values)
     if found.dtype.kind not in "bi" or found.ndim != 1:
         raise TypeError("cumsum is there for one axis of signed integers alone without NumPy")
-    return array_of(list(accumulate(numbers(found.full))), int64)
+    sums = [*accumulate(numbers(found.full))]
+    return made((len(sums),), int64, packed(sums, int64))
 
 
 def product_of(values: Any) -> Any:
