@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gzip
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +101,25 @@ def test_a_full_memory_is_followed_by_another(monkeypatch: pytest.MonkeyPatch, t
     assert len({id(world.state.instance) for world in kept[0][1:]}) > 1
     for one, other in zip(*kept, strict=True):
         assert torch.equal(one.ids, other.ids)
+
+
+LIMITED = """
+import resource
+from powderdsl.arrays import np
+from powderdsl.simulation.compiling import compile_arrays
+
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+for name in ("life", "core+sand"):
+    sim = compile_arrays(name, "wasm")
+    print(int(sim.step(sim.world(np.ones((2, 8, 64), np.uint8)), 3).ids.sum()))
+"""
+
+
+def test_few_addresses_are_enough() -> None:
+    """Under `ulimit -v`, where wasmtime cannot reserve 4 GiB for a memory."""
+    done = subprocess.run([sys.executable, "-c", LIMITED], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split() == ["0", "1024"]
 
 
 def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-def]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import wasmtime
@@ -12,20 +14,55 @@ from wasmtime import _ffi
 from powderdsl.targets.wasm.host import TOO_LARGE, Bytes
 
 MOST_ARGUMENTS = 16
+GROWTH = 16 << 20
+"""Bytes of addresses beyond a memory into which it grows without being moved, where addresses are few."""
+
+
+@dataclass
+class Compiled:
+    """A module with the engine that has compiled it."""
+
+    code: bytes
+    engine: wasmtime.Engine
+    module: wasmtime.Module
 
 
 class WasmtimeHost:
-    """One engine: modules of a host can be instantiated in each other's stores."""
+    """Compiles modules and instantiates them, each in a store of its own.
+
+    wasmtime reserves 4 GiB of addresses for each memory, so that the processor checks accesses. Where addresses are
+    limited (`ulimit -v`), it checks them itself, in code that takes half as long again.
+    """
 
     def __init__(self) -> None:
-        self._engine = wasmtime.Engine()
-        atexit.register(self._engine.close)  # later, when Python has taken wasmtime apart, it would complain
+        self._engine = _engine(reserve=True)
 
-    def compile(self, code: bytes) -> wasmtime.Module:
-        return wasmtime.Module(self._engine, code)
+    def compile(self, code: bytes) -> Compiled:
+        engine = self._engine
+        return Compiled(code, engine, wasmtime.Module(engine, code))
 
-    def instantiate(self, module: wasmtime.Module) -> WasmtimeModule:
-        return WasmtimeModule(self._engine, module)
+    def instantiate(self, module: Compiled) -> WasmtimeModule:
+        try:
+            return WasmtimeModule(module.engine, module.module)
+        except wasmtime.WasmtimeError:
+            self._engine = module.engine = _engine(reserve=False)
+            module.module = wasmtime.Module(module.engine, module.code)
+        try:
+            return WasmtimeModule(module.engine, module.module)
+        except wasmtime.WasmtimeError:
+            raise MemoryError(TOO_LARGE) from None
+
+
+@cache
+def _engine(*, reserve: bool) -> wasmtime.Engine:
+    config = wasmtime.Config()
+    if not reserve:
+        config.memory_reservation = 0
+        config.memory_reservation_for_growth = GROWTH
+        config.memory_guard_size = 0
+    engine = wasmtime.Engine(config)
+    atexit.register(engine.close)  # later, when Python has taken wasmtime apart, it would complain
+    return engine
 
 
 class WasmtimeModule:
