@@ -23,7 +23,8 @@ class WasmProgram:
     """
 
     def __init__(self, program: Program, planes: Program, kind: ArrayKind, memo: Memo | None = None):
-        self._program, self._planes, self._kind, self._memo = program, planes, kind, memo
+        self._program, self._planes, self._kind = program, planes, kind
+        self._memo = Memo() if memo is None else memo  # the schedules are the same for all widths
         self._host = this_host()
         self._modules: dict[tuple[int, bool], Loaded] = {}
 
