@@ -89,7 +89,7 @@ def has_webassembly() -> bool:
     if sys.platform == "emscripten":
         return True
     try:
-        import wasmtime  # noqa: F401
+        import wasmtime  # noqa: F401  only whether it can be imported
     except (ImportError, OSError, RuntimeError):
         return False
     return True

@@ -203,26 +203,35 @@ def _compare_table(op: str, value: int, swapped: bool) -> bytes:
 def _narrow(op: str, a: bytes, b: bytes, kind: dtype, count: int) -> Memory | None:
     """An operation on bytes, or None if a result does not fit into one."""
     found = lanes(count, 1)
-    x, y = int.from_bytes(a, "little"), int.from_bytes(b, "little")
-    if op == "bitwise_and":
-        result = x & y
-    elif op == "bitwise_or":
-        result = x | y
-    elif op == "bitwise_xor":
-        result = x ^ y
-    elif op == "add":
-        result = found.add(x, y)
-        if kind is not uint8 and found.carries(x, y, result):
-            return None
-    elif op == "subtract":
-        result = found.subtract(x, y)
-        if kind is not uint8 and found.borrows(x, y, result):
-            return None
-    elif op in ("minimum", "maximum"):
-        result = _extreme(op, x, y, found, False)
-    else:
+    if op not in _ON_LANES:
         return None
+    x, y = int.from_bytes(a, "little"), int.from_bytes(b, "little")
+    result = _on_lanes(op, x, y, found, False)
+    if kind is not uint8:
+        if op == "add" and found.carries(x, y, result):
+            return None
+        if op == "subtract" and found.borrows(x, y, result):
+            return None
     return Memory(found.write(result), uint8)
+
+
+_ON_LANES = ("bitwise_and", "bitwise_or", "bitwise_xor", "add", "subtract", "minimum", "maximum")
+
+
+def _on_lanes(op: str, x: int, y: int, found: Lanes, signed: bool) -> int:
+    """One of these operations on two vectors."""
+    match op:
+        case "bitwise_and":
+            return x & y
+        case "bitwise_or":
+            return x | y
+        case "bitwise_xor":
+            return x ^ y
+        case "add":
+            return found.add(x, y)
+        case "subtract":
+            return found.subtract(x, y)
+    return _extreme(op, x, y, found, signed)
 
 
 def _extreme(op: str, x: int, y: int, found: Lanes, signed: bool) -> int:
@@ -234,20 +243,8 @@ def _wide(op: str, a: Memory, b: Memory, kind: dtype, count: int) -> Memory:
     found = lanes(count, kind.itemsize)
     signed = kind.kind == "i"
     value = number(b) if b.single else None
-    if op in ("bitwise_and", "bitwise_or", "bitwise_xor", "add", "subtract", "minimum", "maximum"):
-        x, y = _vector(a, kind, found), _vector(b, kind, found)
-        if op == "bitwise_and":
-            result = x & y
-        elif op == "bitwise_or":
-            result = x | y
-        elif op == "bitwise_xor":
-            result = x ^ y
-        elif op == "add":
-            result = found.add(x, y)
-        elif op == "subtract":
-            result = found.subtract(x, y)
-        else:
-            result = _extreme(op, x, y, found, signed)
+    if op in _ON_LANES:
+        result = _on_lanes(op, _vector(a, kind, found), _vector(b, kind, found), found, signed)
     elif op == "multiply" and (a.single or b.single):
         many, one = (a, b) if b.single else (b, a)
         result = found.multiply(_vector(many, kind, found), int(number(one)))

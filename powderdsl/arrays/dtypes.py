@@ -40,7 +40,7 @@ class dtype:
         name = _PYTHON.get(given, given) if isinstance(given, (str, type)) else None
         found = _KNOWN.get(name) if isinstance(name, str) else None
         if found is None:
-            raise TypeError(f"there is no type of numbers {given!r} without NumPy")
+            raise TypeError(f"{given!r} is not a type of numbers that is known without NumPy")
         return found
 
     @property

@@ -29,7 +29,7 @@ def asarray(values: Any, dtype: Any = None) -> ndarray:
         values = float(values)
     if not isinstance(values, (list, tuple, range)):
         if not isinstance(values, (bool, int, float)):
-            raise TypeError(f"there are no arrays of {type(values).__name__} without NumPy")
+            raise TypeError(f"without NumPy, {type(values).__name__} cannot become an array")
         wanted = kind or result_type([], [values])
         return made((), wanted, constant(values, wanted))
     types = {*map(type, values)} if values else set()
@@ -83,7 +83,7 @@ def _nested(values: Any) -> tuple[Shape, list[Any]]:
         return values.shape, [values]
     if not isinstance(values, (list, tuple, range)):
         if not isinstance(values, (bool, int, float)):
-            raise TypeError(f"there are no arrays of {type(values).__name__} without NumPy")
+            raise TypeError(f"without NumPy, {type(values).__name__} cannot become an array")
         return (), [values]
     if values and all(type(one) in (int, float, bool) for one in values):
         return (len(values),), list(values)

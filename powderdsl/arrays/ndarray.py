@@ -40,7 +40,7 @@ class Numbers:
     """What arrays and scalars have in common."""
 
     __slots__ = ("dtype", "fixed", "memory", "owner", "shape")
-    __hash__: ClassVar[None] = None  # type: ignore[assignment]
+    __hash__: ClassVar[None] = None  # type: ignore[assignment]  # arrays have no hash, as in NumPy
 
     shape: Shape
     dtype: dtype
@@ -320,7 +320,7 @@ class generic(Numbers):
 
     __slots__ = ()
 
-    def __hash__(self) -> int:  # type: ignore[override]
+    def __hash__(self) -> int:  # type: ignore[override]  # scalars do have one
         return hash(self.item())
 
 

@@ -142,4 +142,4 @@ for _word, _op in (
     setattr(ndarray, f"__i{_word}__", _in_place(_op))
 for _word, _op in zip(("eq", "ne", "lt", "le", "gt", "ge"), COMPARISONS, strict=True):
     setattr(Numbers, f"__{_word}__", _operator(_op))
-Numbers.clip = _clip  # type: ignore[attr-defined]
+Numbers.clip = _clip  # type: ignore[attr-defined]  # operations need arrays, which so cannot import them

@@ -54,12 +54,15 @@ class ArraySimulator(AnySimulator[ArrayWorld]):
     def __init__(self, ruleset: Ruleset, backend: str = "wasm", memo: Memo | None = None):
         super().__init__(ruleset, PlainArrays())
         self.backend = self.running = backend
+        self._memo = Memo() if memo is None else memo
         self._program = (
-            ReferenceProgram(ruleset, self.kind) if backend == "reference" else WholeOrParts(ruleset, memo)
+            ReferenceProgram(ruleset, self.kind)
+            if backend == "reference"
+            else WholeOrParts(ruleset, self._memo)
         )
 
     def of(self, ruleset: Ruleset) -> ArraySimulator:
-        return ArraySimulator(ruleset, self.backend)
+        return ArraySimulator(ruleset, self.backend, self._memo)
 
 
 def wasm_problem() -> str:
@@ -74,7 +77,7 @@ def wasm_problem() -> str:
 class WholeOrParts:
     """WebAssembly for whole steps and for chosen passes; the oracle for given draws and for what fits no bit planes."""
 
-    def __init__(self, ruleset: Ruleset, memo: Memo | None):
+    def __init__(self, ruleset: Ruleset, memo: Memo):
         self._ruleset, self._kind, self._memo = ruleset, PlainArrays(), memo
         self._lowered = lower(ruleset, memo)  # what cannot be lowered is reported before the first step
         self._oracle = ReferenceProgram(ruleset, self._kind)

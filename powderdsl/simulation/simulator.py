@@ -111,16 +111,6 @@ class Simulator(AnySimulator[World]):
 def compile(
     ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu", threads: int = 1
 ) -> Simulator:
-    """A simulator that runs a ruleset.
-
-    Args:
-        ruleset: from `load` (or a name to load).
-        backend: one of `BACKENDS`; all give the same worlds, bit for bit.
-        device: a torch device: ``"cpu"``, ``"cuda"``, ``"cuda:1"``.
-        threads: for native code, which shares a batch out among them. Torch has its own setting.
-
-    Raises:
-        CompileError: PD701 if the backend or the device is not available.
-    """
+    """`simulation.compiling.compile`, on torch. Raises CompileError (PD701)."""
     model, backend = checked_request(ruleset, backend)
     return Simulator(model, backend, device, threads)
