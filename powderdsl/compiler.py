@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -146,7 +146,6 @@ def load(
     *names: str | Path,
     params: Mapping[str, Any] | None = None,
     palette: Palette | None = None,
-    memo: Memo | None = None,
 ) -> Ruleset:
     """Read rule files into a checked model.
 
@@ -156,12 +155,11 @@ def load(
         params: other values for parameters, by qualified name: ``{"pack.param": 0.05}``.
         palette: ids that were recorded, such as a model's: the qualified name of the element of each id, or None.
             Elements that it does not have get its free ids, then those after its end.
-        memo: where files that have not changed since are not parsed again.
 
     Raises:
         CompileError: with everything that is wrong in the files.
     """
-    ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette, memo=memo)
+    ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette)
     return ruleset
 
 
@@ -170,11 +168,10 @@ def load_with_diagnostics(
     *names: str | Path,
     params: Mapping[str, Any] | None = None,
     palette: Palette | None = None,
-    memo: Memo | None = None,
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
     """Like `load`; the second value has the warnings and notes."""
     reporter = Reporter()
-    packs, ruleset = read(names, reporter, memo)
+    packs, ruleset = read(names, reporter)
     reporter.raise_if_errors()
     model = check(packs, ruleset, reporter, palette, _shipped_words)
     if params:
@@ -205,11 +202,9 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
     )
 
 
-def read(
-    names: Sequence[str | Path], reporter: Reporter, memo: Memo | None = None
-) -> tuple[list[PackDecl], RulesetDecl | None]:
+def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl], RulesetDecl | None]:
     """Declarations of everything named, each pack once, in the order of first mention."""
-    reader = _Reader(reporter, memo)
+    reader = _Reader(reporter)
     packs, rulesets = reader.packs, reader.rulesets
     left_out: dict[str, None] = {}
     for name in names:
@@ -229,7 +224,7 @@ def read(
     *beside, last = rulesets
     loaded = {pack.name.text for pack in kept}
     gone = [name for one in last.lineage for name in one.members if name not in loaded]
-    spare = packs | _left_out_by(last, reporter, memo)
+    spare = packs | _left_out_by(last, reporter)
     reserved = tuple(spare[name] for name in dict.fromkeys(gone) if name in spare)
     return kept, replace(last, beside=tuple(beside), left_out=reserved)
 
@@ -306,11 +301,18 @@ def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Di
     return None, reporter.diagnostics
 
 
+SMALL = 1 << 16
+"""Characters of files that are kept once they are parsed. Larger ones, perhaps a stranger's, take much memory."""
+
+_read_once = lru_cache(maxsize=128)(_read_apart)
+"""Tasks, tests and environments load the same packs again and again."""
+
+
 class _Reader:
     """Declarations that have been read: each pack and ruleset once, in the order of first mention."""
 
-    def __init__(self, reporter: Reporter, memo: Memo | None):
-        self.reporter, self.memo = reporter, memo
+    def __init__(self, reporter: Reporter):
+        self.reporter = reporter
         self.packs: dict[str, PackDecl] = {}
         self.rulesets: list[RulesetDecl] = []
 
@@ -319,8 +321,8 @@ class _Reader:
         source = read_source(path, self.reporter) if path else None
         if source is None:
             return None
-        memo = Memo() if self.memo is None else self.memo
-        decl, found = memo.of(("declaration", source.name), source, lambda: _read_apart(source))
+        read_apart = _read_once if len(source.text) <= SMALL else _read_apart
+        decl, found = read_apart(source)
         for one in found:
             self.reporter.add(one)
         return decl
@@ -356,9 +358,9 @@ class _Reader:
             self.read(name, lister)
 
 
-def _left_out_by(ruleset: RulesetDecl, reporter: Reporter, memo: Memo | None) -> dict[str, PackDecl]:
+def _left_out_by(ruleset: RulesetDecl, reporter: Reporter) -> dict[str, PackDecl]:
     """The packs that rulesets leave out of those that they extend: the ids of their elements stay reserved."""
-    reader = _Reader(reporter, memo)
+    reader = _Reader(reporter)
     for one in ruleset.lineage:
         for scalar in one.without:
             lister = one.base.lister(scalar.text) if one.base else None

@@ -49,7 +49,7 @@ def test_exceptions_are_not_kept() -> None:
 
 
 def code(path: Path, memo: Memo | None) -> bytes:
-    model, _ = load_with_diagnostics(path, memo=memo)
+    model, _ = load_with_diagnostics(path)
     return b"".join(
         wasm_module(part.planes, width, memo=memo).code
         for part in parts(lower(model, memo), memo)
@@ -123,13 +123,12 @@ def test_only_what_has_changed_is_made_again(rules: Path, counted: Counter[str])
 
 
 def test_mistakes_are_reported_each_time(rules: Path) -> None:
-    memo, path = Memo(), rules / "small.yaml"
-    file = rules / "sand.yaml"
+    path, file = rules / "small.yaml", rules / "sand.yaml"
     file.write_text(file.read_text(encoding="utf-8").replace("elements:", "elemments:"), encoding="utf-8")
     messages = []
-    for kept in (None, memo, memo):
+    for _ in range(3):
         with pytest.raises(CompileError) as found:
-            load_with_diagnostics(path, memo=kept)
+            load_with_diagnostics(path)
         messages.append(str(found.value))
     assert len(set(messages)) == 1
     assert "elemments" in messages[0]
@@ -146,7 +145,7 @@ def test_structure_tells_passes_apart() -> None:
 
 def test_modules_that_stand_alone_use_memos(rules: Path, counted: Counter[str]) -> None:
     memo = Memo()
-    model, _ = load_with_diagnostics(rules / "small.yaml", memo=memo)
+    model, _ = load_with_diagnostics(rules / "small.yaml")
     found = [standalone_module(model, (32, 64), one) for one in (None, memo, memo)]
     assert len(set(found)) == 1
     assert counted["plan"] == 2 * len(lower(model).passes)

@@ -29,7 +29,7 @@ FOLDER = Path("rules")
 def laps(memo: Memo) -> dict[str, float]:
     """Seconds from the files to a world that has stepped, by phases."""
     start, clock = cpu(), time.perf_counter()
-    model, _ = load_with_diagnostics(FOLDER / "powderworld.yaml", memo=memo)
+    model, _ = load_with_diagnostics(FOLDER / "powderworld.yaml")
     loaded = cpu()
     sim = ArraySimulator(model, memo=memo)
     lowered = cpu()

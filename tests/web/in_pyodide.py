@@ -45,7 +45,7 @@ for number, words in enumerate(COMMANDS):
     Path(f"status{number}").write_text(str(status or 0))
 
 memo = Memo()
-model = load("powderworld", memo=memo)
+model = load("powderworld")
 (part,) = parts(lower(model, memo), memo)
 assert part.planes is not None
 Path("module.wasm").write_bytes(wasm_module(part.planes, 64, memo=memo).code)
