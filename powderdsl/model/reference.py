@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Any
 
 from powderdsl.arrays import np
@@ -118,8 +119,8 @@ def look_or_nothing(value: Array, offset: Offset) -> Array:
 def inside(shape: tuple[int, ...], offset: Offset) -> Array:
     """bool [H, W]: whether the neighbor lies inside the grid."""
     height, width = shape
-    y, x = np.mgrid[:height, :width]
-    return (y + offset[0] >= 0) & (y + offset[0] < height) & (x + offset[1] >= 0) & (x + offset[1] < width)
+    y, x = np.arange(height)[:, None] + offset[0], np.arange(width) + offset[1]
+    return (y >= 0) & (y < height) & ((x >= 0) & (x < width))
 
 
 def neighborhood(value: Array, kernel: Kernel) -> Array:
@@ -186,12 +187,13 @@ def _property(expr: Expr, at: Context) -> Array:
 
 def _of_elements(prop: Property, ids: Array, at: Context) -> Array:
     """The values of a property for cells of these ids."""
-    result = _as_kind(prop.kind.name, 0, at.shape)
+    plain = (float(value) if isinstance(value, Fraction) else value for value in prop.values)
+    numbers = [0 if isinstance(value, str) else value for value in plain]
+    numbers += [0] * (256 - len(numbers))
+    result = np.asarray(numbers, WIDE.get(prop.kind.name, np.int64))[ids]
     for identity, value in enumerate(prop.values):
-        one = (
-            at.params[value][:, None, None] if isinstance(value, str) else _as_kind(prop.kind.name, value, ())
-        )
-        result = np.where(ids == identity, one, result)
+        if isinstance(value, str):
+            result = np.where(ids == identity, at.params[value][:, None, None], result)
     return result
 
 

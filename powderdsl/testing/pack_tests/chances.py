@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.model import reference
-from powderdsl.model.types import Often
+from powderdsl.model.types import Expr, Often
 
 if TYPE_CHECKING:
     from powderdsl.simulation.any_arrays import AnyWorld, W
@@ -89,7 +89,7 @@ def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: i
     for first in range(0, copies, chunk):
         world = _copies(start, first, min(chunk, copies - first), seed)
         world = world.sim.step(world, steps=steps)
-        at = world_context(world)
+        at = world_context(world, *(claim.after for claim in claims))
         for number, (claim, cells) in enumerate(chosen):
             hits[number] += int(reference.evaluate(claim.after, at)[:, cells].sum())
     for (claim, cells), found in zip(chosen, hits, strict=True):
@@ -108,7 +108,7 @@ def _words(claim: Often) -> str:
 
 def _cells(claim: Often, start: AnyWorld) -> NDArray[np.bool_]:
     """The cells [H, W] of the start world that the claim is about."""
-    holds: NDArray[np.bool_] = reference.evaluate(claim.before, world_context(start))[0]
+    holds: NDArray[np.bool_] = reference.evaluate(claim.before, world_context(start, claim.before))[0]
     return holds
 
 
@@ -120,9 +120,11 @@ def _copies(start: W, first: int, count: int, seed: int) -> W:
     return replace(many, index=index, seed=seeds)
 
 
-def world_context(world: AnyWorld) -> reference.Context:
-    """The values that a condition reads: a world's state as the oracle holds it, parameters, the clock."""
+def world_context(world: AnyWorld, *conditions: Expr) -> reference.Context:
+    """The values that some conditions read: a world's state as the oracle holds it, parameters, the clock."""
     ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
-    state = reference.widened(ruleset, {name: to_numpy(values) for name, values in world.state.items()})
+    read = {part.value for one in conditions for part in one.walk() if part.op in ("field", "property")}
+    names = [name for name in world.state if name == "element" or name in read]
+    state = reference.widened(ruleset, {name: to_numpy(world.state[name]) for name in names})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
     return reference.Context(ruleset, state, reference.parameters(ruleset, len(world), {}), {}, clock)

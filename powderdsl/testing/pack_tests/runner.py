@@ -102,14 +102,18 @@ def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: AnySimulator[An
         if not result.passed and scope and ruleset.added_to(scope):
             scopes.setdefault(scope, []).append(result)
     added: dict[Span, tuple[str, ...]] = {}
+    fewer: dict[str, list[Span]] = {}
     for scope, wrong in scopes.items():
-        places = {result.example.span for result in wrong}
         others = ruleset.added_to(scope)
-        right = _passing(restricted(ruleset, scope), places, sim)
-        fewer = others[:MOST] if len(others) > 1 and right else ()
-        without_one = {pack: _passing(without(ruleset, pack), right, sim) for pack in fewer}
-        for place in right:
-            added[place] = tuple(pack for pack in fewer if place in without_one[pack]) or others
+        right = _passing(restricted(ruleset, scope), {result.example.span for result in wrong}, sim)
+        added |= dict.fromkeys(right, others)
+        for pack in others[:MOST] if len(others) > 1 else ():
+            fewer.setdefault(pack, []).extend(right)
+    alone: dict[Span, tuple[str, ...]] = {}
+    for pack in (pack for pack in ruleset.packs if fewer.get(pack)):
+        for place in _passing(without(ruleset, pack), fewer[pack], sim):
+            alone[place] = (*alone.get(place, ()), pack)
+    added |= alone
     return [replace(one, added=added.get(one.example.span, ())) for one in results]
 
 
@@ -161,7 +165,7 @@ class _Running:
         """The world that is wrong, how, and the field that is not as expected, if one is."""
         example = self.example
         for condition in example.always if step else ():
-            fails = ~reference.evaluate(condition, world_context(world))
+            fails = ~reference.evaluate(condition, world_context(world, condition))
             if fails.any():
                 index, row, column = (int(part[0]) for part in np.nonzero(fails))
                 words = one_line(condition.span) if condition.span else "a condition"
