@@ -115,9 +115,12 @@ class BinPolicy(ActorCriticPolicy):
         bins: tuple[int, int],
         form: ActionForm,
         use_sde: bool = False,
+        optimizer_class: Any = torch.optim.Adam,
     ):
         self._parts = see, channels, bins, form
-        super().__init__(observation_space, action_space, lr_schedule, use_sde=use_sde)
+        super().__init__(
+            observation_space, action_space, lr_schedule, use_sde=use_sde, optimizer_class=optimizer_class
+        )
 
     def _build(self, lr_schedule: Schedule) -> None:
         see, width, bins, form = self._parts
@@ -145,7 +148,8 @@ class BinPolicy(ActorCriticPolicy):
             if last is not None:
                 nn.init.orthogonal_(last.weight, 0.01)  # all actions about equally likely
         self.bins = BinDistribution(form)
-        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1), eps=1e-5)
+        make: Any = self.optimizer_class
+        self.optimizer = make(self.parameters(), lr=lr_schedule(1), eps=1e-5)
 
     def _seen(self, observed: Tensor) -> Tensor:
         """Patches and their places, [B, C + 2, rows, columns]."""

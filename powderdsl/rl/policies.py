@@ -74,6 +74,13 @@ class TrainedPolicy:
         return actions
 
 
+class _NoOptimizer:
+    """For networks that only act: the first optimizer of a process imports torch's compiler, which takes a second."""
+
+    def __init__(self, *_: object, **__: object):
+        pass
+
+
 def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: bool = False) -> TrainedPolicy:
     """The policy of a run's newest checkpoint, for the observations and actions of `env`, on its device.
 
@@ -96,7 +103,8 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         space = Box(
             space.low.repeat(config.frames, 0), space.high.repeat(config.frames, 0), dtype=space.dtype.type
         )
-    network = kind(space, MultiDiscrete(np.array(own.action_nvec)), lambda _: config.learning_rate, **how)
+    actions, rate = MultiDiscrete(np.array(own.action_nvec)), config.learning_rate
+    network = kind(space, actions, lambda _: rate, **how | {"optimizer_class": _NoOptimizer})
     try:
         network.load_state_dict(checkpoint.state["policy"])
     except (RuntimeError, TypeError, AttributeError, KeyError) as error:

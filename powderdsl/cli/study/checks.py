@@ -206,10 +206,10 @@ class _StudyCheck:
 
     def device(self, call: Call) -> None:
         """Whether the machine has the device of a step, which all of its runs would need."""
-        from powderdsl.simulation.programs import find_device
-
         word = call.first("device")
         if self.devices and word is not None and self.first_time(word.step, "device", word.filled):
+            from powderdsl.simulation.programs import find_device  # imports torch
+
             with self.told(word):
                 find_device(word.filled)
 

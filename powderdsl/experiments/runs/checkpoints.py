@@ -9,13 +9,14 @@ import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.system.pickles import checked
 from powderdsl.system.reading import read_bytes
 from powderdsl.system.writing import failure, not_writable, replacing
+
+if TYPE_CHECKING:
+    import torch
 
 NAME = re.compile(r"([0-9]{12})-([0-9a-f]{16})\.pt")
 
@@ -38,6 +39,8 @@ def save_checkpoint(folder: Path, step: int, state: Any) -> Path:
     Raises:
         CompileError: PD613 if the folder cannot be written to, or the disk is full.
     """
+    import torch
+
     buffer = io.BytesIO()
     torch.save(state, buffer)
     data = buffer.getbuffer()
@@ -69,6 +72,8 @@ def latest_checkpoint(folder: Path, device: str | torch.device = "cpu") -> Check
     Raises:
         CompileError: PD620 for a file that is whole and holds something else.
     """
+    import torch
+
     for step, digest, path in _named(folder):
         try:
             data = read_bytes(path, MAX_BYTES)

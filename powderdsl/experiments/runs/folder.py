@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
 from filelock import FileLock, Timeout
 
 from powderdsl.diagnostics import CompileError, suggest
@@ -23,6 +22,9 @@ from powderdsl.experiments.runs.metrics import Metrics
 from powderdsl.system.reading import check_links, read_json
 from powderdsl.system.scratch import sweep
 from powderdsl.system.writing import failure, not_writable, replacing
+
+if TYPE_CHECKING:
+    import torch
 
 ABOUT = "run.json"
 FORMAT = 2
