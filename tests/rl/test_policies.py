@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 @pytest.fixture(scope="module")
 def program(run: RunFolder) -> TaskProgram:
     return compile_task(str(run.config["task"]), backend="wasm")
+
+
+def test_a_policy_that_only_acts_imports_no_compiler(run: RunFolder) -> None:
+    """The first optimizer of a process imports `torch._dynamo`, which takes a second."""
+    program = f"""
+import sys
+from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.rl import load_policy
+from powderdsl.tasks.episodes import compile_task
+load_policy({str(run.path)!r}, TensorEnv(compile_task({str(run.config["task"])!r}, backend="wasm"), 1))
+print("torch._dynamo" in sys.modules)
+"""
+    found = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert found.stdout == "False\n", found.stderr
 
 
 @pytest.mark.parametrize("deterministic", [True, False])

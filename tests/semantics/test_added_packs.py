@@ -283,6 +283,7 @@ def test_tests_that_an_added_pack_changes_are_told_and_do_not_fail() -> None:
     results = {one.example.name: one for one in run_examples(library.load(rules))}
     changed = results["an explosion throws sand away"]
     assert (changed.passed, changed.failed, changed.added) == (False, False, ("quake",))
+    rules = "core+sand+fire+wind+quake.yaml"
     result = powderdsl("test", rules, "--examples", "64", "--drawn", "0", "--no-keep")
     assert result.exit_code == 0, result.output
     assert (

@@ -48,6 +48,27 @@ def test_exceptions_are_not_kept() -> None:
     assert memo.of("thing", "version", lambda: 1) == 1
 
 
+def test_a_file_is_parsed_once_in_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    original = compiler.read_file
+    monkeypatch.setattr(
+        compiler, "read_file", lambda source, reporter: read.append(source.text) or original(source, reporter)
+    )
+    pack = tmp_path / "chalk.yaml"
+    for color in ("#EEEEEE", "#EEEEEE", "#DDDDDD"):
+        pack.write_text(
+            f"pack: chalk\nneeds: core\nelements:\n  chalk: {{id: 90, density: 4, color: '{color}'}}\n"
+        )
+        ruleset = compiler.load(f"core+{pack}")
+        assert next(one for one in ruleset.elements if one.name == "chalk").color == color
+    assert sum("pack: chalk" in text for text in read) == 2
+    for _ in range(2):
+        pack.write_text("pack: chalk\nnothing: known\n")
+        with pytest.raises(CompileError, match="PD108"):
+            compiler.load(pack)
+    assert sum("nothing: known" in text for text in read) == 1
+
+
 def code(path: Path, memo: Memo | None) -> bytes:
     model, _ = load_with_diagnostics(path)
     return b"".join(
