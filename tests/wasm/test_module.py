@@ -76,7 +76,7 @@ def test_worlds_keep_their_state_when_others_follow(torch) -> None:  # type: ign
 def test_memory_is_used_again(torch) -> None:  # type: ignore[no-untyped-def]
     sim = powderdsl.compile("powderworld", backend="wasm")
     ids = torch.randint(0, 14, (3, 20, 64), generator=torch.Generator().manual_seed(1))
-    world = sim.step(sim.world(ids, seed=3), 60)
+    world = sim.step(sim.step(sim.world(ids, seed=3), 60))  # the second call copies the worlds of the first
     instance, _ = packed(world)
     before = instance.call("scratch", 0), instance.running.memory_size()
     for _ in range(60):
