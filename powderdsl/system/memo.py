@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+_MISSING: Any = object()
 
 
 class Memo:
     """Results by what they depend on: for each thing, such as a file, those of its last few versions.
 
-    Functions that take one return what they would return without. It is for one thread at a time.
+    Functions that take one return what they would return without. Threads may share one: two of them may make the same
+    thing at once.
 
     Args:
         versions: of each thing.
@@ -26,11 +30,17 @@ class Memo:
 
     def of(self, thing: Hashable, version: Hashable, make: Callable[[], T]) -> T:
         """The result for a version of a thing, which is made if it is not known. An exception is not kept."""
-        found = self._kept.pop(thing, {})
-        self._kept[thing] = found
-        result: T = found.pop(version) if version in found else make()
+        # Each line below is one operation on a dict, which threads see done or not done. There is no lock, which a
+        # fork could copy while another thread holds it.
+        found = self._kept.setdefault(thing, {})
+        result: T = found.pop(version, _MISSING)
+        if result is _MISSING:
+            result = make()
         found[version] = result
+        self._kept.pop(thing, None)
+        self._kept[thing] = found
         for kept, limit in ((found, self.versions), (self._kept, self.things)):
             if len(kept) > limit:
-                del kept[next(iter(kept))]
+                with suppress(StopIteration, RuntimeError):  # another thread has changed it meanwhile
+                    kept.pop(next(iter(kept)), None)
         return result

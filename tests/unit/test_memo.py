@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -34,6 +36,17 @@ def test_the_least_recently_used_is_forgotten() -> None:
     assert made[6:] == ["yb"]
     with pytest.raises(ValueError, match="at least one"):
         Memo(versions=0)
+
+
+def test_threads_may_share_a_memo() -> None:
+    memo = Memo(versions=2, things=3)
+
+    def use(thread: int) -> bool:
+        numbers = [(thread * step) % 7 for step in range(5000)]
+        return all(memo.of(n % 4, n, partial(str, n)) == str(n) for n in numbers)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(use, range(1, 9)))
 
 
 def test_exceptions_are_not_kept() -> None:

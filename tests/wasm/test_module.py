@@ -15,6 +15,7 @@ import wasmtime
 import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir.segments import segments
+from powderdsl.system.memo import Memo
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.wasm import instances
 from powderdsl.targets.wasm.instances import Instance, WasmState
@@ -71,6 +72,24 @@ def test_worlds_keep_their_state_when_others_follow(torch) -> None:  # type: ign
     again = sim.step(sim.world(ids, seed=3))
     assert torch.equal(first.ids, again.ids)
     assert torch.equal(sim.step(first, 2).ids, sim.step(again, 2).ids)
+
+
+def test_the_same_rules_are_compiled_once_for_a_width(monkeypatch: pytest.MonkeyPatch, torch) -> None:  # type: ignore[no-untyped-def]
+    made: list[int] = []
+    original = instances.wasm_module
+    monkeypatch.setattr(
+        instances, "wasm_module", lambda *given, **more: made.append(given[1]) or original(*given, **more)
+    )
+    monkeypatch.setattr(instances, "_MODULES", Memo(versions=1, things=64))
+    for chance in ("20%", "20%", "30%"):
+        ruleset = powderdsl.load("core+sand+water", params={"water.melt": chance})
+        sim = powderdsl.compile(ruleset, backend="wasm")
+        for width in (5, 70, 5):
+            sim.step(sim.world(torch.zeros((1, 4, width), dtype=torch.int64)))
+    assert made == [5, 70]  # parameters are inputs
+    sim = powderdsl.compile("core+water", backend="wasm")
+    sim.step(sim.world(torch.zeros((1, 4, 5), dtype=torch.int64)))
+    assert made == [5, 70, 5]
 
 
 def test_memory_is_used_again(torch) -> None:  # type: ignore[no-untyped-def]

@@ -8,16 +8,21 @@ from threading import RLock
 from typing import Any
 
 from powderdsl.ir.ops import Program
+from powderdsl.ir.structure import structure
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job
+from powderdsl.targets.layout import Layout
 from powderdsl.targets.profiling import PassClock
 from powderdsl.targets.wasm.host import Host
 from powderdsl.targets.wasm.source import wasm_module
 
 ROOM = 1 << 30
 """Bytes of memory from which an instance takes no new batches. What it has can be stepped and read: there is as much again."""
+
+_MODULES = Memo(versions=1, things=64)
+"""The compiled modules of this process: tests, tasks and environments run the same rules on the same widths again."""
 
 Like = Mapping[str, tuple[Any, tuple[int, ...]]]
 """The dtype and shape of each array of a state."""
@@ -37,9 +42,14 @@ class Loaded:
         apart: bool,
         memo: Memo | None = None,
     ):
-        made = wasm_module(planes, width, apart=apart, memo=memo)
-        self.host, self.kind, self.module = host, kind, host.compile(made.code)
-        self.layout, self.pieces = made.layout, pieces(program)
+        def make() -> tuple[Any, Layout]:
+            made = wasm_module(planes, width, apart=apart, memo=memo)
+            return host.compile(made.code), made.layout
+
+        passes = tuple(structure(one, places=False) for one in planes.passes)
+        key = host, planes.slots, planes.params, planes.streams, passes, width, apart
+        self.module, self.layout = _MODULES.of(key, "", make)
+        self.host, self.kind, self.pieces = host, kind, pieces(program)
         self.passes = tuple(one.name for one in planes.passes)
         self._instances: dict[tuple[int, bool], Instance] = {}
 
