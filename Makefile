@@ -52,7 +52,8 @@ demo: $(VENV)/.core  ## run a designed world and write demo.gif
 	@$(BIN)/powderdsl run powderworld --world garden --steps 240 --out demo.gif
 	@echo "$(CURDIR)/demo.gif"
 
-web: tests/web/node_modules  ## fetch Pyodide for the tests in Node.js
+web: tests/web/node_modules  ## fetch Pyodide and the editor, for `powderdsl play`, the wheel and the tests
+	@node tests/web/parts.mjs
 
 test: $(VENV)/.ready  ## run the tests (ARGS=... for pytest, JOBS=0 for one process)
 	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 $(ARGS)

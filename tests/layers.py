@@ -122,9 +122,12 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "worldmodel": (*_SCREEN, *_LEARNING[:7]),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
+    "web": (*_BACK, "simulation.standalone", *_WORLDS),
+    "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "web.site"),
     "cli": (
         *_SCREEN,
         "simulation.standalone",
+        "web",
         *_TESTING,
         "testing.mutation",
         *_LEARNING,

@@ -18,6 +18,7 @@ from powderdsl.system.interrupts import LIFELINE, end_with_stdin, interruptible
 COMMANDS: dict[str, tuple[str, str]] = {
     # name: (module in powderdsl.cli.commands, summary)
     "run": ("run", "Run a world: watch it, or write a picture or an animation."),
+    "play": ("play", "Open a page to paint worlds and to change their rules while they run."),
     "check": ("check", "Find all mistakes in rule files and tasks at once."),
     "compile": ("compile", "Print the output of a compiler stage."),
     "show": ("show", "List elements, reactions, passes and parameters, or describe a task."),

@@ -7,7 +7,7 @@ from typing import Any
 
 from powderdsl.compiler import lower, parts
 from powderdsl.ir.segments import carry
-from powderdsl.model.state import SNAP, Slot, size_problem, slots, storage
+from powderdsl.model.state import SNAP, Slot, qualified_slots, size_problem, slots, storage
 from powderdsl.model.state import fits as sides_fit
 from powderdsl.model.types import Param, Ruleset
 from powderdsl.system.memo import Memo
@@ -119,8 +119,10 @@ def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
                 "high": ramp.hi,
             }
         elements.append(row)
+    qualified = qualified_slots(ruleset)
     fields = [
-        {"name": slot.name, "kind": slot.kind.name, "type": storage(slot.kind), "components": slot.planes}
+        {"name": slot.name, "qualified": qualified.get(slot.name, slot.name), "kind": slot.kind.name}
+        | {"type": storage(slot.kind), "components": slot.planes}
         for slot in slots(ruleset)
         if slot.name != "element"
     ]

@@ -33,7 +33,7 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
     worlds = np.full((batch, height, width), ground, dtype=np.uint8)
     if not others:
         return worlds
-    frame = _frame_element(ruleset, ground) if min(size) >= 3 else None
+    frame = frame_element(ruleset, ground) if min(size) >= 3 else None
     edge = mask(Shape("frame"), size)
     for index in range(batch):
         world = np.full(size, ground, dtype=np.uint8)
@@ -63,7 +63,8 @@ def random_shape(random: np.random.Generator, size: Size, reach: int) -> Shape:
     return Shape("line", (row, column, row + down, column + right, 1))
 
 
-def _frame_element(ruleset: Ruleset, ground: int) -> int | None:
+def frame_element(ruleset: Ruleset, ground: int) -> int | None:
+    """The id of the element that frames random worlds; None if nothing moves or everything changes."""
     if not moved_ids(ruleset):
         return None
     return min(unchanging_ids(ruleset) - {ground}, default=None)

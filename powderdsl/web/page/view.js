@@ -1,0 +1,215 @@
+// A canvas that shows a world as `powderdsl render` draws it, and the brush on it.
+
+import { generator } from "./engine.js";
+
+const MOTION = [200, 100, 100];
+const MAX_TINT = 0.5;
+const { fround } = Math;
+
+/** @returns {number[]} red, green, blue */
+export function channels(color) {
+  const number = parseInt(color.slice(1), 16);
+  return [number >> 16, (number >> 8) & 255, number & 255];
+}
+
+const packed = ([red, green, blue]) => (255 << 24) | (blue << 16) | (green << 8) | red;
+
+/** Draws worlds into an ImageData of their size. */
+export class Painter {
+  /** @param {import("./engine.js").Engine} engine @param {Map<number, string>} colors  other colors, by id */
+  constructor(engine, colors = new Map()) {
+    this.engine = engine;
+    this.image = new ImageData(engine.columns, engine.rows);
+    this.pixels = new Int32Array(this.image.data.buffer);
+    this.table = new Int32Array(256);
+    this.ramps = [];
+    for (const { id, color, ramp } of engine.elements) {
+      this.table[id] = packed(channels(colors.get(id) ?? color));
+      const field = ramp ? engine.fields.findIndex((one) => one.name === ramp.field) : -1;
+      if (field >= 0 && !colors.has(id)) this.ramps.push({ id, field, ramp, known: new Map() });
+    }
+  }
+
+  /** @returns {ImageData} the world as it is; with `tint`, cells that move are tinted */
+  draw(tint = true) {
+    const { engine, pixels, table } = this;
+    const ids = engine.ids();
+    for (let i = 0; i < ids.length; i++) pixels[i] = table[ids[i]];
+    for (const one of this.ramps) {
+      const values = engine.field(one.field);
+      const cells = engine.ids();
+      for (let i = 0; i < cells.length; i++) if (cells[i] === one.id) pixels[i] = this._ramped(one, values[i]);
+    }
+    if (tint && engine.motion >= 0) this._tint(engine.field(engine.motion));
+    return this.image;
+  }
+
+  /** The color of a value: channels change by one where the value has passed the middle between two of them. */
+  _ramped({ ramp, known }, value) {
+    let found = known.get(value);
+    if (found === undefined) {
+      const part = (Math.min(Math.max(value, ramp.low), ramp.high) - ramp.low) / (ramp.high - ramp.low);
+      const end = channels(ramp.end);
+      found = packed(
+        channels(ramp.start).map((from, i) => {
+          const by = end[i] - from;
+          return by > 0 ? from + Math.floor(by * part + 0.5) : from - Math.max(0, Math.ceil(-by * part - 0.5));
+        }),
+      );
+      if (known.size > 4096) known.clear();
+      known.set(value, found);
+    }
+    return found;
+  }
+
+  _tint(values) {
+    const { pixels, engine } = this;
+    const { cells } = engine;
+    const data = this.image.data;
+    for (let i = 0; i < cells; i++) {
+      const [down, right] = [values[i], values[cells + i]];
+      if (down === 0 && right === 0) continue;
+      const speed = fround(Math.sqrt(down * down + right * right));
+      const weight = Math.min(fround(speed / 2), MAX_TINT);
+      if (weight < 0.001) continue;
+      for (let c = 0; c < 3; c++) {
+        const old = data[4 * i + c];
+        data[4 * i + c] = fround(fround(old + fround((MOTION[c] - old) * weight)) + 0.5);
+      }
+    }
+    return pixels;
+  }
+}
+
+const random = generator(Date.now());
+
+/**
+ * Marks the cells of a brush at (row, column) in a mask.
+ * @param {Uint8Array} mask @param {{shape: string, size: number}} brush
+ */
+export function stamp(mask, rows, columns, row, column, { shape, size }) {
+  const low = -Math.floor((size - 1) / 2);
+  const middle = low + (size - 1) / 2;
+  for (let i = low; i < low + size; i++)
+    for (let j = low; j < low + size; j++) {
+      const [y, x] = [row + i, column + j];
+      if (y < 0 || x < 0 || y >= rows || x >= columns) continue;
+      const outside = (i - middle) ** 2 + (j - middle) ** 2 > (size / 2) ** 2;
+      if (shape !== "square" && outside) continue;
+      if (shape === "spray" && random() > 0.15) continue;
+      mask[y * columns + x] = 1;
+    }
+}
+
+/** Marks the cells of a brush that moves from one cell to another. */
+export function stroke(mask, rows, columns, from, to, brush) {
+  const count = Math.max(Math.abs(to[0] - from[0]), Math.abs(to[1] - from[1]), 1);
+  for (let n = 0; n <= count; n++) {
+    const row = Math.round(from[0] + ((to[0] - from[0]) * n) / count);
+    const column = Math.round(from[1] + ((to[1] - from[1]) * n) / count);
+    stamp(mask, rows, columns, row, column, brush);
+  }
+}
+
+/** Marks all cells of one element that are connected with a cell by sides. */
+export function region(mask, rows, columns, row, column, ids) {
+  const element = ids[row * columns + column];
+  const waiting = [row * columns + column];
+  while (waiting.length) {
+    const at = waiting.pop();
+    if (mask[at] || ids[at] !== element) continue;
+    mask[at] = 1;
+    const x = at % columns;
+    if (x > 0) waiting.push(at - 1);
+    if (x < columns - 1) waiting.push(at + 1);
+    if (at >= columns) waiting.push(at - columns);
+    if (at < (rows - 1) * columns) waiting.push(at + columns);
+  }
+}
+
+/** Lines of counts over time, one for each element that the world has. */
+export function chart(canvas, history, colors) {
+  const largest = Math.max(1, ...history.map((counts) => Math.max(...colors.map(([id]) => counts[id]))));
+  const context = canvas.getContext("2d");
+  const { width, height } = canvas;
+  context.clearRect(0, 0, width, height);
+  for (const [id, color] of colors) {
+    if (!history.some((counts) => counts[id])) continue;
+    context.strokeStyle = color;
+    context.lineWidth = 1.5;
+    context.beginPath();
+    history.forEach((counts, i) => {
+      const x = (i * width) / Math.max(history.length - 1, 100);
+      // The square root shows small counts beside large ones.
+      const y = height - 2 - Math.sqrt(counts[id] / largest) * (height - 4);
+      if (i) context.lineTo(x, y);
+      else context.moveTo(x, y);
+    });
+    context.stroke();
+  }
+}
+
+/** What people do on the canvas, with a pointer, a finger or the keyboard, in cells. */
+export class Surface {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {{start: Function, move: Function, end: Function, hover: Function, leave: Function}} events
+   */
+  constructor(canvas, events) {
+    this.canvas = canvas;
+    this.events = events;
+    /** @type {number[] | null} */ this.cursor = null;
+    let active = null;
+    canvas.addEventListener("pointerdown", (event) => {
+      if (event.button > 0 && event.button !== 2) return;
+      canvas.focus({ preventScroll: true });
+      canvas.setPointerCapture(event.pointerId);
+      active = event.pointerId;
+      events.start(this.cell(event), { erases: event.button === 2, picks: event.altKey });
+      event.preventDefault();
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const cell = this.cell(event);
+      events.hover(cell);
+      if (event.pointerId !== active) return;
+      const passed = event.getCoalescedEvents?.() ?? [];
+      for (const one of passed.length ? passed : [event]) events.move(this.cell(one));
+    });
+    for (const name of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(name, (event) => {
+        if (event.pointerId === active) events.end();
+        if (event.pointerId === active) active = null;
+      });
+    }
+    canvas.addEventListener("pointerleave", () => events.leave());
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("keydown", (event) => this._key(event));
+    canvas.addEventListener("blur", () => (this.cursor = null));
+  }
+
+  /** Row and column of an event; they may lie outside while a stroke leaves the canvas. */
+  cell(event) {
+    const box = this.canvas.getBoundingClientRect();
+    return [
+      Math.floor(((event.clientY - box.top) / box.height) * this.canvas.height),
+      Math.floor(((event.clientX - box.left) / box.width) * this.canvas.width),
+    ];
+  }
+
+  _key(event) {
+    const moves = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+    const { height, width } = this.canvas;
+    this.cursor ??= event.key in moves || event.key === "Enter" ? [height >> 1, width >> 1] : null;
+    if (event.key in moves) {
+      const by = event.shiftKey ? 8 : 1;
+      const [down, right] = moves[event.key];
+      const row = Math.min(Math.max(this.cursor[0] + by * down, 0), height - 1);
+      this.cursor = [row, Math.min(Math.max(this.cursor[1] + by * right, 0), width - 1)];
+      this.events.hover(this.cursor);
+    } else if (event.key === "Enter") {
+      this.events.start(this.cursor, {});
+      this.events.end();
+    } else return;
+    event.preventDefault();
+  }
+}

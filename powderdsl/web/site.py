@@ -1,0 +1,292 @@
+"""The playground as files: the page, rules as WebAssembly modules, start worlds, and the compiler for Pyodide."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from powderdsl.compiler import load, read, shipped, shipped_tests, split_names
+from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.state import fits, qualified_slots
+from powderdsl.model.types import Ruleset
+from powderdsl.simulation.standalone import standalone_module
+from powderdsl.system.user_cache import cache_folder
+from powderdsl.system.writing import replacing
+from powderdsl.worlds.raster import Size
+from powderdsl.worlds.scene import Start, draw_start, shipped_scenes
+from powderdsl.worlds.strewn import frame_element, strew
+
+HERE = Path(__file__).parent
+PAGE = HERE / "page"
+PARTS = HERE / "parts"
+"""What `make web` fetches from npm: Pyodide and CodeMirror, with their licenses. Git ignores the folder."""
+
+SIZES = (64, 128, 256, 512)
+LIBRARIES = ("click", "lark", "pyyaml")
+"""Python packages that the compiler needs in Pyodide."""
+
+PICTURE = 64
+"""Rows and columns of the worlds in the gallery."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Rules that the page offers. `names` is what `load` takes."""
+
+    key: str
+    names: tuple[str, ...]
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def ruleset(self) -> Ruleset:
+        return load(*self.names, params=self.params)
+
+    def files(self) -> dict[str, str]:
+        """The rule files by name, rulesets first; packs are found beside the ruleset that lists them."""
+        words = [word for name in self.names for word in split_names(name)[0]]
+        packs, ruleset = read(words, Reporter())
+        sources = [pack.source for pack in packs]
+        if ruleset is not None:
+            sources = [one.source for whole in (ruleset, *ruleset.beside) for one in whole.lineage] + sources
+        return {Path(source.name).name: source.text for source in sources}
+
+    def left_out(self) -> list[str]:
+        """Packs that a `-` in the names leaves out."""
+        return [word for name in self.names for word in split_names(name)[1]]
+
+
+def entries() -> list[Entry]:
+    """The shipped rules that stand by themselves, then the example packs on top of a ruleset."""
+    found = [Entry(name, (name,)) for name in shipped_tests()]
+    found.sort(key=lambda one: -len(one.ruleset.elements))
+    largest = found[0]
+    examples = [
+        Entry(path.stem, (*largest.names, str(path))) for path in sorted(examples_folder().glob("*.yaml"))
+    ]
+    return found + examples
+
+
+def examples_folder() -> Path:
+    """The example packs: inside the installed package, or in the repository."""
+    inside = shipped("examples")
+    return inside if HERE.parent / "data" in inside.parents else HERE.parents[1] / "docs" / "examples"
+
+
+def world_data(
+    ruleset: Ruleset, ids: Any, fields: Mapping[str, Any], clock: tuple[int, int, int]
+) -> dict[str, Any]:
+    """A world as JSON: ids [H, W] and whole fields [H, W] or [2, H, W], by qualified names."""
+    qualified = qualified_slots(ruleset)
+    return {
+        "rows": int(ids.shape[0]),
+        "columns": int(ids.shape[1]),
+        "palette": {str(element.id): element.qualified for element in ruleset.elements},
+        "ids": _text(ids.astype("uint8").tobytes()),
+        "fields": {
+            qualified.get(name, name): {
+                "type": str(values.dtype),
+                "components": 2 if values.ndim == 3 else 1,
+                "values": _text(values.tobytes()),
+            }
+            for name, values in fields.items()
+        },
+        "clock": [str(number) for number in clock],
+    }
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def _start_data(ruleset: Ruleset, start: Start) -> dict[str, Any]:
+    fields = {name: given.values for name, given in start.fields.items()}
+    return world_data(ruleset, start.ids, fields, (0, 0, 0))
+
+
+class Site:
+    """All files of the page, made when they are asked for.
+
+    `first`: rules that the page opens with, and `world`, their start world, if the user named one.
+    """
+
+    def __init__(self, first: Entry | None = None, world: dict[str, Any] | None = None):
+        self.first, self.world = first, world
+
+    @cached_property
+    def entries(self) -> dict[str, Entry]:
+        known = entries()
+        if self.first is not None:
+            known = [self.first] + [one for one in known if one.key != self.first.key]
+        return {one.key: one for one in known}
+
+    @cached_property
+    def files(self) -> dict[str, Callable[[], bytes]]:
+        """What makes each file, by its path in the site."""
+        found: dict[str, Callable[[], bytes]] = {}
+        for folder, below in ((PAGE, ""), (PARTS, "parts/")):
+            for path in sorted(folder.rglob("*")):
+                if path.is_file():
+                    found[below + path.relative_to(folder).as_posix()] = path.read_bytes
+        found["index.html"] = index_page
+        found["catalog.json"] = self._catalog
+        found["python.zip"] = python_archive
+        for key, entry in self.entries.items():
+            found[f"rules/{key}.json"] = _json(self._rules, entry)
+            for size in self.sizes(entry):
+                found[f"rules/{key}-{size[0]}x{size[1]}.wasm"] = _code(entry, size)
+        return found
+
+    def sizes(self, entry: Entry) -> list[Size]:
+        """The sizes of worlds for which the site has a module, the user's world first."""
+        sizes: list[Size] = [(side, side) for side in SIZES]
+        if entry is self.first and self.world is not None:
+            sizes.insert(0, (self.world["rows"], self.world["columns"]))
+        return [size for size in dict.fromkeys(sizes) if fits(entry.ruleset, size)]
+
+    def start(self) -> str:
+        """The module that the page loads first."""
+        entry = next(iter(self.entries.values()))
+        rows, columns = self.sizes(entry)[0]
+        return f"rules/{entry.key}-{rows}x{columns}.wasm"
+
+    def read(self, path: str) -> bytes | None:
+        """A file, or None if the site has no such file."""
+        make = self.files.get(path or "index.html")
+        return None if make is None else make()
+
+    def write(self, folder: Path) -> int:
+        """Write all files, and return how many there are. Raises CompileError (PD613) where that fails."""
+        for name, make in self.files.items():
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(target) as temporary:
+                temporary.write_bytes(make())
+        return len(self.files)
+
+    def _catalog(self) -> bytes:
+        listed = [
+            {"key": key, "about": _about(entry), "sizes": self.sizes(entry)}
+            for key, entry in self.entries.items()
+        ]
+        return _dump({"format": 1, "world": self.world is not None, "rules": listed})
+
+    def _rules(self, entry: Entry) -> dict[str, Any]:
+        ruleset = entry.ruleset
+        ground = ruleset.elements[0].id
+        worlds = [{"name": name, "about": about} | data for name, about, data in _worlds(ruleset)]
+        if entry is self.first and self.world is not None:
+            worlds.insert(0, self.world)
+        return {
+            "key": entry.key,
+            "title": ruleset.name,
+            "about": _about(entry),
+            "files": entry.files(),
+            "off": entry.left_out(),
+            "frame": frame_element(ruleset, ground),
+            "worlds": worlds,
+        }
+
+
+def index_page() -> bytes:
+    """The page itself, whose content security policy allows its own import map by hash."""
+    text = (PAGE / "index.html").read_text(encoding="utf-8")
+    inline = text.partition('<script type="importmap">')[2].partition("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(inline.encode()).digest()).decode()
+    return text.replace("IMPORTMAP", digest).encode()
+
+
+def _about(entry: Entry) -> str:
+    """The sentence of the last file that is named: a ruleset, or a pack on top of one."""
+    words = [word for name in entry.names for word in split_names(name)[0]]
+    packs, ruleset = read(words[-1:], Reporter())
+    named = packs[-1] if ruleset is None else ruleset
+    return "" if named is None else named.about
+
+
+def _worlds(ruleset: Ruleset) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Scenes whose elements the rules have, then random shapes."""
+    for scene in shipped_scenes():
+        try:
+            yield scene.name, scene.about or "", _start_data(ruleset, draw_start(scene, ruleset))
+        except CompileError:
+            continue
+    ids = strew(ruleset, (PICTURE, PICTURE), 1, 0)[0]
+    yield "shapes", "Random shapes of all elements.", world_data(ruleset, ids, {}, (0, 0, 0))
+
+
+def _dump(value: Any) -> bytes:
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()
+
+
+def _json(make: Callable[[Entry], Any], entry: Entry) -> Callable[[], bytes]:
+    return lambda: _dump(make(entry))
+
+
+def _code(entry: Entry, size: Size) -> Callable[[], bytes]:
+    return lambda: cached_module(entry.ruleset, size)
+
+
+def cached_module(ruleset: Ruleset, size: Size) -> bytes:
+    """The module of a world, from the user's cache if it was made before by the same code."""
+    key = f"{code_version()} {fingerprint(ruleset)} {ruleset.name} {size}"
+    try:
+        path = cache_folder("play") / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.wasm"
+        if path.is_file():
+            return path.read_bytes()
+    except OSError:
+        return standalone_module(ruleset, size)
+    code = standalone_module(ruleset, size)
+    with replacing(path) as temporary:
+        temporary.write_bytes(code)
+    return code
+
+
+@cache
+def code_version() -> str:
+    """A number that changes with any module of powderdsl."""
+    found = hashlib.sha256()
+    for path in sorted(HERE.parent.rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()[:16]
+
+
+ABSENT = ("envs", "datasets", "rl", "worldmodel", "experiments", "targets/cuda", "web/page", "web/parts")
+"""Parts of powderdsl that need torch, and the page itself: Pyodide does without them."""
+
+
+@cache
+def python_archive() -> bytes:
+    """A zip of powderdsl and the packages that it needs, to be unpacked in Pyodide."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(HERE.parent.rglob("*")):
+            name = path.relative_to(HERE.parent).as_posix()
+            if path.is_file() and "__pycache__" not in path.parts and not name.startswith(ABSENT):
+                _add(archive, f"powderdsl/{name}", path.read_bytes())
+        for folder in ("rules", "tasks"):
+            for path in sorted(shipped(folder).rglob("*.yaml")):
+                name = f"powderdsl/data/{folder}/{path.relative_to(shipped(folder)).as_posix()}"
+                if name not in archive.namelist():
+                    _add(archive, name, path.read_bytes())
+        for library in LIBRARIES:
+            for file in metadata.files(library) or ():
+                if not (".." in file.parts or "__pycache__" in file.parts or file.suffix in (".so", ".pyd")):
+                    _add(archive, str(file), Path(str(file.locate())).read_bytes())
+    return out.getvalue()
+
+
+def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    """A file with a fixed date: the same files make the same archive."""
+    entry = zipfile.ZipInfo(name, (2000, 1, 1, 0, 0, 0))
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    archive.writestr(entry, data)

@@ -1,0 +1,45 @@
+// Copies what the page needs from npm's packages, with their licenses, to powderdsl/web/parts: node parts.mjs
+import { cpSync, existsSync, mkdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { dirname, join } from "node:path";
+import { fileURLToPath } from "node:url";
+
+const here = dirname(fileURLToPath(import.meta.url));
+const modules = join(here, "node_modules");
+const parts = join(here, "..", "..", "powderdsl", "web", "parts");
+const PYODIDE = ["pyodide.mjs", "pyodide.asm.mjs", "pyodide.asm.wasm", "python_stdlib.zip", "pyodide-lock.json"];
+const EDITOR = {
+  "@codemirror/autocomplete": "dist/index.js",
+  "@codemirror/commands": "dist/index.js",
+  "@codemirror/lang-yaml": "dist/index.js",
+  "@codemirror/language": "dist/index.js",
+  "@codemirror/lint": "dist/index.js",
+  "@codemirror/search": "dist/index.js",
+  "@codemirror/state": "dist/index.js",
+  "@codemirror/view": "dist/index.js",
+  "@codemirror/streamparser": "dist/index.js",
+  "@lezer/common": "dist/index.js",
+  "@lezer/highlight": "dist/index.js",
+  "@lezer/lr": "dist/index.js",
+  "@lezer/yaml": "dist/index.js",
+  "@marijn/find-cluster-break": "src/index.js",
+  crelt: "index.js",
+  "style-mod": "src/style-mod.js",
+  "w3c-keyname": "index.js",
+};
+
+rmSync(parts, { recursive: true, force: true });
+mkdirSync(join(parts, "pyodide"), { recursive: true });
+mkdirSync(join(parts, "editor"), { recursive: true });
+mkdirSync(join(parts, "licenses"));
+const versions = [];
+for (const [name, file] of [["pyodide", null], ...Object.entries(EDITOR)]) {
+  const folder = join(modules, name);
+  const about = JSON.parse(readFileSync(join(folder, "package.json"), "utf8"));
+  const flat = name.replace("@", "").replace("/", "-");
+  versions.push(`${name} ${about.version}, ${about.license}`);
+  if (file) cpSync(join(folder, file), join(parts, "editor", `${flat}.js`));
+  const license = ["LICENSE", "LICENSE.md"].map((one) => join(folder, one)).find((one) => existsSync(one));
+  if (license) cpSync(license, join(parts, "licenses", `${flat}.txt`));
+}
+for (const file of PYODIDE) cpSync(join(modules, "pyodide", file), join(parts, "pyodide", file));
+writeFileSync(join(parts, "licenses", "README.txt"), `${versions.join("\n")}\n`);
