@@ -17,11 +17,12 @@ from typing import Any
 from powderdsl.compiler import load, read, shipped, shipped_tests, split_names
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.model.state import fits, qualified_slots
+from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import replacing
+from powderdsl.web.worlds import world_data
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene import Start, draw_start, shipped_scenes
 from powderdsl.worlds.strewn import frame_element, strew
@@ -80,32 +81,6 @@ def examples_folder() -> Path:
     """The example packs: inside the installed package, or in the repository."""
     inside = shipped("examples")
     return inside if HERE.parent / "data" in inside.parents else HERE.parents[1] / "docs" / "examples"
-
-
-def world_data(
-    ruleset: Ruleset, ids: Any, fields: Mapping[str, Any], clock: tuple[int, int, int]
-) -> dict[str, Any]:
-    """A world as JSON: ids [H, W] and whole fields [H, W] or [2, H, W], by qualified names."""
-    qualified = qualified_slots(ruleset)
-    return {
-        "rows": int(ids.shape[0]),
-        "columns": int(ids.shape[1]),
-        "palette": {str(element.id): element.qualified for element in ruleset.elements},
-        "ids": _text(ids.astype("uint8").tobytes()),
-        "fields": {
-            qualified.get(name, name): {
-                "type": str(values.dtype),
-                "components": 2 if values.ndim == 3 else 1,
-                "values": _text(values.tobytes()),
-            }
-            for name, values in fields.items()
-        },
-        "clock": [str(number) for number in clock],
-    }
-
-
-def _text(data: bytes) -> str:
-    return base64.b64encode(data).decode()
 
 
 def _start_data(ruleset: Ruleset, start: Start) -> dict[str, Any]:

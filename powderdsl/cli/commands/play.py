@@ -62,7 +62,7 @@ def command(
 def _start(ruleset: Ruleset, world: str) -> dict[str, Any]:
     """The user's start world, as the page reads worlds."""
     from powderdsl.cli.start_worlds import start
-    from powderdsl.web.site import world_data
+    from powderdsl.web.worlds import world_data
 
     first = start(ruleset, world, None, None, None)
     state = {name: value[0].cpu().numpy() for name, value in first.state.items()}

@@ -543,6 +543,9 @@ async function begin() {
   fill($("rules"), app.catalog.rules.map((one) => [one.key, one.key]), app.catalog.rules[0].key);
   await openRules(app.catalog.rules[0].key, { size: app.catalog.size ?? "64x64" });
   app.firstWorld = performance.now();
+  // The rest comes after the first picture: the editor, and Python in a worker.
+  await import("./panels.js");
+  await import("./rules.js");
 }
 
 app.surface = surface;

@@ -1,0 +1,253 @@
+"""What the page calls in Pyodide: functions of one session, JSON in, JSON or bytes out."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from powderdsl.arrays import np
+from powderdsl.compiler import load_with_diagnostics, read
+from powderdsl.diagnostics import CompileError, Diagnostic, Reporter
+from powderdsl.diagnostics.render import diagnostic_data, render_text
+from powderdsl.model.builtins import FUNCTIONS, RESERVED
+from powderdsl.model.schema import KEYS
+from powderdsl.model.state import qualified_slots, slot_name
+from powderdsl.model.types import Ruleset
+from powderdsl.simulation.standalone import standalone_module
+from powderdsl.syntax.parse import reserved_words
+from powderdsl.system.memo import Memo
+
+MAX_FILES = 64
+MAX_TEXT = 1 << 20
+"""Characters of all files together."""
+
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.ya?ml")
+PACK = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
+
+
+class BadRequest(ValueError):
+    """The page, or a link that it was given, asks for something that the session cannot do."""
+
+
+class Session:
+    """Rule files in a folder of their own, and the last rules that had no mistakes."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.memo = Memo()
+        self.ruleset: Ruleset | None = None
+
+    def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
+        """Load the files without the packs in `off`. Rules with mistakes leave the ones before in place."""
+        names = self._write(files, off)
+        packs: list[str] = []
+        try:
+            packs = self._packs(names)
+            ruleset, remarks = load_with_diagnostics(*names, memo=self.memo)
+        except CompileError as error:
+            return {"ok": False, "diagnostics": self._data(error.diagnostics), "packs": packs}
+        self.ruleset = ruleset
+        return {"ok": True, "diagnostics": self._data(remarks), "packs": packs, "words": _words(ruleset)}
+
+    def _write(self, files: Mapping[str, str], off: list[str]) -> list[str]:
+        """Write the files, and name them as `load` takes them: rulesets, packs beside them, packs left out."""
+        if not 0 < len(files) <= MAX_FILES or sum(map(len, files.values())) > MAX_TEXT:
+            raise BadRequest(f"1 to {MAX_FILES} files with at most {MAX_TEXT:,} characters together")
+        for name in files:
+            if not NAME.fullmatch(name):
+                raise BadRequest(f"{name[:80]!r} is not a file name such as sand.yaml")
+        if bad := next((name for name in off if not PACK.fullmatch(name)), None):
+            raise BadRequest(f"{bad[:80]!r} is not the name of a pack")
+        for path in self.folder.iterdir():
+            if path.name not in files:
+                path.unlink()
+        for name, text in files.items():
+            (self.folder / name).write_text(text, encoding="utf-8", errors="replace", newline="")
+        rulesets = [name for name, text in files.items() if re.search(r"^ruleset:", text, re.MULTILINE)]
+        based = {
+            base for name in rulesets for base in re.findall(r"^extends: *(\w+)", files[name], re.MULTILINE)
+        }
+        tops = [str(self.folder / name) for name in rulesets if Path(name).stem not in based]
+        known: set[str] = set()
+        try:
+            known = {pack.source.name for pack in read(tops, Reporter(), self.memo)[0]} if tops else known
+        except CompileError:  # too many mistakes: reported when the rules are loaded
+            pass
+        beside = [str(self.folder / name) for name in files if name not in rulesets]
+        names = tops + [name for name in beside if name not in known]
+        return [*names[:-1], "-".join([names[-1], *off])]
+
+    def _packs(self, names: list[str]) -> list[str]:
+        """The files of packs that take part."""
+        packs, _ = read(names, Reporter(), self.memo)
+        return [Path(pack.source.name).name for pack in packs]
+
+    def _data(self, found: tuple[Diagnostic, ...]) -> list[dict[str, Any]]:
+        """Diagnostics with the text that `check` prints, and file names without the folder."""
+        data = [diagnostic_data(one, utf16=True) | {"text": render_text(one)} for one in found]
+        plain = json.dumps(data).replace(json.dumps(f"{self.folder}/")[1:-1], "")
+        shown: list[dict[str, Any]] = json.loads(plain)
+        return shown
+
+    def compile(self, rows: int, columns: int) -> bytes:
+        """The last good rules as a module of a world."""
+        return standalone_module(self._rules(), (int(rows), int(columns)), self.memo)
+
+    def _rules(self) -> Ruleset:
+        if self.ruleset is None:
+            raise BadRequest("no rules without mistakes have been loaded")
+        return self.ruleset
+
+    def ledger(self) -> str:
+        """What rules create, destroy and conserve, as `check --ledger` prints it."""
+        from powderdsl.analysis.account import ledger_text
+        from powderdsl.analysis.ledger import ledger
+
+        return ledger_text(ledger(self._rules()))
+
+    def invariants(self) -> list[dict[str, Any]]:
+        """Each invariant: proven, tried on worlds, or broken."""
+        from powderdsl.analysis.ledger import ledger
+        from powderdsl.testing.properties.refute import refuted
+
+        rules = self._rules()
+        return self._data(refuted(rules, ledger(rules)))
+
+    def tests(self) -> list[dict[str, Any]]:
+        """Each test of the packs: its place, and what failed, with the world then."""
+        from powderdsl.testing.pack_tests.runner import run_examples
+
+        return [
+            {
+                "name": one.example.name,
+                "passed": one.passed,
+                "problem": one.problem,
+                "step": one.step,
+                "after": list(one.after),
+                "place": one.example.span.place.rpartition("/")[2] if one.example.span else "",
+            }
+            for one in run_examples(self._rules())
+        ]
+
+    def trace(self, world: dict[str, Any], row: int, column: int) -> str:
+        """Why a cell holds what it holds one step after a world."""
+        from powderdsl.simulation.tracing.text import trace_text
+        from powderdsl.simulation.tracing.trace import trace
+
+        return trace_text(trace(self._world(world), int(row), int(column), 1)).replace(f"{self.folder}/", "")
+
+    def save(self, world: dict[str, Any]) -> bytes:
+        """A world as an .npz, which `powderdsl run` continues."""
+        from powderdsl.worlds.store import save
+
+        path = self.folder.parent / "world.npz"
+        save(self._world(world), path)
+        return path.read_bytes()
+
+    def open_world(self, data: str) -> dict[str, Any]:
+        """The first world of an .npz (base64)."""
+        from powderdsl.web.worlds import world_data
+        from powderdsl.worlds.store import load_world
+
+        path = self.folder.parent / "opened.npz"
+        path.write_bytes(base64.b64decode(data))
+        try:
+            found = load_world(path, self._simulator())
+        finally:
+            path.unlink()
+        state = {name: np.asarray(value)[0] for name, value in found.state.items()}
+        ids = state.pop("element")
+        clock = int(found.seed[0]), int(found.index[0]), int(found.step[0])
+        return world_data(self._rules(), ids, state, clock)
+
+    def _simulator(self) -> Any:
+        from powderdsl.simulation.array_worlds import ArraySimulator
+
+        return ArraySimulator(self._rules(), memo=self.memo)
+
+    def _world(self, data: dict[str, Any]) -> Any:
+        """A world as the page writes it, whose ids and fields are those of the rules."""
+        rules, sim = self._rules(), self._simulator()
+        ours = {element.qualified: element.id for element in rules.elements}
+        shape = int(data["rows"]), int(data["columns"])
+        table = bytearray(256)
+        for number, name in data["palette"].items():
+            if name not in ours:
+                raise BadRequest(f"the rules have no element {name}")
+            table[int(number)] = ours[name]
+        ids = np.frombuffer(base64.b64decode(data["ids"]).translate(bytes(table)), np.uint8).reshape(
+            (1, *shape)
+        )
+        fields: dict[str, Any] = {}
+        known = qualified_slots(rules).values()
+        for name, given in data["fields"].items():
+            if name not in known:
+                continue
+            values = np.frombuffer(base64.b64decode(given["values"]), np.dtype(given["type"]))
+            whole = (1, 2, *shape) if given["components"] == 2 else (1, *shape)
+            fields[slot_name(rules, name)] = values.reshape(whole)
+        seed, index, step = (int(number) for number in data["clock"])
+        world = sim.replace(sim.world(ids, seed=seed), **fields)
+        clock = {"index": index, "step": step}
+        from dataclasses import replace
+
+        return replace(
+            world, **{name: np.full_like(getattr(world, name), value) for name, value in clock.items()}
+        )
+
+
+def _words(ruleset: Ruleset) -> dict[str, list[str]]:
+    """What the editor completes, by kind."""
+    return {
+        "element": [one.name for one in ruleset.elements],
+        "field": [one.name for one in (*ruleset.fields, *ruleset.properties)],
+        "parameter": [one.name.rpartition(".")[2] for one in ruleset.params],
+        "function": sorted(FUNCTIONS),
+        "keyword": sorted({*reserved_words(), *RESERVED}),
+        "key": sorted({key for keys in KEYS.values() for key in keys}),
+    }
+
+
+_session: list[Session] = []
+
+
+def session() -> Session:
+    """The session of this process."""
+    if not _session:
+        folder = Path(tempfile.mkdtemp()) / "rules"
+        folder.mkdir()
+        _session.append(Session(folder))
+    return _session[0]
+
+
+CALLS: Mapping[str, Callable[..., Any]] = {
+    "check": Session.check,
+    "compile": Session.compile,
+    "ledger": Session.ledger,
+    "invariants": Session.invariants,
+    "tests": Session.tests,
+    "trace": Session.trace,
+    "save": Session.save,
+    "open_world": Session.open_world,
+}
+
+
+def call(name: str, arguments: str) -> str | bytes:
+    """Call a function of the session with a JSON list; the result as JSON, or bytes as they are.
+
+    What is wrong with the input comes back as {"error": text}, never as an exception.
+    """
+    try:
+        found = CALLS[name](session(), *json.loads(arguments))
+    except CompileError as error:
+        return json.dumps({"error": str(error)})
+    except (BadRequest, IndexError, KeyError, TypeError, ValueError) as error:
+        return json.dumps(
+            {"error": f"{type(error).__name__}: {error}" if not isinstance(error, BadRequest) else str(error)}
+        )
+    return found if isinstance(found, bytes) else json.dumps({"result": found})

@@ -1,0 +1,81 @@
+// Parameters as sliders, and the gallery of live pictures.
+
+import { app, make, openRules, shippedModule, sheetOf, size } from "./app.js";
+import { Engine } from "./engine.js";
+import { Painter } from "./view.js";
+import { readWorld } from "./worlds.js";
+
+const $ = (id) => document.getElementById(id);
+const LIVE_EVERY = 100; // ms between two steps of a picture
+
+function showParameters(engine) {
+  const rows = engine.parameters.map((one, number) => {
+    const whole = one.kind === "int" || one.kind === "flag";
+    const range = make("input", { type: "range", min: one.low, max: one.high, step: whole ? 1 : "any", "aria-label": one.name });
+    range.value = String(engine.values[number]);
+    const word = (value) => (one.kind === "chance" ? `${Math.round(value * 1e5) / 1e3} %` : String(Math.round(value * 1e4) / 1e4));
+    const output = make("output", {}, word(engine.values[number]));
+    const set = (value) => {
+      engine.setParameter(number, value);
+      output.textContent = word(value);
+    };
+    range.oninput = () => set(Number(range.value));
+    const back = make("button", { type: "button", title: "Back to the file's value" }, "↺");
+    back.onclick = () => {
+      range.value = String(one.value);
+      set(one.value);
+    };
+    return make("div", { class: "parameter" }, make("span", {}, one.name), make("span", {}, output, " ", back), range, make("small", {}, one.about ?? ""));
+  });
+  $("parameters").replaceChildren(...(rows.length ? rows : [make("p", { class: "soft" }, "These rules have no parameters.")]));
+}
+
+app.onEngine.push(showParameters);
+if (app.engine) showParameters(app.engine);
+
+// The gallery
+
+let cards = null;
+let timer = null;
+
+async function showGallery() {
+  if (!cards) {
+    cards = [];
+    const shown = app.catalog.rules.map((one) => {
+      const canvas = make("canvas", { width: 64, height: 64 });
+      const open = () => openRules(one.key, { size: size().join("x") });
+      const attributes = { type: "button", class: "card", onclick: open };
+      cards.push({ key: one.key, sizes: one.sizes, canvas, engine: null, painter: null });
+      return make("button", attributes, canvas, make("strong", {}, one.key), make("small", {}, one.about));
+    });
+    $("gallery").replaceChildren(...shown);
+    for (const card of cards) await startCard(card);
+  }
+}
+
+async function startCard(card) {
+  const [rows, columns] = card.sizes[0];
+  const [sheet, module] = await Promise.all([sheetOf(card.key), shippedModule(card.key, rows, columns)]);
+  const engine = await Engine.start(module);
+  engine.restore(readWorld(sheet.worlds[Math.max(0, sheet.worlds.length - 2)]));
+  [card.canvas.width, card.canvas.height] = [columns, rows];
+  card.sheet = sheet;
+  card.painter = new Painter(engine);
+  card.engine = engine;
+}
+
+function live() {
+  for (const { engine, painter, canvas, sheet } of cards ?? []) {
+    if (!engine) continue;
+    engine.step(1);
+    if (engine.clock()[2] > 600n) engine.restore(readWorld(sheet.worlds[Math.max(0, sheet.worlds.length - 2)]));
+    canvas.getContext("2d").putImageData(painter.draw(), 0, 0);
+  }
+}
+
+app.onPanel.push((id) => {
+  clearInterval(timer);
+  if (id !== "gallery") return;
+  showGallery().catch((error) => console.error(error));
+  timer = setInterval(live, LIVE_EVERY);
+});
