@@ -7,6 +7,7 @@ import json
 import re
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from powderdsl.compiler import load_with_diagnostics, read
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter
 from powderdsl.diagnostics.render import diagnostic_data, render_text
 from powderdsl.model.builtins import FUNCTIONS, RESERVED
+from powderdsl.model.parameter_values import set_params
 from powderdsl.model.schema import KEYS
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import Ruleset
@@ -41,6 +43,7 @@ class Session:
         self.folder = folder
         self.memo = Memo()
         self.ruleset: Ruleset | None = None
+        self._made: Any = None
 
     def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
         """Load the files without the packs in `off`. Rules with mistakes leave the ones before in place."""
@@ -111,17 +114,35 @@ class Session:
         return ledger_text(ledger(self._rules()))
 
     def invariants(self) -> list[dict[str, Any]]:
-        """Each invariant: proven, tried on worlds, or broken."""
+        """Each invariant: `proven` and why, `tried` on worlds, or `broken` with a small world that breaks it."""
         from powderdsl.analysis.ledger import ledger
-        from powderdsl.testing.properties.refute import refuted
+        from powderdsl.testing.properties.blame import Oracle
+        from powderdsl.testing.properties.outcomes import counterexample_lines
+        from powderdsl.testing.properties.refute import broken_invariants
+        from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 
         rules = self._rules()
-        return self._data(refuted(rules, ledger(rules)))
+        book = ledger(rules)
+        search = InvariantSearch.of(
+            Oracle(rules, rules.passes), SearchPlan(), declared_only=True, ledger=book
+        )
+        found = {text: ("proven", one.reason, one.prop.owner) for text, one in search.results.items()}
+        found |= {one.prop.text: ("tried", "", one.prop.owner) for one in search.trials}
+        for one in broken_invariants(rules, book):
+            assert one.counterexample is not None
+            lines = "\n".join(counterexample_lines(one.counterexample, rules))
+            found[one.prop.text] = (one.status, lines.replace(f"{self.folder}/", ""), one.prop.owner)
+        return [
+            {"text": text, "status": status, "note": note, "owner": owner}
+            for text, (status, note, owner) in found.items()
+        ]
 
-    def tests(self) -> list[dict[str, Any]]:
-        """Each test of the packs: its place, and what failed, with the world then."""
+    def tests(self, pack: str) -> list[dict[str, Any]]:
+        """Each test of a pack: its place, and what failed, with the world then."""
         from powderdsl.testing.pack_tests.runner import run_examples
 
+        rules = self._rules()
+        own = replace(rules, tests=tuple(one for one in rules.tests if one.pack == pack))
         return [
             {
                 "name": one.example.name,
@@ -129,24 +150,32 @@ class Session:
                 "problem": one.problem,
                 "step": one.step,
                 "after": list(one.after),
+                "legend": dict(one.example.legend),
                 "place": one.example.span.place.rpartition("/")[2] if one.example.span else "",
             }
-            for one in run_examples(self._rules())
+            for one in run_examples(own, sim=self._simulator())
         ]
 
-    def trace(self, world: dict[str, Any], row: int, column: int) -> str:
-        """Why a cell holds what it holds one step after a world."""
+    def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> str:
+        """Why a cell holds what it holds one step after a world, with other values for some parameters."""
+        from powderdsl.simulation.array_worlds import ArraySimulator
         from powderdsl.simulation.tracing.text import trace_text
         from powderdsl.simulation.tracing.trace import trace
 
-        return trace_text(trace(self._world(world), int(row), int(column), 1)).replace(f"{self.folder}/", "")
+        reporter = Reporter()
+        rules = set_params(self._rules(), params, reporter)
+        reporter.raise_if_errors()
+        sim = ArraySimulator(rules, memo=self.memo) if params else self._simulator()
+        return trace_text(trace(self._world(world, sim), int(row), int(column), 1)).replace(
+            f"{self.folder}/", ""
+        )
 
     def save(self, world: dict[str, Any]) -> bytes:
         """A world as an .npz, which `powderdsl run` continues."""
         from powderdsl.worlds.store import save
 
         path = self.folder.parent / "world.npz"
-        save(self._world(world), path)
+        save(self._world(world, self._simulator()), path)
         return path.read_bytes()
 
     def open_world(self, data: str) -> dict[str, Any]:
@@ -166,13 +195,17 @@ class Session:
         return world_data(self._rules(), ids, state, clock)
 
     def _simulator(self) -> Any:
+        """One for each rules: compiling takes a while."""
         from powderdsl.simulation.array_worlds import ArraySimulator
 
-        return ArraySimulator(self._rules(), memo=self.memo)
+        rules = self._rules()
+        if self._made is None or self._made.ruleset is not rules:
+            self._made = ArraySimulator(rules, memo=self.memo)
+        return self._made
 
-    def _world(self, data: dict[str, Any]) -> Any:
+    def _world(self, data: dict[str, Any], sim: Any) -> Any:
         """A world as the page writes it, whose ids and fields are those of the rules."""
-        rules, sim = self._rules(), self._simulator()
+        rules = self._rules()
         ours = {element.qualified: element.id for element in rules.elements}
         shape = int(data["rows"]), int(data["columns"])
         table = bytearray(256)
@@ -194,8 +227,6 @@ class Session:
         seed, index, step = (int(number) for number in data["clock"])
         world = sim.replace(sim.world(ids, seed=seed), **fields)
         clock = {"index": index, "step": step}
-        from dataclasses import replace
-
         return replace(
             world, **{name: np.full_like(getattr(world, name), value) for name, value in clock.items()}
         )

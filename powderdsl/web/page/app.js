@@ -9,6 +9,8 @@ const SPEEDS = [1, 2, 5, 10, 20, 30, 60, 120, 240, 480];
 const STEP_BUDGET = 11; // ms of a frame that steps may take
 const CHART_EVERY = 100; // ms between two points of the chart
 const CHART_POINTS = 200;
+const CHECKPOINT_EVERY = 32n; // steps
+const MOST_CHECKPOINTS = 8;
 
 const $ = (id) => document.getElementById(id);
 
@@ -40,6 +42,8 @@ export const app = {
   /** @type {(cell: number[]) => void} */ explain: () => say("The compiler is still loading."),
   /** What makes an engine of this size for rules that were edited; null for the site's own. */ compiled: null,
   frames: 0,
+  /** Earlier moments of this world, from which its steps can be repeated; none from before an edit. */
+  /** @type {import("./engine.js").Snapshot[]} */ checkpoints: [],
 };
 
 export function say(text, bad = false) {
@@ -79,6 +83,9 @@ const moduleOf = (rows, columns) =>
 
 export const size = () => $("size").value.split("x").map(Number);
 
+/**
+ * Opens rules of the site.
+ */
 export async function openRules(key, { world, size: wanted = "64x64", run = true } = {}) {
   say(`Loading ${key}…`);
   const listed = app.catalog.rules.find((one) => one.key === key);
@@ -115,6 +122,7 @@ export function use(engine) {
   const first = app.engine === null;
   const parameters = app.engine && new Map(app.engine.parameters.map((one, i) => [one.name, app.engine.values[i]]));
   app.engine = engine;
+  app.checkpoints = [];
   if (parameters && app.keepParameters) {
     engine.parameters.forEach(({ name }, i) => parameters.has(name) && engine.setParameter(i, parameters.get(name)));
   }
@@ -157,6 +165,7 @@ function startWorld() {
   }
   app.start = engine.snapshot();
   app.history.clear();
+  app.checkpoints = [];
   counts = [];
   refresh();
 }
@@ -215,12 +224,22 @@ function advance(now) {
   due = Math.min(due + ((now - last) / 1000) * app.speed, Math.max(1, app.speed / 4));
   const began = performance.now();
   while (due >= 1) {
-    app.engine.step(1);
+    step();
     due -= 1;
     dirty = true;
     if (performance.now() - began > STEP_BUDGET) due = Math.min(due, 1);
     if (performance.now() - began > STEP_BUDGET) break;
   }
+}
+
+function step() {
+  const { checkpoints, engine } = app;
+  const now = engine.clock()[2];
+  if (!held && !(checkpoints.length && now - checkpoints.at(-1).clock[2] < CHECKPOINT_EVERY)) {
+    checkpoints.push(engine.snapshot());
+    if (checkpoints.length > MOST_CHECKPOINTS) checkpoints.shift();
+  }
+  engine.step(1);
 }
 
 function frame(now) {
@@ -315,6 +334,7 @@ let held = null;
 
 export function remember() {
   app.history.keep(app.engine.snapshot());
+  app.checkpoints = [];
 }
 
 /** Applies the tool from one cell to another. */
@@ -333,6 +353,7 @@ function apply(from, to, erases = false) {
     const [down, right] = [to[0] - from[0], to[1] - from[1]];
     if (down || right) engine.setField(engine.motion, mask, [down * 3, right * 3]);
   } else if (tool === "field" && engine.fields.length) setChosenField();
+  app.checkpoints = [];
   dirty = true;
 }
 
@@ -384,6 +405,7 @@ const surface = new Surface($("canvas"), {
 function timeTravel(found) {
   if (!found) return;
   app.engine.restore(found);
+  app.checkpoints = [];
   refresh();
 }
 
@@ -399,7 +421,7 @@ function reset() {
 
 function stepOnce() {
   setRunning(false);
-  app.engine.step(1);
+  step();
   refresh();
 }
 
@@ -546,6 +568,7 @@ async function begin() {
   // The rest comes after the first picture: the editor, and Python in a worker.
   await import("./panels.js");
   await import("./rules.js");
+  await Promise.all([import("./exchange.js"), import("./checks.js")]);
 }
 
 app.surface = surface;

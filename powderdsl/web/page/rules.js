@@ -33,7 +33,7 @@ rules.compiler = new Compiler((stage, error) => {
   if (error) say(error, true);
 });
 
-/** Opens the files of the site, or those of a link. */
+/** Opens the files of the site, or those of a link. Resolves to what the check finds. */
 export function openFiles(files, off = [], shown = undefined) {
   rules.files = { ...files };
   rules.off = new Set(off);
@@ -44,7 +44,7 @@ export function openFiles(files, off = [], shown = undefined) {
   const own = `${app.rules.key}.yaml`;
   const wanted = [shown, own].find((name) => name && names.includes(name) && !/^ruleset:/m.test(files[name]));
   show(wanted ?? names[2] ?? names.at(-1));
-  check({ applies: false });
+  return check({ applies: false });
 }
 
 function show(name) {
@@ -111,30 +111,38 @@ function edited() {
   waiting = setTimeout(() => check({ applies: true }), PAUSE);
 }
 
-let running = false;
-let again = null;
+/** The check that runs, and whether another one has to follow, for files that have changed since. */
+let running = null;
+let again = false;
+let applying = false;
 
-/** Checks the files; if `applies` and they have no mistakes, the world continues under them. One check at a time. */
-async function check(wanted) {
-  if (running) {
-    again = { applies: wanted.applies || (again?.applies ?? false) };
-    return;
-  }
-  running = true;
-  try {
-    await checkNow(wanted);
-  } catch (error) {
-    say(String(error.message ?? error), true);
-    showProblem(String(error.message ?? error));
-  } finally {
-    running = false;
-    const next = again;
-    again = null;
-    if (next) check(next);
-  }
+/**
+ * Checks the files; if `applies` and they have no mistakes, the world continues under them. One check runs at a time.
+ * @returns {Promise<{ok: boolean} | undefined>} what the last check found
+ */
+async function check({ applies }) {
+  applying = applies;
+  again = true;
+  running ??= checkAll().finally(() => (running = null));
+  return running;
 }
 
-async function checkNow({ applies }) {
+async function checkAll() {
+  let found;
+  while (again) {
+    again = false;
+    try {
+      found = await checkNow(applying);
+    } catch (error) {
+      found = undefined;
+      say(String(error.message ?? error), true);
+      showProblem(String(error.message ?? error));
+    }
+  }
+  return found;
+}
+
+async function checkNow(applies) {
   const began = rules.changedAt;
   const found = await rules.compiler.check(rules.files, [...rules.off]);
   rules.diagnostics = found.diagnostics;
@@ -143,14 +151,14 @@ async function checkNow({ applies }) {
   editor.mark(found.diagnostics);
   showTabs();
   showProblems(found.ok);
-  if (again || !found.ok || !applies) return;
+  if (again || !found.ok || !applies) return found;
   await applyRules();
   rules.applyTook = performance.now() - began;
+  return found;
 }
 
-/** Compiles the checked files for the present size, and continues the world under them. */
-export async function applyRules() {
-  const { rows, columns } = app.engine;
+/** Compiles the checked files for a size, the present one by default, and continues the world under them. */
+export async function applyRules(rows = app.engine.rows, columns = app.engine.columns) {
   const module = await compiled(rows, columns);
   const engine = await Engine.start(module);
   const lost = continueUnder(engine);

@@ -1,0 +1,154 @@
+// Pictures and animations of the world: PNG by the browser, GIF written here.
+
+const MOST_FRAMES = 120;
+const BUDGET = 32 << 20; // bytes of frames that are kept
+const EVERY = 50; // ms between frames
+
+/** Keeps the last seconds, with 15 bits a pixel. */
+export class Recorder {
+  constructor() {
+    this.clear();
+  }
+
+  clear() {
+    /** @type {Uint16Array[]} */ this.frames = [];
+    this.last = -Infinity;
+  }
+
+  /** @param {ImageData} image */
+  add(image, now = performance.now()) {
+    if (now - this.last < EVERY) return;
+    this.last = now;
+    if (this.rows !== image.height || this.columns !== image.width) this.frames = [];
+    [this.rows, this.columns] = [image.height, image.width];
+    const pixels = new Uint32Array(image.data.buffer);
+    const frame = new Uint16Array(pixels.length);
+    for (let i = 0; i < pixels.length; i++) {
+      const color = pixels[i];
+      frame[i] = ((color & 0xf8) << 7) | ((color >> 6) & 0x3e0) | ((color >> 19) & 31);
+    }
+    this.frames.push(frame);
+    const most = Math.max(2, Math.min(MOST_FRAMES, Math.floor(BUDGET / frame.byteLength)));
+    if (this.frames.length > most) this.frames.shift();
+  }
+
+  /** @returns {Blob} an animation of all frames, each pixel of the world as `factor`×`factor` */
+  gif(factor = Math.max(1, Math.floor(256 / Math.max(this.rows, this.columns)))) {
+    return new Blob(gif(this.frames, this.rows, this.columns, factor, EVERY / 10), { type: "image/gif" });
+  }
+}
+
+/** The most frequent colors, at most 256, and a table from each 15-bit color to the nearest of them. */
+function paletteOf(frames) {
+  const counts = new Uint32Array(32768);
+  for (const frame of frames) for (const color of frame) counts[color]++;
+  const seen = [...counts.keys()].filter((color) => counts[color]).sort((a, b) => counts[b] - counts[a]);
+  const palette = seen.slice(0, 256);
+  const table = new Uint8Array(32768);
+  const parts = (color) => [color >> 10, (color >> 5) & 31, color & 31];
+  palette.forEach((color, i) => (table[color] = i));
+  for (const color of seen.slice(256)) {
+    const [r, g, b] = parts(color);
+    let best = Infinity;
+    palette.forEach((other, i) => {
+      const [x, y, z] = parts(other);
+      const far = (r - x) ** 2 + (g - y) ** 2 + (b - z) ** 2;
+      if (far < best) [best, table[color]] = [far, i];
+    });
+  }
+  return { colors: palette.map((color) => parts(color).map((c) => (c << 3) | (c >> 2))), table };
+}
+
+/** GIF89a: a header, one palette, and the frames, each compressed by LZW. @returns {Uint8Array[]} */
+function gif(frames, rows, columns, factor, delay) {
+  const { colors, table } = paletteOf(frames);
+  const [width, height] = [columns * factor, rows * factor];
+  const two = (n) => [n & 255, n >> 8];
+  const ascii = (text) => [...text].map((c) => c.charCodeAt(0));
+  const palette = new Uint8Array(768);
+  colors.forEach((color, i) => palette.set(color, 3 * i));
+  const found = [
+    Uint8Array.from([...ascii("GIF89a"), ...two(width), ...two(height), 0xf7, 0, 0]),
+    palette,
+    Uint8Array.from([0x21, 0xff, 11, ...ascii("NETSCAPE2.0"), 3, 1, 0, 0, 0]),
+  ];
+  const pixels = new Uint8Array(width * height);
+  for (const frame of frames) {
+    for (let y = 0, to = 0; y < height; y++) {
+      const row = Math.floor(y / factor) * columns;
+      for (let x = 0; x < width; x++) pixels[to++] = table[frame[row + Math.floor(x / factor)]];
+    }
+    found.push(Uint8Array.from([0x21, 0xf9, 4, 0, ...two(delay), 0, 0]));
+    found.push(Uint8Array.from([0x2c, 0, 0, 0, 0, ...two(width), ...two(height), 0, 8]));
+    found.push(compressed(pixels), Uint8Array.of(0));
+  }
+  found.push(Uint8Array.of(0x3b));
+  return found;
+}
+
+/** LZW as GIF has it, for 8-bit symbols, in blocks of at most 255 bytes, each with its length before it. */
+function compressed(symbols) {
+  const [clear, end] = [256, 257];
+  const out = [];
+  let [bits, held, width] = [0, 0, 9];
+  const put = (code) => {
+    bits |= code << held;
+    held += width;
+    while (held >= 8) {
+      out.push(bits & 255);
+      bits >>>= 8;
+      held -= 8;
+    }
+  };
+  let codes = new Map();
+  let next = 258;
+  put(clear);
+  let known = symbols[0];
+  for (let i = 1; i < symbols.length; i++) {
+    const key = (known << 8) | symbols[i];
+    const longer = codes.get(key);
+    if (longer !== undefined) {
+      known = longer;
+      continue;
+    }
+    put(known);
+    if (next === 4096) {
+      put(clear);
+      codes = new Map();
+      [next, width] = [258, 9];
+    } else {
+      if (next === 1 << width) width++;
+      codes.set(key, next++);
+    }
+    known = symbols[i];
+  }
+  put(known);
+  put(end);
+  if (held) out.push(bits & 255);
+  const found = [];
+  for (let i = 0; i < out.length; i += 255) {
+    const block = out.slice(i, i + 255);
+    found.push(block.length, ...block);
+  }
+  return Uint8Array.from(found);
+}
+
+/** @param {HTMLCanvasElement} canvas @returns {Promise<Blob>} a PNG, small worlds enlarged */
+export function png(canvas) {
+  const factor = Math.max(1, Math.floor(512 / Math.max(canvas.width, canvas.height)));
+  const large = document.createElement("canvas");
+  [large.width, large.height] = [canvas.width * factor, canvas.height * factor];
+  const context = large.getContext("2d");
+  context.imageSmoothingEnabled = false;
+  context.drawImage(canvas, 0, 0, large.width, large.height);
+  return new Promise((resolve) => large.toBlob(resolve, "image/png"));
+}
+
+/** Saves a blob as a file of the user's. */
+export function download(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}
