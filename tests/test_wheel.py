@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-import sysconfig
 import zipfile
 from pathlib import Path
 
 import pytest
 
-from tests.wheels import ROOT, build_wheel, run, succeed
+from tests.wheels import ROOT, build_wheel, install_wheel, run, succeed
 
 pytestmark = pytest.mark.wheel
 
@@ -22,16 +20,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scripts(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scripts of a fresh environment with the wheel in it. Third parties come from this environment."""
-    home = tmp_path_factory.mktemp("environment")
-    succeed(sys.executable, "-m", "venv", "--without-pip", home, cwd=home)
-    places = sysconfig.get_paths(scheme="venv", vars={"base": str(home), "platbase": str(home)})
-    # A path in a .pth file is searched last, and .pth files in it, such as an editable one's, are not read.
-    Path(places["purelib"], "outer.pth").write_text(sysconfig.get_paths()["purelib"], encoding="utf-8")
-    python = Path(places["scripts"], "python")
-    pip = (sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel)
-    succeed(*pip, cwd=home)
-    return Path(places["scripts"])
+    """The scripts of a fresh environment with the wheel in it."""
+    return install_wheel(wheel, tmp_path_factory.mktemp("environment"))
 
 
 def shipped(folder: str) -> dict[str, bytes]:
@@ -44,6 +34,9 @@ def test_wheel_holds_what_ships(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         inside = {name: archive.read(name) for name in archive.namelist()}
     data = {f"powderdsl/data/{name}": text for name, text in (shipped("rules") | shipped("tasks")).items()}
+    data |= {
+        name.replace("docs", "powderdsl/data", 1): text for name, text in shipped("docs/examples").items()
+    }
     package = {name: text for name, text in shipped("powderdsl").items() if "__pycache__" not in name}
     assert data, "nothing ships"
     assert {name for name in inside if ".dist-info/" not in name} == data.keys() | package.keys()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,3 +31,15 @@ def build_wheel(folder: Path) -> Path:
     succeed(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
     (built,) = folder.glob("*.whl")
     return built
+
+
+def install_wheel(wheel: Path, home: Path) -> Path:
+    """The scripts of a fresh environment with the wheel in it. Third parties come from this environment."""
+    succeed(sys.executable, "-m", "venv", "--without-pip", home, cwd=home)
+    places = sysconfig.get_paths(scheme="venv", vars={"base": str(home), "platbase": str(home)})
+    # A path in a .pth file is searched last, and .pth files in it, such as an editable one's, are not read.
+    Path(places["purelib"], "outer.pth").write_text(sysconfig.get_paths()["purelib"], encoding="utf-8")
+    python = Path(places["scripts"], "python")
+    pip = (sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel)
+    succeed(*pip, cwd=home)
+    return Path(places["scripts"])

@@ -7,6 +7,7 @@ import json
 import re
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,10 +78,8 @@ class Session:
         }
         tops = [str(self.folder / name) for name in rulesets if Path(name).stem not in based]
         known: set[str] = set()
-        try:
+        with suppress(CompileError):  # too many mistakes: reported when the rules are loaded
             known = {pack.source.name for pack in read(tops, Reporter(), self.memo)[0]} if tops else known
-        except CompileError:  # too many mistakes: reported when the rules are loaded
-            pass
         beside = [str(self.folder / name) for name in files if name not in rulesets]
         names = tops + [name for name in beside if name not in known]
         return [*names[:-1], "-".join([names[-1], *off])]
@@ -91,11 +90,8 @@ class Session:
         return [Path(pack.source.name).name for pack in packs]
 
     def _data(self, found: tuple[Diagnostic, ...]) -> list[dict[str, Any]]:
-        """Diagnostics with the text that `check` prints, and file names without the folder."""
-        data = [diagnostic_data(one, utf16=True) | {"text": render_text(one)} for one in found]
-        plain = json.dumps(data).replace(json.dumps(f"{self.folder}/")[1:-1], "")
-        shown: list[dict[str, Any]] = json.loads(plain)
-        return shown
+        """Diagnostics with the text that `check` prints."""
+        return [diagnostic_data(one, utf16=True) | {"text": render_text(one)} for one in found]
 
     def compile(self, rows: int, columns: int) -> bytes:
         """The last good rules as a module of a world."""
@@ -131,7 +127,7 @@ class Session:
         for one in broken_invariants(rules, book):
             assert one.counterexample is not None
             lines = "\n".join(counterexample_lines(one.counterexample, rules))
-            found[one.prop.text] = (one.status, lines.replace(f"{self.folder}/", ""), one.prop.owner)
+            found[one.prop.text] = (one.status, lines, one.prop.owner)
         return [
             {"text": text, "status": status, "note": note, "owner": owner}
             for text, (status, note, owner) in found.items()
@@ -151,7 +147,7 @@ class Session:
                 "step": one.step,
                 "after": list(one.after),
                 "legend": dict(one.example.legend),
-                "place": one.example.span.place.rpartition("/")[2] if one.example.span else "",
+                "place": one.example.span.place.rpartition("/")[2],
             }
             for one in run_examples(own, sim=self._simulator())
         ]
@@ -236,7 +232,7 @@ def _words(ruleset: Ruleset) -> dict[str, list[str]]:
     """What the editor completes, by kind."""
     return {
         "element": [one.name for one in ruleset.elements],
-        "field": [one.name for one in (*ruleset.fields, *ruleset.properties)],
+        "field": [*(one.name for one in ruleset.fields), *(one.name for one in ruleset.properties)],
         "parameter": [one.name.rpartition(".")[2] for one in ruleset.params],
         "function": sorted(FUNCTIONS),
         "keyword": sorted({*reserved_words(), *RESERVED}),
@@ -273,12 +269,14 @@ def call(name: str, arguments: str) -> str | bytes:
 
     What is wrong with the input comes back as {"error": text}, never as an exception.
     """
+    current = session()
     try:
-        found = CALLS[name](session(), *json.loads(arguments))
-    except CompileError as error:
-        return json.dumps({"error": str(error)})
-    except (BadRequest, IndexError, KeyError, TypeError, ValueError) as error:
-        return json.dumps(
-            {"error": f"{type(error).__name__}: {error}" if not isinstance(error, BadRequest) else str(error)}
-        )
-    return found if isinstance(found, bytes) else json.dumps({"result": found})
+        found = {"result": CALLS[name](current, *json.loads(arguments))}
+    except (BadRequest, CompileError) as error:
+        found = {"error": str(error)}
+    except (IndexError, KeyError, TypeError, ValueError) as error:
+        found = {"error": f"{type(error).__name__}: {error}"}
+    if isinstance(found.get("result"), bytes):
+        return bytes(found["result"])
+    # Files have the names that the page gave them, wherever a text mentions them.
+    return json.dumps(found).replace(json.dumps(f"{current.folder}/")[1:-1], "")

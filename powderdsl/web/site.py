@@ -184,8 +184,7 @@ def _about(entry: Entry) -> str:
     """The sentence of the last file that is named: a ruleset, or a pack on top of one."""
     words = [word for name in entry.names for word in split_names(name)[0]]
     packs, ruleset = read(words[-1:], Reporter())
-    named = packs[-1] if ruleset is None else ruleset
-    return "" if named is None else named.about
+    return packs[-1].about if ruleset is None else ruleset.about
 
 
 def _worlds(ruleset: Ruleset) -> Iterator[tuple[str, str, dict[str, Any]]]:

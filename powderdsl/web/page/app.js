@@ -1,7 +1,7 @@
 // Puts the parts of the page together: which rules, which world, which tool; runs, draws and edits.
 
 import { blindColors } from "./colors.js";
-import { Engine, History, enlarged, scatter } from "./engine.js";
+import { Engine, History, enlarged, framed, scatter } from "./engine.js";
 import { Painter, Surface, chart, region, stamp, stroke } from "./view.js";
 import { readWorld } from "./worlds.js";
 
@@ -159,7 +159,7 @@ function startWorld() {
     engine.restore(factor > 1 ? enlarged(world, factor) : world);
     if (!world.clock.some(Boolean)) engine.reseed(seed);
   } else if (name === "empty") {
-    engine.begin(new Uint8Array(engine.cells).fill(engine.ground), seed);
+    engine.begin(framed(new Uint8Array(engine.cells).fill(engine.ground), engine, app.rules.frame), seed);
   } else {
     engine.begin(scatter(engine, app.rules.frame, seed), seed);
   }

@@ -275,11 +275,15 @@ export function scatter(engine, frame, seed) {
         ids[row * columns + column] = element;
       }
   }
-  if (frame !== null) {
-    for (let i = 0; i < ids.length; i++) {
-      const [y, x] = [Math.floor(i / columns), i % columns];
-      if (y === 0 || x === 0 || y === rows - 1 || x === columns - 1) ids[i] = frame;
-    }
+  return framed(ids, engine, frame);
+}
+
+/** Ids with an edge of the element `frame`, so that nothing falls out; null for rules that need none. */
+export function framed(ids, { rows, columns }, frame) {
+  if (frame === null) return ids;
+  for (let i = 0; i < ids.length; i++) {
+    const [y, x] = [Math.floor(i / columns), i % columns];
+    if (y === 0 || x === 0 || y === rows - 1 || x === columns - 1) ids[i] = frame;
   }
   return ids;
 }

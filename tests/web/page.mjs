@@ -1,0 +1,186 @@
+// Uses the playground as people do, in headless Chromium: node page.mjs ADDRESS FOLDER
+// Pictures and downloads go to FOLDER; what was seen and measured is printed as JSON.
+import { join } from "node:path";
+import { launch, openPage } from "./browser.mjs";
+
+const [address, folder] = process.argv.slice(2);
+const browser = await launch();
+const requests = new Set();
+
+/** The page as people find it, once its compiler has checked the rules. */
+async function visit(url) {
+  const found = await openPage(browser, url);
+  await found.page.waitForFunction(() => powderdsl.compilerReady && powderdsl.linkOpened, null, { timeout: 60000 });
+  return found;
+}
+
+/** A hash (FNV-1a) of the ids and of a field of the world, and its step. */
+const hashes = (page, field) =>
+  page.evaluate((name) => {
+    const fnv = (data) => {
+      let found = 0x811c9dc5;
+      for (const byte of new Uint8Array(data.buffer)) found = Math.imul(found ^ byte, 0x01000193) >>> 0;
+      return found;
+    };
+    const { ids, fields, clock } = powderdsl.engine.snapshot();
+    return { ids: fnv(ids), field: fnv(fields.get(name).values), step: Number(clock[2]) };
+  }, field);
+const count = (page, name) =>
+  page.evaluate((one) => {
+    const { engine } = powderdsl;
+    return engine.counts()[engine.elements.find((each) => each.name === one).id];
+  }, name);
+const text = (page, id) => page.locator(`#${id}`).textContent();
+const step = (page) => page.evaluate(() => Number(powderdsl.engine.clock()[2]));
+
+/** Replaces a text in the editor. */
+async function edit(page, from, to) {
+  await page.evaluate(
+    ([old, fresh]) => {
+      const { view } = powderdsl.edits.editor;
+      const at = view.state.doc.toString().indexOf(old);
+      if (at < 0) throw new Error(`${old} is not in the file`);
+      view.dispatch({ changes: { from: at, to: at + old.length, insert: fresh } });
+    },
+    [from, to],
+  );
+}
+const until = (page, what) =>
+  page.waitForFunction((name) => powderdsl.edits[name] !== null, what, { timeout: 60000 }).then(() =>
+    page.evaluate((name) => powderdsl.edits[name], what),
+  );
+
+async function drag(page, from, to) {
+  const box = await page.locator("#canvas").boundingBox();
+  const place = ([x, y]) => [box.x + box.width * x, box.y + box.height * y];
+  await page.mouse.move(...place(from));
+  await page.mouse.down();
+  await page.mouse.move(...place(to), { steps: 12 });
+  await page.mouse.up();
+}
+
+async function saved(page, id, name) {
+  const waiting = page.waitForEvent("download");
+  await page.locator("#save summary").click();
+  await page.locator(`#${id}`).click();
+  await (await waiting).saveAs(join(folder, name));
+}
+
+const seen = {};
+const { page, problems } = await visit(address);
+page.on("request", (one) => requests.add(new URL(one.url()).origin));
+seen.firstWorld = await page.evaluate(() => powderdsl.firstWorld);
+seen.compilerReady = await page.evaluate(() => powderdsl.compilerReady);
+await page.screenshot({ path: join(folder, "page.png") });
+
+// Paint sand and see it fall; undo.
+await page.locator("#run").click();
+await page.locator("#world").selectOption("empty");
+const clean = await hashes(page, "wind.velocity");
+await page.locator("#elements button", { hasText: "sand" }).click();
+await drag(page, [0.3, 0.2], [0.7, 0.2]);
+seen.painted = await count(page, "sand");
+const low = () =>
+  page.evaluate(() => {
+    const { engine } = powderdsl;
+    const sand = engine.elements.find((one) => one.name === "sand").id;
+    return engine.ids().subarray(-2 * engine.columns).filter((one) => one === sand).length;
+  });
+seen.lyingBefore = await low();
+await page.locator("#undo").click();
+const undone = await hashes(page, "wind.velocity");
+seen.undone = undone.ids === clean.ids && undone.step === clean.step;
+await page.locator("#redo").click();
+seen.redone = await count(page, "sand");
+await page.locator("#run").click();
+await page.waitForFunction(() => powderdsl.engine.clock()[2] > 100n);
+await page.locator("#run").click();
+seen.lyingAfter = await low();
+seen.fallen = await count(page, "sand");
+
+// Drag wind.
+await page.keyboard.press("w");
+await drag(page, [0.2, 0.5], [0.8, 0.5]);
+seen.wind = await page.evaluate(() => {
+  const { engine } = powderdsl;
+  return Math.max(...engine.field(engine.motion).subarray(engine.cells));
+});
+await page.keyboard.press("b");
+
+// Break a rule, see where and why; fix it, and see the world continue.
+const before = await hashes(page, "wind.velocity");
+await edit(page, "density: 4", "densit: 4");
+seen.keystrokeToDiagnostics = await until(page, "checkTook");
+seen.problem = await text(page, "problems");
+await page.locator("#run").click();
+await page.waitForFunction((from) => powderdsl.engine.clock()[2] > BigInt(from + 5), before.step);
+await page.screenshot({ path: join(folder, "broken.png") });
+seen.ranWhileBroken = (await step(page)) - before.step;
+await edit(page, "densit: 4", "density: 2");
+seen.editToRunning = await until(page, "applyTook");
+seen.applied = await text(page, "status");
+seen.stepsAfterFix = (await step(page)) - before.step;
+seen.sandAfterFix = await count(page, "sand");
+
+// A pack of one's own.
+await page.locator("#packs button", { hasText: "+ pack" }).click();
+await until(page, "applyTook");
+seen.own = await page.locator("#elements button", { hasText: "mine" }).count();
+await page.locator("#run").click();
+
+// A link opens the same world, with the same rules.
+await page.locator("#share").click();
+await page.waitForFunction(() => location.hash.length > 10);
+seen.link = page.url().length;
+const here = await hashes(page, "wind.velocity");
+const second = await visit(page.url());
+seen.sameFromLink = JSON.stringify(await hashes(second.page, "wind.velocity")) === JSON.stringify(here);
+seen.ownFromLink = await second.page.locator("#elements button", { hasText: "mine" }).count();
+await second.page.close();
+
+// A world continues on the command line.
+await page.goto(address);
+await page.reload();
+await page.waitForFunction(() => powderdsl?.linkOpened && powderdsl.compilerReady, null, { timeout: 60000 });
+await page.waitForFunction(() => document.getElementById("problems").textContent.includes("No mistakes"));
+await page.waitForFunction(() => powderdsl.engine.clock()[2] > 60n);
+await page.locator("#run").click();
+await saved(page, "save-world", "world.npz");
+for (let i = 0; i < 20; i++) await page.locator("#step").click();
+seen.continued = await hashes(page, "wind.velocity");
+await saved(page, "save-png", "world.png");
+await saved(page, "save-gif", "world.gif");
+
+// Why a cell changed, and what is known about the rules.
+await page.keyboard.press("t");
+const box = await page.locator("#canvas").boundingBox();
+await page.mouse.click(box.x + box.width * 0.25, box.y + box.height * 0.8);
+await page.waitForFunction(() => /of powderworld/.test(document.getElementById("checks").textContent), null, { timeout: 60000 });
+await page.locator("#checks button", { hasText: "ledger" }).click();
+await page.waitForFunction(() => /ledger of/.test(document.getElementById("checks").textContent), null, { timeout: 60000 });
+seen.checks = await text(page, "checks");
+await page.screenshot({ path: join(folder, "checks.png") });
+
+// A stranger's link: damaged, or with HTML in it.
+for (const bad of ["#w=AAAA", "#w=%3Cscript%3E", `#w=${"A".repeat(5000)}`]) {
+  await page.evaluate((hash) => (location.hash = hash), bad);
+  await page.waitForFunction(() => /damaged|version/.test(document.getElementById("status").textContent));
+}
+await page.locator("[data-panel=rules-panel]").click();
+await edit(page, "about: A powder that falls and piles up.", 'about: "<img src=x onerror=alert(1)>" \nnot <b>rules</b>');
+await until(page, "checkTook");
+seen.htmlInserted = await page.evaluate(() => document.querySelectorAll("#problems img, #problems b, #status img").length);
+seen.htmlShown = (await text(page, "problems")).includes("<b>");
+
+// The gallery, and narrow screens.
+await page.locator("[data-panel=gallery]").click();
+await page.locator("#gallery .card").first().waitFor();
+seen.gallery = await page.locator("#gallery .card").count();
+await page.setViewportSize({ width: 360, height: 740 });
+seen.tooWide = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
+await page.screenshot({ path: join(folder, "narrow.png") });
+
+seen.problems = problems;
+seen.origins = [...requests].filter((one) => one !== new URL(address).origin && one !== "null");
+console.log(JSON.stringify(seen, null, 1));
+await browser.close();

@@ -1,0 +1,159 @@
+"""What the page calls in Pyodide, called here: rules of strangers give messages, and worlds keep what they are."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import wasmtime
+
+import powderdsl
+from powderdsl.web import bridge
+from powderdsl.web.site import Entry, Site
+from powderdsl.web.worlds import world_data
+
+
+@pytest.fixture
+def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bridge.Session:
+    folder = tmp_path / "rules"
+    folder.mkdir()
+    made = bridge.Session(folder)
+    monkeypatch.setattr(bridge, "_session", [made])
+    return made
+
+
+def call(name: str, *arguments: Any) -> Any:
+    found = bridge.call(name, json.dumps(arguments))
+    return found if isinstance(found, bytes) else json.loads(found)
+
+
+def files(*names: str) -> dict[str, str]:
+    return Entry("rules", names).files()
+
+
+@pytest.mark.parametrize("names", [("powderworld",), ("life",), ("powderworld", "docs/examples/salt.yaml")])
+def test_the_files_of_rules_are_the_rules(session: bridge.Session, names: tuple[str, ...]) -> None:
+    found = call("check", files(*names), [])["result"]
+    assert (found["ok"], found["diagnostics"]) == (True, [])
+    wanted, ruleset = powderdsl.load(*names), session.ruleset
+    assert ruleset is not None
+    assert (ruleset.name, ruleset.palette, ruleset.passes) == (wanted.name, wanted.palette, wanted.passes)
+    module = call("compile", 16, 64)
+    wasmtime.Module.validate(wasmtime.Engine(), module)
+    assert set(found["words"]["element"]) == {one.name for one in wanted.elements}
+
+
+def test_broken_rules_leave_the_last_good_ones(session: bridge.Session) -> None:
+    assert call("compile", 8, 64) == {"error": "no rules without mistakes have been loaded"}
+    good = files("core", "sand")
+    assert call("check", good, [])["result"]["ok"]
+    last = session.ruleset
+    bad = good | {"sand.yaml": good["sand.yaml"].replace("density: 4", "densit: 4")}
+    found = call("check", bad, [])["result"]
+    assert not found["ok"]
+    (problem,) = found["diagnostics"]
+    assert (problem["code"], problem["primary"]["span"]["file"]) == ("PD108", "sand.yaml")
+    assert problem["primary"]["span"]["start"] == {"line": 5, "column": 17}
+    assert "^^^^^^" in problem["text"]
+    assert str(session.folder) not in json.dumps(found)
+    assert session.ruleset is last
+
+
+def test_packs_are_left_out(session: bridge.Session) -> None:
+    found = call("check", files("powderworld"), ["acid", "wind"])["result"]
+    assert found["ok"]
+    assert {"acid.yaml", "wind.yaml"}.isdisjoint(found["packs"])
+    assert session.ruleset is not None
+    assert session.ruleset.packs == powderdsl.load("powderworld-acid-wind").packs
+    assert not call("check", files("powderworld"), ["core"])["result"]["ok"]
+
+
+def test_worlds_are_saved_and_opened(session: bridge.Session, tmp_path: Path) -> None:
+    call("check", files("powderworld"), [])
+    ruleset = powderdsl.load("powderworld")
+    sim = powderdsl.compile(ruleset)
+    random = np.random.default_rng(1)
+    world = sim.world(random.integers(0, 14, (1, 16, 64)).astype(np.uint8), seed=2**40 + 3)
+    world = sim.step(world, 7)
+    state = {name: value[0].numpy() for name, value in world.state.items()}
+    data = world_data(ruleset, state.pop("element"), state, (2**40 + 3, 0, 7))
+    saved = call("save", data)
+    path = tmp_path / "world.npz"
+    path.write_bytes(saved)
+    from powderdsl.worlds.store import load_world
+
+    loaded = load_world(path, sim)
+    later = [sim.step(one, 5) for one in (world, loaded)]
+    for name, values in later[0].state.items():
+        assert (values == later[1].state[name]).all(), name
+    assert call("open_world", base64.b64encode(saved).decode())["result"] == data
+    assert "error" in call("open_world", base64.b64encode(b"no world").decode())
+
+
+def test_reports(session: bridge.Session) -> None:
+    call("check", files("core", "sand"), [])
+    assert call("ledger")["result"].startswith("ledger of core+sand")
+    (first, *_) = call("tests", "sand")["result"]
+    assert (first["name"], first["passed"], first["place"]) == (
+        "sand falls and slides off its pile",
+        True,
+        "sand.yaml:7:5",
+    )
+    known = {one["text"]: one["status"] for one in call("invariants")["result"]}
+    assert known["wall never changes"] == "proven"
+    broken = files("core", "sand")
+    broken["sand.yaml"] = broken["sand.yaml"].replace("gravity: yes", "gravity: no")
+    call("check", broken, [])
+    (first, *_) = call("tests", "sand")["result"]
+    assert not first["passed"]
+    assert first["after"]
+
+
+def test_traces_are_those_of_the_world(session: bridge.Session) -> None:
+    call("check", files("powderworld"), [])
+    ruleset = powderdsl.load("powderworld")
+    ids = np.zeros((8, 8), np.uint8)
+    sand = ruleset.element("sand")
+    assert sand is not None
+    ids[2, 3] = sand.id
+    data = world_data(ruleset, ids, {}, (0, 0, 0))
+    assert "cell 3,3 in step 1 of powderworld" in call("trace", data, 3, 3, {})["result"]
+    assert "sand" in call("trace", data, 3, 3, {"water.melt": 0.5})["result"]
+    assert "error" in call("trace", data, 99, 3, {})
+
+
+HOSTILE = [
+    ("check", [{}, []]),
+    ("check", [{"../core.yaml": ""}, []]),
+    ("check", [{"core.yaml": "pack: core"}, ["a-b"]]),
+    ("check", [{"core.yaml": "x" * (2 << 20)}, []]),
+    ("check", [{f"p{i}.yaml": "" for i in range(99)}, []]),
+    ("check", [{"core.yaml": 5}, []]),
+    ("check", [[], []]),
+    ("compile", ["a", 4]),
+    ("compile", [1 << 20, 1 << 20]),
+    ("compile", [0, -4]),
+    ("save", [{"rows": 4}]),
+    ("trace", [{}, 0, 0, {}]),
+    ("tests", []),
+    ("no such call", []),
+]
+
+
+@pytest.mark.parametrize(("name", "arguments"), HOSTILE)
+def test_what_does_not_fit_is_an_error_message(
+    session: bridge.Session, name: str, arguments: list[Any]
+) -> None:
+    call("check", files("core", "sand"), [])
+    found = call(name, *arguments)
+    assert found["error"]
+
+
+def test_every_ruleset_of_the_site_opens(session: bridge.Session) -> None:
+    site = Site()
+    for key, entry in site.entries.items():
+        assert call("check", entry.files(), entry.left_out())["result"]["ok"], key

@@ -1,0 +1,133 @@
+"""The playground in headless Chromium, from the installed wheel, as people use it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from powderdsl.web.site import PARTS
+from tests.wasm.standalone_world import chromium, fnv
+from tests.wheels import build_wheel, install_wheel, succeed
+
+HERE = Path(__file__).parent
+
+pytestmark = pytest.mark.wheel
+
+
+def needed() -> str:
+    """What is missing for these tests; empty if nothing is."""
+    if shutil.which("node") is None or not (HERE / "node_modules" / "playwright-core").is_dir():
+        return "the page is tested with Node.js and playwright-core: `make web` fetches it with npm"
+    if not PARTS.is_dir():
+        return "the page needs Pyodide and CodeMirror: `make web` fetches them with npm"
+    return "" if chromium() else "the page is tested in Chromium: apt install chromium-headless-shell"
+
+
+@pytest.fixture(scope="module")
+def scripts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if words := needed():
+        pytest.skip(words)
+    wheel = build_wheel(tmp_path_factory.mktemp("wheel"))
+    assert wheel.stat().st_size <= 20 << 20
+    return install_wheel(wheel, tmp_path_factory.mktemp("environment"))
+
+
+@pytest.fixture(scope="module")
+def address(scripts: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    command = [scripts / "powderdsl", "play", "--no-open"]
+    folder = tmp_path_factory.mktemp("elsewhere")
+    with subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as server:
+        assert server.stdout is not None
+        try:
+            yield server.stdout.readline().split()[0]
+        finally:
+            server.terminate()
+
+
+@pytest.fixture(scope="module")
+def seen(address: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("seen")
+    node = str(shutil.which("node"))
+    found: dict[str, Any] = json.loads(succeed(node, HERE / "page.mjs", address, folder, cwd=folder))
+    return found | {"folder": folder}
+
+
+def test_painted_sand_falls_and_edits_can_be_undone(seen: dict[str, Any]) -> None:
+    assert seen["painted"] > 60
+    assert seen["lyingBefore"] == 0 < seen["lyingAfter"]
+    assert seen["fallen"] == seen["painted"] == seen["redone"]
+    assert seen["undone"]
+    assert seen["wind"] > 1
+
+
+def test_broken_rules_are_explained_while_the_world_runs(seen: dict[str, Any]) -> None:
+    assert "error[PD108]: unknown property `densit`" in seen["problem"]
+    assert "sand.yaml:5" in seen["problem"]
+    assert "^^^^^^" in seen["problem"]
+    assert "did you mean `density`?" in seen["problem"]
+    assert seen["ranWhileBroken"] > 5
+    assert seen["applied"] == "The new rules run."
+    assert seen["stepsAfterFix"] >= seen["ranWhileBroken"]
+    assert seen["sandAfterFix"] == seen["painted"]
+    assert seen["own"] == 1
+
+
+def test_a_link_holds_the_world_and_its_rules(seen: dict[str, Any]) -> None:
+    assert seen["sameFromLink"]
+    assert seen["ownFromLink"] == 1
+    assert seen["link"] < 20_000
+
+
+def test_a_downloaded_world_continues_on_the_command_line(seen: dict[str, Any], scripts: Path) -> None:
+    folder: Path = seen["folder"]
+    arguments = ("powderworld", "--world", "world.npz", "--steps", "20", "--out", "later.npz")
+    succeed(scripts / "powderdsl", "run", *arguments, cwd=folder)
+    with np.load(folder / "later.npz") as later:
+        found = {
+            "ids": fnv(later["slot_element"].tobytes()),
+            "field": fnv(later["slot_velocity"].tobytes()),
+            "step": int(later["step"][0]),
+        }
+    assert found == seen["continued"]
+
+
+def test_pictures(seen: dict[str, Any], scripts: Path) -> None:
+    """The page draws as `powderdsl render` does; its animation ends with the same picture, in fewer colors."""
+    folder: Path = seen["folder"]
+    succeed(scripts / "powderdsl", "render", "powderworld", "later.npz", "--scale", "8", "--out", "later.png", cwd=folder)
+    with Image.open(folder / "world.png") as picture, Image.open(folder / "later.png") as wanted:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+        assert np.array_equal(pixels, np.asarray(wanted.convert("RGB")))
+    with Image.open(folder / "world.gif") as film:
+        assert film.size == (256, 256)
+        assert getattr(film, "n_frames", 1) > 5
+        film.seek(film.n_frames - 1)  # type: ignore[attr-defined]
+        last = np.asarray(film.convert("RGB")).astype(int)
+    assert np.abs(last - pixels[::2, ::2]).max() <= 24  # 15 bits a pixel, and 256 colors
+
+
+def test_reports(seen: dict[str, Any]) -> None:
+    assert "ledger of powderworld" in seen["checks"]
+    assert "of powderworld" in seen["checks"]
+    assert "/tmp" not in seen["checks"]
+
+
+def test_strangers_reach_nothing(seen: dict[str, Any]) -> None:
+    assert (seen["htmlInserted"], seen["htmlShown"]) == (0, True)
+    assert seen["origins"] == []
+    assert seen["problems"] == []
+
+
+def test_layout(seen: dict[str, Any]) -> None:
+    assert seen["gallery"] >= 12
+    assert not seen["tooWide"]

@@ -1,0 +1,177 @@
+"""The site as files, and the server that shows it on loopback."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import threading
+import zipfile
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from powderdsl.simulation.standalone import standalone_module
+from powderdsl.web import site as site_module
+from powderdsl.web.server import SiteServer
+from powderdsl.web.site import PAGE, Entry, Site
+from tests.cli.commands import powderdsl as command
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return Site(Entry("life", ("life",)))
+
+
+@pytest.fixture
+def server(site: Site) -> Iterator[SiteServer]:
+    made = SiteServer(site)
+    threading.Thread(target=made.serve_forever, daemon=True).start()
+    yield made
+    made.shutdown()
+    made.server_close()
+
+
+def ask(server: SiteServer, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes, Any]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
+    connection.request(method, path, headers=headers)
+    answer = connection.getresponse()
+    found = answer.status, answer.read(), answer.headers
+    connection.close()
+    return found
+
+
+def test_files_have_their_types(server: SiteServer) -> None:
+    for path, kind in (
+        ("/", "text/html; charset=utf-8"),
+        ("/app.js", "text/javascript; charset=utf-8"),
+        ("/catalog.json", "application/json"),
+        ("/rules/life-64x64.wasm", "application/wasm"),
+    ):
+        status, data, headers = ask(server, path)
+        assert (status, headers["Content-Type"], headers["X-Content-Type-Options"]) == (200, kind, "nosniff")
+        assert data
+    assert ask(server, "/rules/life-64x64.wasm")[1] == standalone_module(
+        Entry("life", ("life",)).ruleset, (64, 64)
+    )
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../site.py",
+        "/%2e%2e/site.py",
+        "/..%2fsite.py",
+        "//etc/passwd",
+        "/page/app.js",
+        "/rules/",
+        "/rules/x.json",
+    ],
+)
+def test_only_files_of_the_site_are_served(server: SiteServer, path: str) -> None:
+    assert ask(server, path)[0] == 404
+
+
+def test_other_pages_reach_nothing(server: SiteServer) -> None:
+    assert ask(server, "/app.js", Host="evil.example")[0] == 403
+    assert ask(server, "/app.js", Origin="http://evil.example")[0] == 403
+    assert ask(server, "/app.js", Origin=f"http://127.0.0.1:{server.server_port}")[0] == 200
+    for method in ("POST", "PUT", "DELETE", "OPTIONS"):
+        assert ask(server, "/app.js", method)[0] == 501
+
+
+class _Page(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.policy, self.inline, self.found = "", "", list[tuple[str, dict[str, str | None]]]()
+        self._in_map = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.found.append((tag, given))
+        if given.get("http-equiv") == "Content-Security-Policy":
+            self.policy = given["content"] or ""
+        self._in_map = tag == "script" and given.get("type") == "importmap"
+
+    def handle_data(self, data: str) -> None:
+        if self._in_map:
+            self.inline += data
+            self._in_map = False
+
+
+def test_the_page_allows_its_own_code_alone(site: Site) -> None:
+    import base64
+    import hashlib
+
+    page = _Page()
+    text = site.read("index.html")
+    assert text is not None
+    page.feed(text.decode())
+    rules = dict(part.strip().split(" ", 1) for part in page.policy.split(";"))
+    assert rules["default-src"] == "'none'"
+    digest = base64.b64encode(hashlib.sha256(page.inline.encode()).digest()).decode()
+    assert rules["script-src"] == f"'self' 'wasm-unsafe-eval' 'sha256-{digest}'"
+    assert rules["connect-src"] == "'self'"
+    assert not [
+        given for _, given in page.found if any(name.startswith("on") or name == "style" for name in given)
+    ]
+    for target in json.loads(page.inline)["imports"].values():
+        assert target.startswith("./parts/editor/")
+
+
+def test_scripts_insert_no_html() -> None:
+    for path in PAGE.glob("*.js"):
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(
+            r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function", text
+        ), path
+
+
+def test_a_folder_for_any_web_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(site_module, "SIZES", (64,))
+    monkeypatch.setattr(site_module, "entries", lambda: [Entry("life", ("life",))])
+    count = Site().write(tmp_path / "site")
+    written = {
+        path.relative_to(tmp_path / "site").as_posix()
+        for path in (tmp_path / "site").rglob("*")
+        if path.is_file()
+    }
+    assert len(written) == count
+    assert {
+        "index.html",
+        "app.js",
+        "catalog.json",
+        "python.zip",
+        "rules/life.json",
+        "rules/life-64x64.wasm",
+    } <= written
+    listed = json.loads((tmp_path / "site/catalog.json").read_text())
+    assert listed["rules"][0]["key"] == "life"
+    assert listed["rules"][0]["sizes"] == [[64, 64]]
+
+
+def test_the_archive_for_pyodide_is_the_compiler() -> None:
+    with zipfile.ZipFile(BytesIO(site_module.python_archive())) as archive:
+        names = set(archive.namelist())
+    assert {
+        "powderdsl/web/bridge.py",
+        "powderdsl/data/rules/sand.yaml",
+        "lark/__init__.py",
+        "yaml/__init__.py",
+    } <= names
+    assert not [name for name in names if name.endswith((".so", ".pyc")) or name.startswith("powderdsl/rl")]
+    assert site_module.python_archive() == site_module.python_archive.__wrapped__()
+
+
+def test_without_its_parts_the_command_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(site_module, "PARTS", tmp_path / "none")
+    done = command("play", "--no-open")
+    assert done.exit_code == 2
+    assert "make web" in done.stderr
+    assert "Traceback" not in done.stderr
