@@ -122,12 +122,14 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "worldmodel": (*_SCREEN, *_LEARNING[:7]),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
-    "web": (*_BACK, "simulation.standalone", *_WORLDS),
-    "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "web.site"),
+    "web.worlds": _FRONT,
+    "web": (*_BACK, "simulation.standalone", *_WORLDS, "web.worlds"),
+    "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "web.worlds"),
     "cli": (
         *_SCREEN,
         "simulation.standalone",
         "web",
+        "web.worlds",
         *_TESTING,
         "testing.mutation",
         *_LEARNING,

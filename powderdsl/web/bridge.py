@@ -64,7 +64,7 @@ class Session:
             raise BadRequest(f"1 to {MAX_FILES} files with at most {MAX_TEXT:,} characters together")
         for name in files:
             if not NAME.fullmatch(name):
-                raise BadRequest(f"{name[:80]!r} is not a file name such as sand.yaml")
+                raise BadRequest(f"{name[:80]!r} is not a file name such as pack.yaml")
         if bad := next((name for name in off if not PACK.fullmatch(name)), None):
             raise BadRequest(f"{bad[:80]!r} is not the name of a pack")
         for path in self.folder.iterdir():

@@ -9,7 +9,7 @@ const SPEEDS = [1, 2, 5, 10, 20, 30, 60, 120, 240, 480];
 const STEP_BUDGET = 11; // ms of a frame that steps may take
 const CHART_EVERY = 100; // ms between two points of the chart
 const CHART_POINTS = 200;
-const CHECKPOINT_EVERY = 32n; // steps
+const CHECKPOINT_EVERY = 32; // steps of small worlds; fewer of large ones, which take longer to copy
 const MOST_CHECKPOINTS = 8;
 
 const $ = (id) => document.getElementById(id);
@@ -235,7 +235,8 @@ function advance(now) {
 function step() {
   const { checkpoints, engine } = app;
   const now = engine.clock()[2];
-  if (!held && !(checkpoints.length && now - checkpoints.at(-1).clock[2] < CHECKPOINT_EVERY)) {
+  const every = BigInt(CHECKPOINT_EVERY * Math.max(1, Math.round(engine.cells / 65536)));
+  if (!held && !(checkpoints.length && now - checkpoints.at(-1).clock[2] < every)) {
     checkpoints.push(engine.snapshot());
     if (checkpoints.length > MOST_CHECKPOINTS) checkpoints.shift();
   }
