@@ -123,7 +123,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
     "web.worlds": _FRONT,
-    "web": (*_BACK, "simulation.standalone", *_WORLDS, "web.worlds"),
+    "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors", "web.worlds"),
     "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "web.worlds"),
     "cli": (
         *_SCREEN,

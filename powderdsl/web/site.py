@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib import metadata
@@ -15,29 +15,29 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.compiler import load, read, shipped, shipped_tests, split_names
-from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.diagnostics import Reporter
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
+from powderdsl.system.memo import Memo
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import replacing
-from powderdsl.web.worlds import world_data
+from powderdsl.web.offered_worlds import offered_worlds
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene import Start, draw_start, shipped_scenes
-from powderdsl.worlds.strewn import frame_element, strew
+from powderdsl.worlds.strewn import frame_element
 
 HERE = Path(__file__).parent
 PAGE = HERE / "page"
 PARTS = HERE / "parts"
 """What `make web` fetches from npm: Pyodide and CodeMirror, with their licenses. Git ignores the folder."""
 
+MODULES = HERE / "modules"
+"""Modules of all shipped rules: `make wheel` compiles them, so that the first world of an installed page needs no wait."""
+
 SIZES = (64, 128, 256, 512)
 LIBRARIES = ("click", "lark", "pyyaml")
 """Python packages that the compiler needs in Pyodide."""
-
-PICTURE = 64
-"""Rows and columns of the worlds in the gallery."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,6 @@ def examples_folder() -> Path:
     """The example packs: inside the installed package, or in the repository."""
     inside = shipped("examples")
     return inside if HERE.parent / "data" in inside.parents else HERE.parents[1] / "docs" / "examples"
-
-
-def _start_data(ruleset: Ruleset, start: Start) -> dict[str, Any]:
-    fields = {name: given.values for name, given in start.fields.items()}
-    return world_data(ruleset, start.ids, fields, (0, 0, 0))
 
 
 class Site:
@@ -153,14 +148,14 @@ class Site:
             {"key": key, "about": _about(entry), "sizes": self.sizes(entry)}
             for key, entry in self.entries.items()
         ]
-        return _dump({"format": 1, "world": self.world is not None, "rules": listed})
+        return _dump({"format": 1, "rules": listed})
 
     def _rules(self, entry: Entry) -> dict[str, Any]:
         ruleset = entry.ruleset
         ground = ruleset.elements[0].id
-        worlds = [{"name": name, "about": about} | data for name, about, data in _worlds(ruleset)]
+        worlds, shown = offered_worlds(ruleset, entry.names)
         if entry is self.first and self.world is not None:
-            worlds.insert(0, self.world)
+            worlds, shown = [self.world, *worlds], self.world["name"]
         return {
             "key": entry.key,
             "title": ruleset.name,
@@ -169,6 +164,7 @@ class Site:
             "off": entry.left_out(),
             "frame": frame_element(ruleset, ground),
             "worlds": worlds,
+            "shown": shown,
         }
 
 
@@ -187,17 +183,6 @@ def _about(entry: Entry) -> str:
     return packs[-1].about if ruleset is None else ruleset.about
 
 
-def _worlds(ruleset: Ruleset) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Scenes whose elements the rules have, then random shapes."""
-    for scene in shipped_scenes():
-        try:
-            yield scene.name, scene.about or "", _start_data(ruleset, draw_start(scene, ruleset))
-        except CompileError:
-            continue
-    ids = strew(ruleset, (PICTURE, PICTURE), 1, 0)[0]
-    yield "shapes", "Random shapes of all elements.", world_data(ruleset, ids, {}, (0, 0, 0))
-
-
 def _dump(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()
 
@@ -211,10 +196,12 @@ def _code(entry: Entry, size: Size) -> Callable[[], bytes]:
 
 
 def cached_module(ruleset: Ruleset, size: Size) -> bytes:
-    """The module of a world, from the user's cache if it was made before by the same code."""
-    key = f"{code_version()} {fingerprint(ruleset)} {ruleset.name} {size}"
+    """The module of a world: that of the installation or of the user's cache, if the same code has made it."""
+    name = _file_name(ruleset, size)
+    if (made := MODULES / name).is_file():
+        return made.read_bytes()
     try:
-        path = cache_folder("play") / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.wasm"
+        path = cache_folder("play") / name
         if path.is_file():
             return path.read_bytes()
     except OSError:
@@ -223,6 +210,26 @@ def cached_module(ruleset: Ruleset, size: Size) -> bytes:
     with replacing(path) as temporary:
         temporary.write_bytes(code)
     return code
+
+
+def write_modules() -> None:
+    """Compile all shipped rules into the folder MODULES, and remove what other code has made."""
+    for path in MODULES.glob("*.wasm"):
+        path.unlink()
+    MODULES.mkdir(exist_ok=True)
+    memo = Memo()
+    for entry in entries():
+        for size in ((side, side) for side in SIZES):
+            if fits(entry.ruleset, size):
+                (MODULES / _file_name(entry.ruleset, size)).write_bytes(
+                    standalone_module(entry.ruleset, size, memo)
+                )
+
+
+def _file_name(ruleset: Ruleset, size: Size) -> str:
+    """A name that only the same code gives to the same rules."""
+    key = f"{code_version()} {fingerprint(ruleset)} {ruleset.name} {size}"
+    return f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.wasm"
 
 
 @cache
@@ -234,7 +241,17 @@ def code_version() -> str:
     return found.hexdigest()[:16]
 
 
-ABSENT = ("envs", "datasets", "rl", "worldmodel", "experiments", "targets/cuda", "web/page", "web/parts")
+ABSENT = (
+    "envs",
+    "datasets",
+    "rl",
+    "worldmodel",
+    "experiments",
+    "targets/cuda",
+    "web/page",
+    "web/parts",
+    "web/modules",
+)
 """Parts of powderdsl that need torch, and the page itself: Pyodide does without them."""
 
 

@@ -95,7 +95,7 @@ export async function openRules(key, { world, size: wanted = "64x64", run = true
   app.compiled = null;
   $("rules").value = key;
   fill($("size"), listed.sizes.map((one) => [one.join("x"), one.join("×")]), shape);
-  fillWorlds(world ?? sheet.worlds[sheet.worlds.length > 2 ? defaultWorld(sheet) : 0]?.name);
+  fillWorlds(world ?? sheet.shown);
   use(await Engine.start(module));
   startWorld();
   setRunning(run);
@@ -104,11 +104,8 @@ export async function openRules(key, { world, size: wanted = "64x64", run = true
 }
 app.onRules = [];
 
-/** The last designed world, before the random shapes: the liveliest. */
-const defaultWorld = (sheet) => (app.catalog.world && sheet.key === app.catalog.rules[0].key ? 0 : sheet.worlds.length - 2);
-
 function fillWorlds(chosen) {
-  const names = app.rules.worlds.map((one) => [one.name, one.name]);
+  const names = app.rules.worlds.map((one) => [one.name, one.name.replace(/^task /, "task: ")]);
   fill($("world"), [...names, ["random", "random shapes"], ["empty", "empty"]], chosen ?? "random");
 }
 
@@ -564,7 +561,8 @@ async function begin() {
   showPanel("rules-panel");
   app.catalog = await (await get("catalog.json")).json();
   fill($("rules"), app.catalog.rules.map((one) => [one.key, one.key]), app.catalog.rules[0].key);
-  await openRules(app.catalog.rules[0].key, { size: app.catalog.size ?? "64x64" });
+  const [first] = app.catalog.rules;
+  await openRules(first.key, { size: first.sizes[0].join("x") });
   app.firstWorld = performance.now();
   // The rest comes after the first picture: the editor, and Python in a worker.
   await import("./panels.js");

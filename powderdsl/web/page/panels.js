@@ -57,18 +57,21 @@ async function startCard(card) {
   const [rows, columns] = card.sizes[0];
   const [sheet, module] = await Promise.all([sheetOf(card.key), shippedModule(card.key, rows, columns)]);
   const engine = await Engine.start(module);
-  engine.restore(readWorld(sheet.worlds[Math.max(0, sheet.worlds.length - 2)]));
+  engine.restore(pictured(sheet));
   [card.canvas.width, card.canvas.height] = [columns, rows];
   card.sheet = sheet;
   card.painter = new Painter(engine);
   card.engine = engine;
 }
 
+/** The world that shows the rules best. */
+const pictured = (sheet) => readWorld(sheet.worlds.find((one) => one.name === sheet.shown));
+
 function live() {
   for (const { engine, painter, canvas, sheet } of cards ?? []) {
     if (!engine) continue;
     engine.step(1);
-    if (engine.clock()[2] > 600n) engine.restore(readWorld(sheet.worlds[Math.max(0, sheet.worlds.length - 2)]));
+    if (engine.clock()[2] > 600n) engine.restore(pictured(sheet));
     canvas.getContext("2d").putImageData(painter.draw(), 0, 0);
   }
 }

@@ -1,0 +1,88 @@
+"""The start worlds that the page offers with rules: scenes, those of tasks, shapes and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from powderdsl.analysis.reactions import unchanging_ids
+from powderdsl.arrays import np
+from powderdsl.diagnostics import CompileError
+from powderdsl.model.types import Ruleset
+from powderdsl.targets.array_kind import PlainArrays
+from powderdsl.tasks.shipped import load_task, shipped_tasks
+from powderdsl.tasks.tensors.starts import StartWorlds
+from powderdsl.web.worlds import world_data
+from powderdsl.worlds.raster import mask
+from powderdsl.worlds.scene import draw_start, shipped_scenes
+from powderdsl.worlds.strewn import random_shape, strew
+
+SIDE = 64
+"""Rows and columns of worlds that have no size of their own."""
+
+MANY = 5
+"""Rules with this many elements, all of which change, grow patterns out of noise."""
+
+OWN_SHAPES = 12
+"""Shapes of an added pack's own elements."""
+
+
+def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
+    """Worlds with `name`, `about` and what `world_data` has; and the name of the one that shows the rules best.
+
+    `names` is what `load` takes: tasks belong to their rules alone, an added pack gets a world with its elements.
+    """
+    found = [*_scenes(ruleset), *_tasks(ruleset, tuple(names))]
+    scenes = [one for one in found if not one["name"].startswith("task ")]
+    found.append(
+        _named("shapes", "Random shapes of all elements.", ruleset, strew(ruleset, (SIDE, SIDE), 1, 0)[0])
+    )
+    shown = scenes[-1]["name"] if scenes else "shapes"
+    if not unchanging_ids(ruleset):
+        ids = np.array([element.id for element in ruleset.elements], np.uint8)
+        noise = ids[np.random.default_rng(0).integers(0, len(ids), (SIDE, SIDE))]
+        found.append(_named("noise", "Every cell at random.", ruleset, noise))
+        shown = "noise" if len(ids) >= MANY else shown
+    if len(names) > 1:
+        found.append(_own(ruleset))
+        shown = found[-1]["name"]
+    return found, shown
+
+
+def _named(name: str, about: str, ruleset: Ruleset, ids: Any, fields: Any = None) -> dict[str, Any]:
+    return {"name": name, "about": about} | world_data(ruleset, ids, fields or {}, (0, 0, 0))
+
+
+def _scenes(ruleset: Ruleset) -> Iterator[dict[str, Any]]:
+    """The shipped scenes whose elements the rules have."""
+    for scene in shipped_scenes():
+        try:
+            start = draw_start(scene, ruleset)
+        except CompileError:
+            continue
+        fields = {name: given.values for name, given in start.fields.items()}
+        yield _named(scene.name, scene.about or "", ruleset, start.ids, fields)
+
+
+def _tasks(ruleset: Ruleset, names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+    """The first world of each task's first split."""
+    kind = PlainArrays()
+    for name in shipped_tasks():
+        task = load_task(name)
+        if task.rules == names and task.ruleset.palette == ruleset.palette:
+            made = StartWorlds(task, task.splits[0].name, kind).make(np.array([0], np.int64))
+            yield _named(f"task {name}", task.about, ruleset, np.asarray(made.ids)[0])
+
+
+def _own(ruleset: Ruleset) -> dict[str, Any]:
+    """Shapes of all elements, and more of those of the pack that was added last."""
+    pack = ruleset.packs[-1]
+    own = [element.id for element in ruleset.elements if element.pack == pack]
+    ids = strew(ruleset, (SIDE, SIDE), 1, 1)[0]
+    edge = ids.copy()
+    random = np.random.default_rng(2)
+    for number in range(OWN_SHAPES if own else 0):
+        ids[mask(random_shape(random, (SIDE, SIDE), SIDE // 10), (SIDE, SIDE))] = own[number % len(own)]
+    for cells in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        ids[cells] = edge[cells]
+    return _named(pack, f"Random shapes, and more of {pack}.", ruleset, ids)
